@@ -81,17 +81,31 @@ def _require_size(content: IO[bytes], size: int, compressed: int, name: str) -> 
         return
     shape, _, dtype = _HEADERS[version](content)
     stored_bytes = math.prod(shape) * dtype.itemsize
-    array = f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
+    array = _array_text(name, shape, stored_bytes)
     if stored_bytes > size:
         raise InputError(
             f"{array} according to its header, but the file has only {size:,} bytes of it; "
             "expected a complete file: it may be truncated"
         )
+    require_plausible_size(name, shape, stored_bytes, compressed)
+
+
+def _array_text(name: str, shape: tuple[int, ...], stored_bytes: int) -> str:
+    return f"the array {name or 'in it'} {shape} takes {stored_bytes / 1e9:.3g} GB"
+
+
+def require_plausible_size(
+    name: str, shape: tuple[int, ...], stored_bytes: int, compressed: int
+) -> None:
+    """Refuse an array above `SMALL_BYTES` that is compressed more than `LARGEST_COMPRESSION`-fold,
+    to `compressed` bytes, or takes more than `MEMORY_SHARE` of this machine's memory (if known).
+    """
     if stored_bytes <= SMALL_BYTES:
         return
+    array = _array_text(name, shape, stored_bytes)
     if stored_bytes > LARGEST_COMPRESSION * compressed:
         raise InputError(
-            f"{array} and is compressed {stored_bytes / compressed:.0f}-fold, "
+            f"{array} and is compressed {stored_bytes / max(compressed, 1):.0f}-fold, "
             "as no measurement is; "
             "expected an array with data"
         )

@@ -29,6 +29,8 @@ EXPLICABLE_CONCERNS = (
 )
 # Topics of a verdict that come first.
 FIRST_TO_CORRECT = ("description", "solve")
+# Decrease of χ² that a reader of the table takes for significant.
+NOTICEABLE = 15.0
 DEEPER_CHECK_ADVICE = (
     "For a deeper check, run `solve --probe` (in Python `cs.run(problem, probe=True)`): it refits "
     "subsets of the data and relaxes each assumption."
@@ -186,7 +188,15 @@ def _conclusions(result: Result) -> Iterator[str]:
             yield f"alternative explanations with similar effects: {listed(others)}"
     elif not significant and is_routine(result):
         tested = listed(source_label(probe.name) for probe in _largest_probes(result))
-        yield f"tested without a finding: {tested}"
+        first = max(result.probes, key=lambda probe: probe.chi_squared)
+        # Of independent residuals, such a decrease would be a finding.
+        reason = (
+            f"; χ² decreases by {first.chi_squared:.3g} with {source_label(first.name)}, which is "
+            "not significant because the residuals are not independent"
+            if first.chi_squared > NOTICEABLE
+            else ""
+        )
+        yield f"tested without a finding: {tested}{reason}"
     elif not significant:
         yield "no subset of the data and no relaxed assumption changes the fit significantly"
     if not is_routine(result):

@@ -557,8 +557,12 @@ def _cards(result: Result) -> Cards:
     simulated = result.rollout
     name = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))
     interval = values[name].combined95
-    value = f"{number(values[name].value, 4)} {unit_of(name)}"
-    known = "{:.4g} to {:.4g} (95 %)".format(*interval) if interval else "no error bar"
+    factor, unit = _readable_unit(result, name)
+    value = f"{number(factor * values[name].value, 4)} {unit}"
+    known = "no error bar"
+    if interval is not None:
+        low, high = (number(factor * end, 4) for end in interval)
+        known = f"{low} to {high} (95 %)"
     cards = [(symbol_of(name), value.strip(), known)]
     if any(each.samples for each in fit.experiments.values()):
         alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"

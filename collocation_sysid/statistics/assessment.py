@@ -212,8 +212,10 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
         or not np.isfinite(dependence.lag1_deviation)
         or abs(dependence.lag1) > CLEARLY_PERSISTENT
     )
-    # Residuals of exactly zero are those of no measurement at all.
-    smaller = not larger and 0 < factor < 1 / MISFIT and level.smaller_p < RARE and not is_used
+    # Residuals of exactly zero are those of no measurement at all. Dependent residuals scatter less
+    # by chance, too, and their error bars do not follow from sigma.
+    least = GROSS_MISFIT if is_used else MISFIT
+    smaller = not larger and 0 < factor < 1 / least and level.smaller_p < RARE
     sigma_key = level.sigma_key
     return [
         *(outlier.to_concern() for outlier in uncertainty.outliers),

@@ -7,7 +7,7 @@ drawn at random from the seed, the kind and the number of the case: files are tr
 their bytes are replaced, repeated or exchanged, and values with a special meaning in the format are
 inserted. In files that are "changed", the format stays valid: keys, values, cells, columns, shapes
 and types of arrays are exchanged, for each kind of problem. `--quick` leaves out the simulations of
-`check`, which then only reads and describes the problem. Each case is run in a separate process
+`check` and the searches of `plan`, which then only read the files. Each case is run in a separate process
 with limits of time and memory. Its outcome is
 
     refused     exit code 2, one message of one line, and nothing written
@@ -61,6 +61,8 @@ from collocation_sysid import cli
 from collocation_sysid.cli import problem_commands
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.export import TARGETS
+from collocation_sysid.extras.planning import motion_plan
+from collocation_sysid.features.image_tracks.track_files import TrackFile, read_tracks
 from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
@@ -780,6 +782,118 @@ FILES = (
         words=(b"ascii", b"binary_compressed", b"FIELDS", b"F", *COUNTS),
     ),
 )
+
+
+# Image tracks ----------------------------------------------------------------------------------
+
+
+def _with_tracks(file: str, write: Callable[[Path, TrackFile], object]) -> Callable[[Path], object]:
+    """Return a function that makes the problem that of the video, with its tracks in a file of
+    another program.
+    """
+
+    def make(folder: Path) -> None:
+        _shipped(_TEMPLATES / "video")(folder)
+        tracks = read_tracks(folder / "front.csv")
+        write(folder / file, tracks)
+        has_times = file.endswith((".csv", ".npz")) and "dlc" not in file
+        rate = "" if has_times else "frame_rate_hz = 60\n"
+        _state(folder, 'file = "front.csv"', f'{rate}file = "{file}"')
+
+    return make
+
+
+def _long_csv(file: Path, tracks: TrackFile) -> None:
+    assert tracks.t_s is not None
+    rows = ["t_s,point,u,v,likelihood"]
+    for k, t in enumerate(tracks.t_s):
+        for n, name in enumerate(tracks.names):
+            u, v = tracks.pixels[k, n]
+            rows.append(f"{t},{name},{u},{v},1.0")
+    file.write_text("\n".join(rows))
+
+
+def _deeplabcut(file: Path, tracks: TrackFile) -> None:
+    import pandas as pd
+
+    parts = [["net"], list(tracks.names), ["x", "y", "likelihood"]]
+    columns = pd.MultiIndex.from_product(parts, names=["scorer", "bodyparts", "coords"])
+    scores = np.ones((*tracks.pixels.shape[:2], 1))
+    values = np.concatenate([tracks.pixels, scores], axis=2).reshape(len(scores), -1)
+    table = pd.DataFrame(values, columns=columns)
+    if file.suffix == ".csv":
+        table.to_csv(file)
+    else:
+        table.to_hdf(file, key="df_with_missing", format="table", mode="w")
+
+
+def _sleap(file: Path, tracks: TrackFile) -> None:
+    import h5py
+
+    with h5py.File(file, "w") as content:
+        content["tracks"] = tracks.pixels.transpose(2, 1, 0)[None]
+        content["node_names"] = np.array(tracks.names, dtype="S")
+        content["track_names"] = np.array(["bar"], dtype="S")
+
+
+def _cotracker(file: Path, tracks: TrackFile) -> None:
+    seen = np.asarray(np.isfinite(tracks.pixels).all(axis=2))[None]
+    assert tracks.t_s is not None
+    names = np.array(tracks.names)
+    np.savez(
+        file, pred_tracks=tracks.pixels[None], pred_visibility=seen, names=names, t_s=tracks.t_s
+    )
+
+
+_MATRIX = "[1096.96, 0, 637.93, 0, 1096.96, 361, 0, 0, 1]"
+_ROWS = "[[1096.96, 0, 637.93], [0, 1096.96, 361], [0, 0, 1]]"
+CALIBRATIONS = {
+    "OpenCV": ("front.yaml", ""),
+    "ROS": (
+        "info.yaml",
+        "image_width: 1280\nimage_height: 720\ncamera_name: front\n"
+        f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {_MATRIX}\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients:\n  data: [0.1, 0, 0, 0, 0]\n",
+    ),
+    "Kalibr": (
+        "chain.yaml",
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [1096.96, 1096.96, 637.93, 361]\n"
+        "  distortion_model: radtan\n  distortion_coeffs: [0.1, 0, 0, 0]\n"
+        "  resolution: [1280, 720]\n",
+    ),
+    "Anipose": (
+        "calibration.toml",
+        f'[cam_0]\nname = "front"\nsize = [1280, 720]\nmatrix = {_ROWS}\n'
+        "distortions = [0.1, 0.0, 0.0, 0.0, 0.0]\nrotation = [0.1, 0.2, 0.3]\n"
+        "translation = [0.0, 0.1, 0.5]\n\n[metadata]\nadjusted = true\n",
+    ),
+    "COLMAP": (
+        "cameras.txt",
+        "# cameras\n1 OPENCV 1280 720 1096.96 1096.96 638.4 361.5 0.1 0 0 0\n",
+    ),
+}
+
+
+def _with_calibration(file: str, text: str) -> Callable[[Path], object]:
+    def make(folder: Path) -> None:
+        _shipped(_TEMPLATES / "video")(folder)
+        if text:
+            (folder / file).write_text(text)
+            _state(folder, 'file = "front.yaml"', f'file = "{file}"')
+
+    return make
+
+
+def _with_reference(folder: Path) -> None:
+    """Make the problem that of a plan, with a reference in a file."""
+    _shipped(ROOT / "problems/foam_cylinder")(folder)
+    rows = "\n".join(f"{0.1 * k:.1f},{0.01 * k:.3f},,0.0" for k in range(13))
+    (folder / "tip.csv").write_text(f"t_s,x_m,y_m,z_m\n{rows}\n")
+    task = (folder / "task.toml").read_text()
+    values = "t_s = [1.2]\nposition_m = [[0.1, 0.0, 0.0]]\n"
+    (folder / "task.toml").write_text(task.replace(values, 'file = "tip.csv"\n'))
+
+
 ROOT = Path(__file__).resolve().parents[2]
 _TEMPLATES = ROOT / "collocation_sysid/problem/templates"
 _SHIPPED = {
@@ -815,6 +929,40 @@ FILES += (
         (("plot", "run"), ("export", "run", "--to", "json")),
         change=changed_arrays,
     ),
+)
+
+_BENCH, _SPECIMEN = _shipped(_SHIPPED["bench"]), _shipped(_SHIPPED["specimen"])
+_VIDEO = _shipped(_TEMPLATES / "video")
+_PLAN = (("plan", "problem.toml", "task.toml", "--limits", "limits.toml", "--out", "planned"),)
+YAML = (b"!!python/name:os.system ", b"&a ", b"*a ", b"!!timestamp x", b"- ", b"{", b"|\n", b": ")
+YAML += (b"!!int x", b"!!bool x", b"%YAML", b"\t", b".nan", b".inf", b"9" * 5000, *COUNTS)
+FILES += (
+    FileKind("bench, CSV", _BENCH, "run_1.csv", words=(*CSV, *COUNTS)),
+    FileKind("specimen, CSV", _SPECIMEN, "pull.csv", words=(*CSV, *COUNTS)),
+    FileKind("video, changed .toml", _VIDEO, "*.toml", change=changed_toml),
+    FileKind("image tracks, CSV", _VIDEO, "front.csv", words=(*CSV, *COUNTS)),
+    FileKind("image tracks, changed .csv", _VIDEO, "front.csv", change=changed_table),
+    FileKind(
+        "image tracks, long CSV", _with_tracks("l.csv", _long_csv), "l.csv", change=changed_table
+    ),
+    FileKind(
+        "DeepLabCut, CSV", _with_tracks("dlc.csv", _deeplabcut), "dlc.csv", change=changed_table
+    ),
+    FileKind("DeepLabCut, HDF5", _with_tracks("d.h5", _deeplabcut), "d.h5", words=COUNTS),
+    FileKind("SLEAP, HDF5", _with_tracks("s.h5", _sleap), "s.h5", words=COUNTS),
+    FileKind(
+        "CoTracker, NPZ", _with_tracks("c.npz", _cotracker), "c.npz", words=(b"'|O'", *COUNTS)
+    ),
+    FileKind(
+        "CoTracker, changed NPZ", _with_tracks("c.npz", _cotracker), "c.npz", change=changed_arrays
+    ),
+    *(
+        FileKind(f"calibration of {name}", _with_calibration(file, text), file, words=YAML)
+        for name, (file, text) in CALIBRATIONS.items()
+    ),
+    FileKind("plan, task", _with_reference, "task.toml", _PLAN, change=changed_toml),
+    FileKind("plan, limits", _with_reference, "limits.toml", _PLAN, change=changed_toml),
+    FileKind("plan, reference", _with_reference, "tip.csv", _PLAN, change=changed_table),
 )
 
 # Other kinds --------------------------------------------------------------------------------------
@@ -1281,6 +1429,9 @@ def table(
         with (
             mock.patch.object(run_record, "write_pictures"),
             mock.patch.object(problem_commands, "check_problem", checked),
+            mock.patch.object(
+                motion_plan, "solve_reduced", _end if quick else motion_plan.solve_reduced
+            ),
         ):
             cases = CaseSettings(folder, problem, solved, count, seed, limit_s, failure_folder)
             for name in only:

@@ -12,6 +12,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.track_files import read_tracks
+from collocation_sysid.recording.formats.calibration_files import read_calibration
 
 RNG = np.random.default_rng(7)
 PIXELS = np.round(RNG.uniform(10, 600, (5, 2, 2)), 3)
@@ -52,6 +53,7 @@ def deeplabcut() -> pd.DataFrame:
 def require_same(read: Any, has_times: bool = False) -> None:
     assert read.names == NAMES
     np.testing.assert_allclose(read.pixels, PIXELS, atol=1e-9)
+    assert read.likelihood is not None
     np.testing.assert_allclose(read.likelihood, SCORES, atol=1e-9)
     assert (read.t_s is not None) == has_times
     confident = read.confident(0.6)
@@ -62,6 +64,7 @@ def require_same(read: Any, has_times: bool = False) -> None:
 def test_wide_and_long_tables_are_read(tmp_path: Path) -> None:
     read = read_tracks(write(tmp_path, "wide.csv", wide()))
     require_same(read, has_times=True)
+    assert read.t_s is not None
     np.testing.assert_allclose(read.t_s, T_S)
     read = read_tracks(write(tmp_path, "long.csv", long()))
     order = [read.names.index(name) for name in NAMES]
@@ -149,9 +152,12 @@ def test_times_of_tables_have_any_unit(name: str, tmp_path: Path) -> None:
     header = wide().splitlines()[0].replace("t_s", name)
     read = read_tracks(write(tmp_path, "wide.csv", "\n".join([header, *later])))
     require_same(read, has_times=True)
+    assert read.t_s is not None
     np.testing.assert_allclose(read.t_s, T_S)
     table = f"{name},point,u,v\n0,t,1,2\n100,t,3,4\n"
-    np.testing.assert_allclose(read_tracks(write(tmp_path, "l.csv", table)).t_s, [0, 0.1])
+    long_t_s = read_tracks(write(tmp_path, "l.csv", table)).t_s
+    assert long_t_s is not None
+    np.testing.assert_allclose(long_t_s, [0, 0.1])
     assert read_tracks(write(tmp_path, "f.csv", "frame,t_u,t_v\n0,1,2\n1,3,4\n")).t_s is None
 
 
@@ -170,6 +176,7 @@ def test_archives_of_cotracker_and_tapir_are_read(tmp_path: Path) -> None:
     )
     read = read_tracks(tmp_path / "tapir.npz")
     require_same(read, has_times=True)
+    assert read.t_s is not None
     np.testing.assert_allclose(read.t_s, np.arange(5) / 30)
 
 
@@ -181,6 +188,7 @@ def test_archives_of_cotracker_and_tapir_are_read(tmp_path: Path) -> None:
         ("t_s,tip_u,tip_v\n0,x,2\n", "line 2"),
         ("frame,point,u,v\n0,tip,1,2\n0,tip,3,4\n", "line 3: tip appears twice in this image"),
         ("scorer,n,n\ncoords,x,y\n0,1,2\n", "expected those of DeepLabCut"),
+        ("scorer,n\nbodyparts,a,a\ncoords,x\n0,1,2\n", "header rows have different lengths"),
     ],
 )
 def test_faulty_tables_are_refused(text: str, message: str, tmp_path: Path) -> None:
@@ -205,3 +213,53 @@ def test_faulty_archives_are_refused(arrays: dict, message: str, tmp_path: Path)
     np.savez(tmp_path / "tracks.npz", **arrays)
     with pytest.raises(cs.InputError, match=rf"tracks.npz: .*{message}"):
         read_tracks(tmp_path / "tracks.npz")
+
+
+SHAPE = (5, 2, 2)
+BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
+    "complex": ({"pred_tracks": np.ones(SHAPE, complex)}, "pred_tracks must hold numbers"),
+    "texts": ({"pred_tracks": np.full(SHAPE, "x")}, "pred_tracks must hold numbers"),
+    "no images": ({"pred_tracks": np.zeros((0, 2, 2))}, "expected \\(T, N, 2\\)"),
+    "rate of zero": ({"fps": 0.0}, "fps is \\[0.0\\]; expected one number above 0"),
+    "rates": ({"fps": [30.0, 60.0]}, "expected one number above 0"),
+    "a time": ({"t_s": 1.0}, "t_s .*shape"),
+    "times without a number": ({"t_s": [0, 1, np.nan, 3, 4]}, "t_s"),
+    "one name twice": ({"names": ["a", "a"]}, "2 points are called 'a'; expected one"),
+    "visible texts": (
+        {"pred_visibility": np.full((5, 2), "x")},
+        "pred_visibility must hold numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_ARRAYS.values(), ids=BAD_ARRAYS)
+def test_arrays_that_are_no_tracks_are_refused(change: dict, message: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "co.npz", **{"pred_tracks": PIXELS, **change})
+    with pytest.raises(cs.InputError, match=message):
+        read_tracks(tmp_path / "co.npz")
+
+
+def test_damaged_hdf5_files_are_refused(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    file = tmp_path / "analysis.h5"
+    with h5py.File(file, "w") as content:
+        content["tracks"] = PIXELS.transpose(2, 1, 0)[None]
+        content["node_names"] = np.arange(3.0)[:, None]
+    with pytest.raises(cs.InputError, match=r"tracks has the shape"):
+        read_tracks(file)
+    file.write_bytes(file.read_bytes()[:900])
+    with pytest.raises(cs.InputError, match="this HDF5 file cannot be read"):
+        read_tracks(file)
+    with h5py.File(file, "w") as content:
+        shape = (1, 2, 2, 10**9)
+        content.create_dataset("tracks", shape, "f4", chunks=(1, 2, 2, 1000), compression="gzip")
+        content["node_names"] = np.array(NAMES, dtype="S")
+    with pytest.raises(cs.InputError, match="expected an array with data"):
+        read_tracks(file)
+
+
+@pytest.mark.parametrize("tag", ["!!int x", "!!bool x", "!!timestamp x", "1" + 400 * "0"])
+def test_calibrations_with_wrong_values_are_refused(tag: str, tmp_path: Path) -> None:
+    text = f"K: [{tag}, 0, 1, 0, 1, 1, 0, 0, 1]\n"
+    with pytest.raises(cs.InputError, match="expected"):
+        read_calibration(write(tmp_path, "c.yaml", text))

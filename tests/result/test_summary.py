@@ -228,4 +228,5 @@ def test_a_run_without_markers_has_no_cards_of_markers():
     result = replace(a_result({"young_pa": value()}), fit=replace(FIT, wrench_rms_n=0.25))
     cards = dict((name, shown) for name, shown, _ in _cards(result).items)
     assert cards["force, fitted"] == "0.25 N"
+    assert cards["E"].endswith((" kPa", " Pa"))
     assert not any("markers" in name for name in cards)

@@ -215,6 +215,17 @@ def size_of_residuals(kind):
     assert named(kind, "noise/smaller") in codes(kind, white(kind) / 5)
 
 
+def small_but_persistent(kind):
+    """Residuals of ten times less than sigma are too small, whether or not they are independent."""
+    errors = white(kind)
+    for k in range(1, len(errors)):
+        errors[k] = 0.9 * errors[k - 1] + np.sqrt(1 - 0.9**2) * errors[k]
+    found = codes(kind, errors / 10)
+    assert named(kind, "noise/smaller") in found
+    if kind != "specimen":
+        assert "residuals/persist" in found
+
+
 def one_is_noisier(kind):
     assert named(kind, "noise/marker") in codes(
         kind, white(kind) * [[1.0], [30.0], *[[1.0]] * (BLOCKS[kind][1][0] - 2)]
@@ -366,6 +377,7 @@ CHECKS = {
     "loss of samples": loss_of_samples,
     "the same values twice": same_values_twice,
     "size of the residuals": size_of_residuals,
+    "small but persistent residuals": small_but_persistent,
     "one instrument is noisier": one_is_noisier,
     "correlation in time": correlation_in_time,
     "correlation between numbers": correlation_of_numbers,

@@ -70,6 +70,23 @@ def test_a_probe_without_shown_estimates_states_no_changes():
     assert first.endswith("χ² decreases by 30; measure it, or estimate it")
 
 
+@pytest.mark.parametrize(("chi_squared", "explained"), [(44.0, True), (4.0, False)])
+def test_a_decrease_without_a_finding_is_explained(chi_squared, explained):
+    probe = SimpleNamespace(
+        name="anisotropy z",
+        kind="assumption",
+        sentences=(),
+        chi_squared=chi_squared,
+        size=0.1,
+        size_error=0.05,
+        routine=True,
+    )
+    result: Any = SimpleNamespace(probes=[probe], collect_estimates=dict, parameters={}, budget={})
+    (told,) = _conclusions(result)
+    assert told.startswith("tested without a finding: anisotropy z")
+    assert ("χ² decreases by 44 with anisotropy z, which is not significant" in told) == explained
+
+
 def test_an_outlier_in_a_table_without_times_has_a_row():
     test = cs.Specimen("uniaxial", [0.1, 0.2, 0.3], [1e3, 2e3, 3e3], 10.0)
     outlier = Outlier("pull/stress", 2, 2.0, 0.9, 12.0, is_relaxed_start=False)

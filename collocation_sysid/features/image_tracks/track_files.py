@@ -19,6 +19,7 @@ import io
 import json
 import pickle
 import zipfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,10 @@ from typing import Any
 
 import numpy as np
 
+from ...common.array_files import load_arrays, require_plausible_size
 from ...common.array_types import Array
+from ...common.checked_arrays import float_array
+from ...common.files import DAMAGE
 from ...errors import InputError, listed
 from ...recording.formats.columns import find_time
 from ...recording.formats.text import (
@@ -172,7 +176,8 @@ def _long_table(grid: TextTable, point: int, t_s: Array | None, frames: Array) -
     names = tuple(dict.fromkeys(labels))
     at = frames if t_s is None else t_s
     times, sample = np.unique(at, return_inverse=True)
-    column = np.array([names.index(label) for label in labels])
+    number = {name: k for k, name in enumerate(names)}
+    column = np.array([number[label] for label in labels])
     pairs = sample * len(names) + column
     if len(np.unique(pairs)) < len(pairs):
         seen: set[int] = set()
@@ -206,7 +211,9 @@ def _deeplabcut_table(rows: list[Row]) -> TrackFile:
             f"found the header rows {listed(heads)}; expected those of DeepLabCut: scorer, "
             "bodyparts, coords"
         )
-    individuals = heads.get("individuals", [""] * len(heads["bodyparts"]))
+    individuals = heads.setdefault("individuals", [""] * len(heads["bodyparts"]))
+    if len({len(heads[name]) for name in ("individuals", "bodyparts", "coords")}) > 1:
+        raise InputError("the header rows have different lengths; expected one name in each column")
     columns = list(zip(individuals, heads["bodyparts"], heads["coords"], strict=True))
     grid = table_of_rows(["frame", *map(str, range(len(columns)))], rows)
     values = np.asarray(numeric_cells(grid, range(1, 1 + len(columns)), blank_allowed=True))
@@ -222,12 +229,13 @@ def _by_columns(columns: Sequence[tuple[str, str, str]], values: Array, frames: 
     several = len({individual for individual, _, _ in columns}) > 1
     labels = [f"{i}_{part}" if several else part for i, part, _ in columns]
     names = tuple(dict.fromkeys(labels))
+    number = {name: k for k, name in enumerate(names)}
     parts = {"x": np.full((len(values), len(names)), np.nan)}
     parts["y"], parts["likelihood"] = parts["x"].copy(), np.ones_like(parts["x"])
     for k, (label, (_, _, coordinate)) in enumerate(zip(labels, columns, strict=True)):
         if coordinate not in parts:
             raise InputError(f"found the coordinate {coordinate!r}; expected x, y or likelihood")
-        parts[coordinate][:, names.index(label)] = values[:, k]
+        parts[coordinate][:, number[label]] = values[:, k]
     has_score = any(coordinate == "likelihood" for _, _, coordinate in columns)
     pixels = np.stack([parts["x"], parts["y"]], axis=2)
     return TrackFile(names, pixels, parts["likelihood"] if has_score else None, None, frames)
@@ -238,9 +246,10 @@ def _by_columns(columns: Sequence[tuple[str, str, str]], values: Array, frames: 
 
 def _read_archive(file: Path) -> TrackFile:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {name: np.asarray(archive[name]) for name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        arrays = load_arrays(file)
+    except InputError:
+        raise
+    except (*DAMAGE, OSError) as error:
         raise InputError(f"this archive cannot be read ({error}); expected arrays") from error
     return tracks_of_arrays(arrays)
 
@@ -251,10 +260,10 @@ def tracks_of_arrays(arrays: Mapping[str, Any]) -> TrackFile:
     key = by_time or ("tracks" if "tracks" in arrays else None)
     if key is None:
         raise InputError(f"found the arrays {listed(arrays)}; expected pred_tracks or tracks")
-    tracks = np.asarray(arrays[key], dtype=float)
+    tracks = float_array(arrays[key], key, finite=False)
     if tracks.ndim == 4 and len(tracks) == 1:
         tracks = tracks[0]
-    if tracks.ndim != 3 or tracks.shape[2] != 2:
+    if tracks.ndim != 3 or tracks.shape[2] != 2 or not tracks.size:
         raise InputError(
             f"{key} has the shape {tracks.shape}; expected (T, N, 2), (1, T, N, 2) or, for TAPIR, "
             "(N, T, 2)"
@@ -266,7 +275,9 @@ def tracks_of_arrays(arrays: Mapping[str, Any]) -> TrackFile:
     name = of_points if by_time is None and of_points else None
     name = name or next((each for each in VISIBILITY if each in arrays), None)
     if name is not None:
-        seen = np.asarray(arrays[name], dtype=float)
+        stated = np.asarray(arrays[name])
+        is_truth = stated.dtype.kind == "b"
+        seen = float_array(stated.astype(int) if is_truth else stated, name, finite=False)
         seen = seen[0] if seen.ndim == 3 and len(seen) == 1 else seen
         seen = seen[..., 0] if seen.ndim == 3 and seen.shape[2] == 1 else seen
         seen = seen.T if name == of_points else seen
@@ -276,17 +287,29 @@ def tracks_of_arrays(arrays: Mapping[str, Any]) -> TrackFile:
                 f"{tracks.shape[0]} images and {tracks.shape[1]} points"
             )
         likelihood = 1.0 - seen if "occ" in name else seen
-    stated = np.ravel(arrays["names"]) if "names" in arrays else ()
-    names = tuple(map(str, stated)) or tuple(f"p{k + 1}" for k in range(tracks.shape[1]))
+    names = tuple(f"p{k + 1}" for k in range(tracks.shape[1]))
+    if "names" in arrays:
+        names = tuple(map(str, np.ravel(arrays["names"])))
     if len(names) != tracks.shape[1]:
         raise InputError(f"names has {len(names)} names for {tracks.shape[1]} points")
     frames = np.arange(float(len(tracks)))
-    t_s = np.asarray(arrays["t_s"], dtype=float).ravel() if "t_s" in arrays else None
-    if t_s is None and "fps" in arrays:
-        t_s = frames / float(np.ravel(arrays["fps"])[0])
-    if t_s is not None and len(t_s) != len(tracks):
-        raise InputError(f"t_s has {len(t_s)} times for {len(tracks)} images")
-    return TrackFile(names, tracks, likelihood, t_s, frames)
+    t_s = None
+    if "t_s" in arrays:
+        t_s = float_array(arrays["t_s"], "t_s", (len(tracks),))
+    elif "fps" in arrays:
+        rates = float_array(arrays["fps"], "fps").ravel()
+        if len(rates) != 1 or not rates[0] > 0:
+            raise InputError(f"fps is {rates.tolist()}; expected one number above 0")
+        t_s = frames / rates[0]
+    return _with_distinct_names(TrackFile(names, tracks, likelihood, t_s, frames))
+
+
+def _with_distinct_names(tracks: TrackFile) -> TrackFile:
+    """Return the tracks; an `InputError` if two points have the same name."""
+    counts = Counter(tracks.names)
+    if twice := [name for name, count in counts.items() if count > 1]:
+        raise InputError(f"{counts[twice[0]]} points are called {twice[0]!r}; expected one")
+    return tracks
 
 
 class _PlainUnpickler(pickle.Unpickler):
@@ -304,34 +327,52 @@ def _read_hdf5(file: Path) -> TrackFile:
             "this is an HDF5 file, for which the library h5py is missing; expected pip install "
             "'collocation-sysid[tracks]', or the tracks as .csv"
         ) from error
-    with h5py.File(file) as content:
-        if "tracks" in content and "node_names" in content:
-            return _sleap_tracks(content)
-        if {"frames", "instances", "metadata"} <= set(content):
-            return _sleap_labels(content)
-        for name, group in content.items():
-            if isinstance(group, h5py.Group) and "table" in group:
-                return _deeplabcut_hdf5(name, group)
+    try:
+        with h5py.File(file) as content:
+            if "tracks" in content and "node_names" in content:
+                return _with_distinct_names(_sleap_tracks(content))
+            if {"frames", "instances", "metadata"} <= set(content):
+                return _with_distinct_names(_sleap_labels(content))
+            for name, group in content.items():
+                if isinstance(group, h5py.Group) and "table" in group:
+                    return _deeplabcut_hdf5(name, group)
+            found = listed(content)
+    except InputError:
+        raise
+    except (*DAMAGE, OSError) as error:
         raise InputError(
-            f"found the groups {listed(content)}; expected those of DeepLabCut (in table format) or "
-            "of SLEAP (.slp, or an analysis file)"
-        )
+            f"this HDF5 file cannot be read ({error}); expected a complete file: it may be damaged"
+        ) from error
+    raise InputError(
+        f"found the groups {found}; expected those of DeepLabCut (in table format) or of SLEAP (.slp, "
+        "or an analysis file)"
+    )
+
+
+def _dataset(content: Any, name: str) -> Any:
+    """Return the array of a dataset of an HDF5 file, whose size is plausible."""
+    stored = content[name]
+    size = stored.size * stored.dtype.itemsize
+    require_plausible_size(name, stored.shape, size, stored.id.get_storage_size())
+    return stored[()]
 
 
 def _sleap_tracks(content: Any) -> TrackFile:
-    tracks = np.asarray(content["tracks"], dtype=float)
-    nodes = [_text(each) for each in content["node_names"][()]]
+    tracks = float_array(_dataset(content, "tracks"), "tracks", finite=False)
+    nodes = [_text(each) for each in _dataset(content, "node_names")]
     if tracks.ndim != 4 or tracks.shape[1] != 2 or tracks.shape[2] != len(nodes):
         raise InputError(
             f"tracks has the shape {tracks.shape}; expected (tracks, 2, {len(nodes)} nodes, frames)"
         )
-    of = [_text(each) for each in content["track_names"][()]] if "track_names" in content else []
+    of = []
+    if "track_names" in content:
+        of = [_text(each) for each in _dataset(content, "track_names")]
     of = of if len(of) == len(tracks) else [f"track_{k + 1}" for k in range(len(tracks))]
     names = [f"{track}_{node}" if len(tracks) > 1 else node for track in of for node in nodes]
     pixels = tracks.transpose(3, 0, 2, 1).reshape(tracks.shape[3], -1, 2)
     likelihood = None
     if "point_scores" in content:
-        scores = np.asarray(content["point_scores"], dtype=float)
+        scores = float_array(_dataset(content, "point_scores"), "point_scores", finite=False)
         if scores.shape == (len(tracks), len(nodes), tracks.shape[3]):
             likelihood = scores.transpose(2, 0, 1).reshape(len(pixels), -1)
     return TrackFile(tuple(names), pixels, likelihood, None, np.arange(float(len(pixels))))
@@ -398,7 +439,7 @@ def _text(value: Any) -> str:
 
 def _deeplabcut_hdf5(name: str, group: Any) -> TrackFile:
     """Return the tracks of a table of pandas, whose column names are pickled lists of texts."""
-    table = group["table"]
+    table = _dataset(group, "table")
     values = np.concatenate(
         [
             np.asarray(table[block], dtype=float).reshape(len(table), -1)

@@ -27,7 +27,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
-from ...common.files import require_size
+from ...common.files import DAMAGE, require_size
 from ...errors import InputError, listed
 from ..camera import Lens
 
@@ -161,7 +161,7 @@ def _parsed(text: str, file: Path) -> Mapping[str, Any]:
     for read in readers:
         try:
             content = read(plain)
-        except (ValueError, yaml.YAMLError, RecursionError):
+        except (*DAMAGE, yaml.YAMLError):  # readers of YAML raise anything for wrong tags
             continue
         if isinstance(content, Mapping):
             return content
@@ -177,7 +177,7 @@ def _numbers(value: Any, file: Path, key: str) -> Array:
     data = value.get("data") if isinstance(value, Mapping) else value
     try:
         numbers = np.asarray(data, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     if not np.isfinite(numbers).all():
         raise InputError(f"found {value!r}; expected numbers", where=f"{file}: {key}")
