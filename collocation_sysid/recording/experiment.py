@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
+from itertools import combinations
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -211,6 +212,7 @@ class Experiment:
         self._check_time()
         vars(self)["markers"] = self.markers.on_body(self.body, self._undeformed_places)
         self._check_nodes()
+        self._check_order_of_grasps()
         vars(self)["grasps"] = tuple(self._without_symmetric_loads(each) for each in self.grasps)
         self._check_start()
         self._check_actuators()
@@ -807,6 +809,38 @@ class Experiment:
                 f"the markers were associated with a body of {placed} nodes, but this body has "
                 f"{own}; expected an association with this body"
             )
+
+    def _check_order_of_grasps(self) -> None:
+        """Raise an `InputError` if one platen of an equilibrium passes the other one: the nodes of
+        two grasps exchange their order. Ends of slender bodies may do so.
+        """
+        if not self.is_static:
+            return
+        nodes_m = self.body.nodes_m
+        grasps = self.body_grasps
+        for (i, first), (k, second) in combinations(enumerate(grasps, 1), 2):
+            for axis in set(first.axis_indices.tolist()) & set(second.axis_indices.tolist()):
+                least = min(
+                    float(np.ptp(np.delete(nodes_m[g.nodes], axis, axis=1), axis=0).min())
+                    for g in (first, second)
+                )
+                a, b = (g.positions_at(nodes_m, self.t_s)[..., axis] for g in (first, second))
+                side = np.sign(
+                    nodes_m[first.nodes, axis].mean() - nodes_m[second.nodes, axis].mean()
+                )
+                low, high = (a, b) if side < 0 else (b, a)
+                own, other = (first, second) if side < 0 else (second, first)
+                apart_m = nodes_m[other.nodes, axis].min() - nodes_m[own.nodes, axis].max()
+                passed = np.flatnonzero(high.max(axis=1) <= low.min(axis=1))
+                if not 0 < apart_m < 4 * least or not passed.size:
+                    continue
+                nearer_m = apart_m - (high[passed[0]].min() - low[passed[0]].max())
+                raise InputError(
+                    f"{self.description}: at {self.t_s[passed[0]]:.4g} s grasps {i} and {k} are "
+                    f"{1e3 * nearer_m:.4g} mm nearer along {'xyz'[axis]} than in the undeformed body, "
+                    f"where {1e3 * apart_m:.4g} mm are between them; expected less: check the unit, the "
+                    "sign and the scale of the displacement"
+                )
 
     def _check_obstacles(self) -> None:
         """Raise an `InputError` if two obstacles have the same name."""

@@ -757,3 +757,15 @@ def test_a_quarter_of_a_cylinder_has_a_quarter_of_its_volume():
     assert whole.volume_m3 == pytest.approx(np.pi * 0.025**2 * 0.03, rel=1e-9)
     assert quarter.volume_m3 == pytest.approx(whole.volume_m3 / 4, rel=1e-9)
     assert quarter.points_m[:, :2].min() == 0.0
+
+
+def test_a_platen_that_passes_the_other_one_is_refused(tmp_path: Path):
+    """Displacements in mm that are read as cm."""
+    create_problem(tmp_path / "bench", kind="compression")
+    file = tmp_path / "bench" / "run_1.csv"
+    file.write_text(file.read_text().replace("(mm)", "(cm)"))
+    message = (
+        r"mm nearer along z than in the undeformed body, where 30 mm are between them; expected"
+    )
+    with pytest.raises(InputError, match=message):
+        Problem.read(tmp_path / "bench" / "problem.toml")
