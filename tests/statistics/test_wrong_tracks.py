@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
 from collocation_sysid.features.image_tracks.track_feature import track_hypotheses
 from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
 
-TEMPLATES = Path(cs.__file__).parent / "problem" / "templates"
 Change = Callable[[cs.ImageTracks], cs.ImageTracks]
 
 
@@ -215,16 +213,3 @@ def test_good_tracks_are_not_doubted() -> None:
     (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
     true = projected(filming("front"), motion_m())
     assert [*track_hypotheses(residual, true, "'front'")] == []
-
-
-@pytest.mark.parametrize(("every", "rate"), [(1, None), (2, 0.5)])
-def test_the_rate_of_a_video_is_named_if_it_is_wrong(every: int, rate: float | None) -> None:
-    """Every second image of the example, with the times of all."""
-    experiment = cs.Problem.read(TEMPLATES / "video" / "problem.toml").experiments[0]
-    (tracks,) = experiment.readings
-    assert isinstance(tracks, cs.ImageTracks)
-    pixels = pixels_of(tracks)[::every]
-    fewer = replace(tracks, t_s=tracks.sample_times_s[: len(pixels)], pixels=pixels)
-    found = [*hypotheses(replace(experiment, readings=[fewer]))]
-    assert len(found) == (0 if rate is None else 1)
-    assert all("rate" in each.concern().message for each in found)

@@ -386,9 +386,11 @@ def _sleap_labels(content: Any) -> TrackFile:
         stated = json.loads(_text(content["metadata"].attrs["json"]))
         nodes = [each["name"] for each in stated["nodes"]]
         order = [each["id"] for each in stated["skeletons"][0]["nodes"]]
-        frames, instances = content["frames"][()], content["instances"][()]
+        frames, instances = _dataset(content, "frames"), _dataset(content, "instances")
         # Points that a person placed, and predicted ones, by the type of an instance.
-        points_of: list[Any] = [content[name][()] if name in content else () for name in POINTS]
+        points_of: list[Any] = [
+            _dataset(content, name) if name in content else () for name in POINTS
+        ]
         # Until version 1.1 the centre of the first pixel was (0.5, 0.5).
         version = float(content["metadata"].attrs.get("format_id", 1.0))
         videos = np.unique(frames["video"])
