@@ -2,10 +2,11 @@
 
 A cylinder of MuJoCo (energy of St. Venant and Kirchhoff, damping of MuJoCo, a fine mesh) is recorded
 once. A body of this package with a coarser mesh and default damping law is identified from six noisy
-markers. Three motions are planned and executed in MuJoCo: the tip moves along a circle, moves by
-200 mm from rest to rest, and stays where it is while the hand moves by 50 mm. The tip is compared
-with its reference for the plan, for a plan with the estimates of the penalty method, and for hands
-that move as if the body were rigid, with and without a zero-vibration shaper.
+markers. Four motions are planned and executed in MuJoCo: the tip moves along a circle, moves by
+200 mm from rest to rest along a path of least jerk or on any path, and stays where it is while the
+hand moves by 50 mm. The tip is compared with its reference for the plan, for a plan with the
+estimates of the penalty method, and for hands that move as if the body were rigid, with and without a
+zero-vibration shaper.
 
     python scripts study_planning
     python scripts study_planning --tasks circle --no-penalty
@@ -265,11 +266,14 @@ class Wanted:
         Displacement (T, 3) of the tip from its place before the motion, by the share of the way.
     hand : callable
         Coordinates (T, 6) of the rigid hand, by the share of the way.
+    from_s : float
+        Time from which the tip is compared with its reference [s].
     """
 
     task: Task
     tip: Motion
     hand: Motion
+    from_s: float = 0.0
 
     def rigid_hand(self, t_s: Array) -> Array:
         """Return the coordinates (T, 6) of the hand of a rigid body."""
@@ -316,6 +320,15 @@ def straight() -> Wanted:
     return Wanted(_task(0.5, tip), tip, lambda share: np.pad(tip(share), ((0, 0), (0, 3))))
 
 
+def arrival() -> Wanted:
+    """The tip arrives 200 mm away after 0.5 s, on any path, and rests."""
+    wanted = straight()
+    (reference,) = wanted.task.reference
+    late = reference.model_copy(update={"from_s": wanted.task.duration_s})
+    task = wanted.task.model_copy(update={"reference": [late]})
+    return Wanted(task, wanted.tip, wanted.hand, from_s=task.duration_s)
+
+
 def still() -> Wanted:
     """The tip stays while the hand moves by 50 mm in 0.5 s, and turns."""
 
@@ -334,7 +347,7 @@ def still() -> Wanted:
     return Wanted(task, tip, hand)
 
 
-TASKS = {"circle": circle, "straight": straight, "still": still}
+TASKS = {"circle": circle, "straight": straight, "arrival": arrival, "still": still}
 
 
 @dataclass(frozen=True)
@@ -385,6 +398,7 @@ def errors_of(t_s: Array, tip: Array, wanted: Wanted) -> tuple[float, float, flo
     """
     duration_s = wanted.task.duration_s
     distance = np.linalg.norm(tip - wanted.tip(smooth(t_s, duration_s)), axis=1)
+    distance = distance[t_s >= wanted.from_s - 1e-9]
     after = tip[t_s >= duration_s - 1e-9]
     vibration = np.linalg.norm(after - after.mean(axis=0), axis=1).max()
     return float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(vibration)

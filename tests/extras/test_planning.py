@@ -1286,4 +1286,5 @@ def test_the_folder_of_a_plan_checks_its_execution_and_identifies_from_it(tmp_pa
     # The first recording of write_problem has other constants than its guesses.
     record(**TRUTH_OF_FILES)
     again = solved("identify.toml", "again")
-    assert again["parameters"]["mu_pa"]["value"] == pytest.approx(300.0, rel=0.05)
+    # Within 10 % of the truth; the guess is a third below it.
+    assert again["parameters"]["mu_pa"]["value"] == pytest.approx(300.0, rel=0.1)
