@@ -11,6 +11,7 @@ from kit.problems import GUESS, TRUTH, hung_cube, measured
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.runs.misspecifications import find_misspecifications
+from collocation_sysid.statistics.misspecification.sensor_misspecifications import whole_mistakes
 
 SIGMA = 2e-4
 STEPS = 15
@@ -53,6 +54,18 @@ MISTAKES = {
     "sensor-axes": lambda t_s, values: (t_s, values[:, [1, 0, 2]]),
     "sensor-clock": lambda t_s, values: (t_s - 0.008, values),
 }
+
+
+def test_likely_mistakes_of_a_sensor_are_deviations_that_correct_it():
+    experiment = sensed(MISTAKES["sensor-unit"])
+    probe, other = experiment.readings
+    predicted = 1e-3 * probe.measured_values
+    rows = {row.name: row for row in whole_mistakes(probe, predicted)}
+    assert set(rows) == {"sensor-sign", "sensor-unit"}
+    corrected, data = rows["sensor-unit"].corrected(experiment, np.ones(1))
+    assert data == {"factor": 1e-3}
+    np.testing.assert_allclose(corrected.readings[0].measured_values, predicted)
+    assert corrected.readings[1] is other
 
 
 @pytest.mark.long

@@ -17,8 +17,9 @@ are of one kind and fit, the other kinds are therefore compared by their likelih
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
 from ...program.custom_sensor_residual import CustomSensorResidual
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.homogeneous_deformation import DEFORMATIONS, HomogeneousDeformation
@@ -45,7 +47,12 @@ from ...recording.specimen import (
 )
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...statistics.misspecification.misspecification_hypothesis import (
+    Correction,
+    Hypothesis,
+    HypothesisTest,
+    corrected_hypothesis,
+)
 from ...statistics.thresholds import (
     BETTER,
     CERTAIN,
@@ -155,8 +162,9 @@ def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
     chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
     corrections: dict[str, list[Experiment]] = {}
     for each in chosen:
-        for hypothesis in _kind_hypotheses(each, ""):
-            corrections.setdefault(hypothesis.data["test"], []).append(hypothesis.corrected)
+        for row in _other_kinds(each):
+            if hypothesis := corrected_hypothesis(row, each):
+                corrections.setdefault(hypothesis.data["test"], []).append(hypothesis.corrected)
     stated = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
     if stated is None:
         return []
@@ -240,14 +248,10 @@ def _is_explained(
     plausible (`PLAUSIBLE_NUISANCE`), and χ² smaller by at least `DECISIVE`.
     """
     chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
-    corrected = [
-        each.corrected
-        for each in _hypotheses(chosen[index], ())
-        if (each.code, each.data) == (tested.code, tested.data)
-    ]
+    corrected = tested.deviation and corrected_hypothesis(tested.deviation, chosen[index])
     if not corrected:
         return False
-    chosen[index] = corrected[0]
+    chosen[index] = corrected.corrected
     refit = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
     if refit is None:
         return False
@@ -338,59 +342,80 @@ def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Ite
     """Yield each common mistake that is possible for a specimen, untested, with the experiment that
     corrects it.
     """
-    deformation = experiment.specimen
-    assert deformation is not None
-    of = f"'{experiment.name}'"
-    strain, _ = specimen_strains(experiment)
-    areas = area_ratios(deformation, strain)
-    # Stresses in unloading are smaller than in loading, like engineering in place of true stresses.
-    if areas is not None and np.ptp(areas) and not is_unloading(strain):
-        yield Hypothesis(
-            "specimen-true-stress", of, data={}, corrected=_with_stress(experiment, areas)
-        )
-    # No sign acts on the stretches of a file.
-    is_invertible = (
-        (strain >= 0).all() and strain.max() < 1.0 and "stretch" not in deformation.columns
-    )
-    if deformation.test in ("uniaxial", "equibiaxial", "planar") and is_invertible:
-        yield Hypothesis("specimen-compression", of, data={}, corrected=_compressed(experiment))
-    if deformation.held:
-        yield Hypothesis("specimen-gap", of, data={}, corrected=_of_undeformed_gap(experiment))
-    elif strain.max() > PERCENT_STRAIN and deformation.test != "volumetric":
-        yield Hypothesis("specimen-percent", of, data={}, corrected=_strained(experiment, 0.01))
-    yield from _placeholder_hypotheses(experiment, of)
-    yield from _kind_hypotheses(experiment, of)
+    for row in likely_mistakes(experiment, other_slopes_pa):
+        if hypothesis := corrected_hypothesis(row, experiment):
+            yield hypothesis
+
+
+def likely_mistakes(
+    experiment: Experiment, other_slopes_pa: Sequence[float]
+) -> Iterator[Deviation]:
+    """Yield the likely mistakes about a specimen. The name of a row is the code of its hypothesis."""
+    yield _mistake("specimen-true-stress", _of_engineering_stress)
+    yield _mistake("specimen-compression", _compressed)
+    yield _mistake("specimen-gap", _of_undeformed_gap)
+    yield _mistake("specimen-percent", _of_ratios)
+    for gauge in experiment.readings[1:]:
+        yield _mistake("specimen-placeholder", partial(_without_placeholder, name=gauge.name))
+    yield from _other_kinds(experiment)
     ratios = [other / _initial_slope(experiment) for other in other_slopes_pa]
     for unit, factor in UNIT_FACTORS.items():
         decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
         if (decades > np.log(UNIT_LIKE)).any():
-            corrected = _with_stress(experiment, np.full_like(strain, factor))
-            yield Hypothesis(
-                "specimen-unit", of, data={"unit": unit, "factor": factor}, corrected=corrected
-            )
+            yield _mistake("specimen-unit", partial(_of_unit, unit=unit))
 
 
-def _kind_hypotheses(experiment: Experiment, of: str) -> Iterator[Hypothesis]:
-    """Yield the other kinds of test that the measurements of a specimen can be from."""
+def _other_kinds(experiment: Experiment) -> Iterator[Deviation]:
+    """Yield the rows of other kinds of test that measurements of a specimen can be from."""
     assert experiment.specimen is not None
     strain, _ = specimen_strains(experiment)
     kinds = CONFUSED_TESTS.get(experiment.specimen.test, ())
     if experiment.specimen.test == "uniaxial" and (strain <= 0).all():
         kinds = (*kinds, "confined")
     for test in kinds:
-        if test == "simple-shear" and "stretch" in experiment.specimen.columns:
-            continue
-        corrected = _of_another_kind(experiment, test)
-        if corrected is not None:
-            yield Hypothesis("specimen-kind", of, data={"test": test}, corrected=corrected)
+        yield _mistake("specimen-kind", partial(_of_another_kind, test=test))
 
 
-def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
+def _mistake(name: str, corrected: Callable[[Experiment], Correction]) -> Deviation:
+    return Deviation(name, "1", corrected=lambda at, _: corrected(at), is_whole=True)
+
+
+def _of_engineering_stress(experiment: Experiment) -> Correction:
+    """Return the experiment with engineering stresses computed from true ones. Stresses in unloading
+    are smaller than in loading, like engineering in place of true stresses.
+    """
+    assert experiment.specimen is not None
+    strain, _ = specimen_strains(experiment)
+    areas = area_ratios(experiment.specimen, strain)
+    if areas is None or not np.ptp(areas) or is_unloading(strain):
+        return None
+    return _with_stress(experiment, areas), {}
+
+
+def _of_ratios(experiment: Experiment) -> Correction:
+    """Return the experiment with strains in percent divided by 100."""
+    deformation = experiment.specimen
+    assert deformation is not None
+    strain, _ = specimen_strains(experiment)
+    if deformation.held or strain.max() <= PERCENT_STRAIN or deformation.test == "volumetric":
+        return None
+    return _strained(experiment, 0.01), {}
+
+
+def _of_unit(experiment: Experiment, unit: str) -> Correction:
+    factor = UNIT_FACTORS[unit]
+    other = _with_stress(experiment, np.full(len(experiment.t_s), factor))
+    return other, {"unit": unit, "factor": factor}
+
+
+def _of_another_kind(experiment: Experiment, test: str) -> Correction:
     """Return a copy of the experiment with the same numbers, but those of another kind of test;
     None if that test cannot have all of them.
     """
     assert experiment.specimen is not None
-    if experiment.specimen.held:
+    if experiment.specimen.held or (
+        test == "simple-shear" and "stretch" in experiment.specimen.columns
+    ):
         return None
     strain, _ = specimen_strains(experiment)
     values = {gauge.name: gauge.measured_values[:, 0] for gauge in experiment.readings}
@@ -421,15 +446,17 @@ def _of_another_kind(experiment: Experiment, test: str) -> Experiment | None:
         )
         for gauge in experiment.readings
     ]
-    return replace(other, readings=readings, nuisance=experiment.nuisance)
+    return replace(other, readings=readings, nuisance=experiment.nuisance), {"test": test}
 
 
-def _of_undeformed_gap(experiment: Experiment) -> Experiment:
+def _of_undeformed_gap(experiment: Experiment) -> Correction:
     """Return a copy of the experiment of a pre-stretched shear test whose amounts of shear are the
     displacement over the distance before the stretch.
     """
     deformation = experiment.specimen
     assert deformation is not None
+    if not deformation.held:
+        return None
 
     def corrected(grasp: Grasp) -> Grasp:
         """Return a grasp with its shift along the direction of shear as without pre-stretch."""
@@ -438,24 +465,20 @@ def _of_undeformed_gap(experiment: Experiment) -> Experiment:
         shifts_m = grasp.poses.positions_m / [deformation.scale, 1.0, 1.0]
         return replace(grasp, poses=replace(grasp.poses, positions_m=shifts_m))
 
-    return replace(experiment, grasps=[corrected(grasp) for grasp in experiment.grasps])
+    return replace(experiment, grasps=[corrected(grasp) for grasp in experiment.grasps]), {}
 
 
-def _placeholder_hypotheses(experiment: Experiment, of: str) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each further measurement of a specimen whose strains, or stresses, are
-    all exactly zero: that it was not measured.
+def _without_placeholder(experiment: Experiment, name: str) -> Correction:
+    """Return the experiment without a further measurement whose strains, or stresses, are all
+    exactly zero: it was not measured.
     """
-    for gauge in experiment.readings[1:]:
-        values = gauge.measured_values[np.isfinite(gauge.measured_values)]
-        if (values == (1.0 if gauge.name == LATERAL_NAME else 0.0)).all():
-            others = [each for each in experiment.readings if each is not gauge]
-            quantity = "lateral strain" if gauge.name == LATERAL_NAME else gauge.name
-            yield Hypothesis(
-                "specimen-placeholder",
-                of,
-                data={"quantity": quantity},
-                corrected=replace(experiment, readings=others),
-            )
+    (gauge,) = (each for each in experiment.readings if each.name == name)
+    values = gauge.measured_values[np.isfinite(gauge.measured_values)]
+    if not (values == (1.0 if name == LATERAL_NAME else 0.0)).all():
+        return None
+    others = [each for each in experiment.readings if each is not gauge]
+    quantity = "lateral strain" if name == LATERAL_NAME else name
+    return replace(experiment, readings=others), {"quantity": quantity}
 
 
 def area_ratios(deformation: HomogeneousDeformation, strain: Array) -> Array | None:
@@ -494,17 +517,26 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
     return replace(experiment, grasps=[scaled(grasp) for grasp in experiment.grasps])
 
 
-def _compressed(experiment: Experiment) -> Experiment:
+def _compressed(experiment: Experiment) -> Correction:
     """Return a copy of the experiment with strains and stresses of the opposite sign, and lateral
-    strains, if the file has these and not stretches.
+    strains, if the file has these and not stretches, on which no sign acts.
     """
+    deformation = experiment.specimen
+    assert deformation is not None
+    strain, _ = specimen_strains(experiment)
+    is_invertible = (strain >= 0).all() and strain.max() < 1.0
+    if (
+        deformation.test not in ("uniaxial", "equibiaxial", "planar")
+        or "stretch" in deformation.columns
+        or not is_invertible
+    ):
+        return None
     reversed_stress = _with_stress(experiment, np.full(len(experiment.t_s), -1.0))
-    assert experiment.specimen is not None
-    is_reversed = "lateral_strain" in experiment.specimen.columns
+    is_reversed = "lateral_strain" in deformation.columns
     readings = [
         replace(gauge, values=2.0 - gauge.measured_values)
         if gauge.name == LATERAL_NAME and is_reversed
         else gauge
         for gauge in reversed_stress.readings
     ]
-    return _strained(replace(reversed_stress, readings=readings), -1.0)
+    return _strained(replace(reversed_stress, readings=readings), -1.0), {}

@@ -13,8 +13,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
+from ...common.array_types import Array
 from ...common.step_counting import search_activity
+from ...recording.deviation import Deviation
+from ...recording.experiment import Experiment
 from ..concerns import Concern, Grade
+
+# Experiment without a mistake, and data of its message; None if the mistake is impossible.
+Correction = tuple[Experiment, dict[str, object]] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +47,8 @@ class Hypothesis:
     remaining : float or None
         Misfit that remains if the hypothesis is true, in the unit of its test; None if it is not
         known.
+    deviation : Deviation, optional
+        Likely mistake of a table of such, whose name is the code.
     """
 
     code: str
@@ -48,6 +58,7 @@ class Hypothesis:
     handicap: float = 1.0
     strength: float = 0.0
     remaining: float | None = None
+    deviation: Deviation | None = None
 
     @property
     def cause(self) -> str:
@@ -122,6 +133,20 @@ class HypothesisTest:
             strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
             if strength > self.required_factor or misfit < self.noise_level < self.misfit:
                 yield replace(each, strength=strength, remaining=misfit)
+
+
+def corrected_hypothesis(
+    row: Deviation, experiment: Experiment, amplitudes: Array | None = None
+) -> Hypothesis | None:
+    """Return the hypothesis of a likely mistake, with the experiment without it as `corrected`; None
+    where it is impossible. `amplitudes` are those of its axes, see `Deviation.corrected`.
+    """
+    assert row.corrected is not None
+    correction = row.corrected(experiment, np.ones(1) if amplitudes is None else amplitudes)
+    if correction is None:
+        return None
+    other, data = correction
+    return Hypothesis(row.name, f"'{experiment.name}'", data=data, corrected=other, deviation=row)
 
 
 def clock_hypothesis(

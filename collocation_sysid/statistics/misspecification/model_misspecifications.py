@@ -33,7 +33,7 @@ from ..budget.shape_error import GRAVITY_M_S2, other_section, sag_m
 from ..budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect, shape_effect
 from ..linearised import LinearisedFit, linearise_fit
 from ..thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
-from .misspecification_hypothesis import Hypothesis
+from .misspecification_hypothesis import Correction, Hypothesis, corrected_hypothesis
 
 AXES = "xyz"
 # Most hypotheses of a screening that are fitted again.
@@ -48,9 +48,6 @@ SAME_SHAPE = 0.02
 MESH_AMPLITUDES = (0.5, 3.5)
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
-
-# Experiment without a mistake, and data of its message; None if it is impossible.
-Correction = tuple[Experiment, dict[str, object]] | None
 
 
 @dataclass(frozen=True)
@@ -244,13 +241,9 @@ def screened_bodies(
         decrease, amplitudes = linear_step(gram, own, np.ones(len(own)) if row.is_whole else None)
         if is_far and row.name == "law":
             decrease = np.inf
-        assert row.corrected is not None
-        correction = row.corrected(experiment, amplitudes)
-        if decrease < LEAST_DECREASE or correction is None:
-            continue
-        other, data = correction
-        hypothesis = Hypothesis(row.name, f"'{experiment.name}'", data=data, corrected=other)
-        found.append((decrease, hypothesis))
+        hypothesis = corrected_hypothesis(row, experiment, amplitudes)
+        if decrease >= LEAST_DECREASE and hypothesis is not None:
+            found.append((decrease, hypothesis))
     found.sort(key=lambda each: -each[0])
     count = Counter[str]()
     for _, hypothesis in found:

@@ -16,13 +16,14 @@ from ...common.array_types import Array, root_mean
 from ...errors import InputError
 from ...methods.solution import Solution
 from ...recording.custom_sensor import CustomSensor
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.measured_wrench import Wrench
 from ...recording.measurement import Measurement
 from ..axes import with_other_axes
 from ..linearised import LinearisedFit, linearise_fit
 from ..thresholds import BETTER, LEAST_DECREASE
-from .misspecification_hypothesis import Hypothesis
+from .misspecification_hypothesis import Correction, Hypothesis, corrected_hypothesis
 from .model_misspecifications import linear_step, projected_gram
 
 # Factors of wrong units: prefixes, percent, degrees, kilograms-force, pounds-force, psi, inches.
@@ -87,29 +88,39 @@ def sensor_hypotheses(
         origin = origins[experiment.measurements.index(sensor)]
         linear = _linear_mistakes(sensor, predictions[sensor], fit, own, origin)
         is_plain = not declared and not sensor.counts_pixels
-        whole = _mistakes(sensor, predictions[sensor]) if is_plain else ()
-        for hypothesis in (*whole, *linear):
-            values, t_s = hypothesis.corrected
-            try:
-                corrected = experiment.with_measurements(
-                    each.with_samples(t_s, values) if each is sensor else each
-                    for each in experiment.measurements
-                )
-            except InputError:
-                continue
-            title = sensor.samples_text or sensor.title
-            of = f"{title} of '{experiment.name}'"
-            yield replace(hypothesis, subject=of, corrected=corrected)
+        whole = whole_mistakes(sensor, predictions[sensor]) if is_plain else ()
+        title = sensor.samples_text or sensor.title
+        for row in (*whole, *linear):
+            if hypothesis := corrected_hypothesis(row, experiment):
+                yield replace(hypothesis, subject=f"{title} of '{experiment.name}'")
 
 
-def _mistakes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
-    """Yield wrong signs, units and axes of a sensor, with values (S, m) and times (S,) without
-    them.
+def _mistake(
+    code: str, sensor: Measurement, values: Array, t_s: Array | None = None, **data: object
+) -> Deviation:
+    """Return the row of a sensor that measured other values (S, m), or at other times (S,); its name
+    is the code of the hypothesis.
     """
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        times_s = sensor.sample_times_s if t_s is None else t_s
+        try:
+            other = experiment.with_measurements(
+                each.with_samples(times_s, values) if each is sensor else each
+                for each in experiment.measurements
+            )
+        except InputError:
+            return None
+        return other, data
+
+    return Deviation(code, sensor.unit, corrected=corrected, is_whole=True)
+
+
+def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
+    """Yield wrong signs, units and axes of a sensor."""
     measured = sensor.measured_values
-    t_s = sensor.sample_times_s
     sigmas = sensor.sample_sigmas
-    yield Hypothesis("sensor-sign", corrected=(-measured, t_s))
+    yield _mistake("sensor-sign", sensor, -measured)
     known = np.isfinite(measured + predicted)
     size = root_mean((measured / sigmas)[known] ** 2)
     ratio = root_mean((predicted / sigmas)[known] ** 2) / max(size, 1e-300)
@@ -120,13 +131,12 @@ def _mistakes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
     )
     for apart, factor in units[:MOST_UNITS]:
         if apart < SAME_SIZE:
-            corrected = factor * measured, t_s
-            yield Hypothesis("sensor-unit", data={"factor": factor}, corrected=corrected)
+            yield _mistake("sensor-unit", sensor, factor * measured, factor=factor)
     if measured.shape[1] % 3 == 0:
         yield from _other_axes(sensor, predicted)
 
 
-def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
+def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
     """Yield the other order or signs of the axes that bring the values nearest to the prediction;
     nothing if none is clearly nearer.
     """
@@ -139,16 +149,15 @@ def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Hypothesis]:
     turned = dict(with_other_axes(measured, has_sign=False))
     axes = min(turned, key=lambda each: misfit(turned[each]))
     if BETTER * misfit(turned[axes]) < misfit(measured):
-        corrected = turned[axes], sensor.sample_times_s
-        yield Hypothesis("sensor-axes", data={"axes": axes}, corrected=corrected)
+        yield _mistake("sensor-axes", sensor, turned[axes], axes=axes)
 
 
 def _linear_mistakes(
     sensor: Measurement, predicted: Array, fit: LinearisedFit, own: int, origin: Measurement
-) -> Iterator[Hypothesis]:
+) -> Iterator[Deviation]:
     """Yield a wrong zero and a wrong clock of a sensor, by the amounts that explain its residuals,
-    the block `own` of the fit, best; with values (S, m) and times (S,) without them. Messages state
-    the differences from `origin`, the sensor as it was stated.
+    the block `own` of the fit, best. Messages state the differences from `origin`, the sensor as it
+    was stated.
     """
     measured = sensor.measured_values
     t_s = sensor.sample_times_s
@@ -159,9 +168,9 @@ def _linear_mistakes(
     decrease, zeros[used] = _linear_step(fit, columns, own)
     whole = np.nanmean((origin.measured_values - measured)[:, used] + zeros[used], axis=0)
     shown = ", ".join(f"{each:.3g}" for each in whole)
-    data = {"offset": f"{shown} {sensor.unit}".rstrip()}
     if decrease > LEAST_DECREASE and not sensor.counts_pixels:
-        yield Hypothesis("sensor-zero", data=data, corrected=(measured - zeros, t_s))
+        offset = f"{shown} {sensor.unit}".rstrip()
+        yield _mistake("sensor-zero", sensor, measured - zeros, offset=offset)
     if fit.blocks[own].is_static or len(t_s) < 3:
         return
     rates = np.nan_to_num(np.gradient(predicted, t_s, axis=0))
@@ -169,7 +178,7 @@ def _linear_mistakes(
     lag_s = float(np.mean(t_s - origin.sample_times_s) + more_s)
     if decrease > LEAST_DECREASE and 0 < abs(lag_s) < LATEST * float(np.ptp(t_s)):
         named = {"by_ms": 1e3 * abs(lag_s), "when": "later" if lag_s > 0 else "earlier"}
-        yield Hypothesis("sensor-clock", data=named, corrected=(measured, t_s + more_s))
+        yield _mistake("sensor-clock", sensor, measured, t_s + more_s, **named)
 
 
 def _linear_step(fit: LinearisedFit, columns: Sequence[Array], own: int) -> tuple[float, Array]:
