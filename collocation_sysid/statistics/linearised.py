@@ -97,21 +97,6 @@ def observable_responses(collocation: Collocation, z: Array) -> list[ObservableR
     return map_experiments(of, collocation.iterates(z), threads=collocation.threads)
 
 
-def marker_sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """Return the derivatives d(markers)/dp of each experiment at its samples, (T, 3M, m) [m per
-    unit of p].
-
-    The m parameters p are those of `sensitivities`; the M markers are the first measurement of each
-    experiment.
-
-    Raises
-    ------
-    SimulationError
-        If the equations of a step are singular.
-    """
-    return [response.observed_changes[0] for response in observable_responses(collocation, z)]
-
-
 Mask = NDArray[np.bool_]
 
 # A parameter within this distance of a bound, in its logarithm, is at it: interior-point methods

@@ -27,7 +27,7 @@ from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.statistics.linearised import marker_sensitivities, sensitivities
+from collocation_sysid.statistics.linearised import observable_responses, sensitivities
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 AT_TRUTH = GUESS.with_guess(TRUTH)
@@ -136,12 +136,13 @@ def test_given_motion_does_not_depend_on_the_parameters():
     assert by_q[1:].any(axis=(1, 2)).all()
 
 
-def test_marker_sensitivities_are_those_of_the_nodes_at_the_samples():
+def test_sensitivities_of_markers_are_those_of_the_nodes_at_the_samples():
     collocation, z = simulated([cube_with_gaps(4), released_cube(3)], substeps=2)
-    nodes, markers = (sensitivities(collocation, z), marker_sensitivities(collocation, z))
-    for transcription, of_nodes, of_markers in zip(
+    nodes, markers = (sensitivities(collocation, z), observable_responses(collocation, z))
+    for transcription, of_nodes, response in zip(
         collocation.transcriptions, nodes, markers, strict=True
     ):
+        of_markers = response.observed_changes[0]
         observe = transcription.experiment.markers.predict_positions
         for k in range(collocation.nq):
             expected = observe(of_nodes[::2, :, k].reshape(-1, transcription.dof_count // 3, 3))
@@ -213,7 +214,8 @@ def fitted(collocation: Collocation, q, steps=2):
     weight = 1 / transcription.experiment.markers.sigma_m[0]
     for _ in range(steps):
         (x,) = positions(collocation, q)
-        (by_q,) = marker_sensitivities(collocation, collocation.pack(q, [x]))
+        (response,) = observable_responses(collocation, collocation.pack(q, [x]))
+        by_q = response.observed_changes[0]
         matrix = weight * by_q.reshape(-1, 4)
         q = q - np.linalg.lstsq(matrix, residuals(transcription, x).ravel())[0]
     return q
