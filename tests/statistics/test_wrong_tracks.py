@@ -148,6 +148,9 @@ def test_points_near_the_grasp_move_as_it_does(mistake: str) -> None:
     pixels = projected(camera, points)
     right = cs.ImageTracks("front", camera, T_S, pixels, [*places], sigma_px=0.3)
     assert [*hypotheses(swaying(right))] == []
+    lost = pixels.copy()
+    lost[:, 1] = lost[0, 1]
+    assert [*hypotheses(swaying(replace(right, pixels=lost)))] == []
     change, words = MOVED[mistake]
     (found,) = hypotheses(swaying(change(right)))
     assert words in found.message

@@ -45,10 +45,12 @@ SAGS = (0.0, 0.1, 0.25, 0.5)
 NEAR = 0.25
 MOST_NEAR = 4
 # Motion of these points [standard deviations of a pixel] from which on it is compared; deviation from
-# it, over the motion itself, that is suspicious; and the factor by which a correction decreases it.
+# it, over the motion itself, that is suspicious; the factor by which a correction decreases it, and
+# what it leaves at most.
 MOVING = 5.0
 UNLIKE = 0.6
 ALIKE = 2.0
+WELL_ALIKE = 0.25
 # Factor between corrections that explain the tracks equally well, deviation of the motion below which
 # they do, and how many are named.
 SIMILAR = 1.3
@@ -146,7 +148,8 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
     if experiment.is_static or not unlike > UNLIKE:
         return
     tried = [(trial.unlike(other), other) for other in trial.corrections(stated, with_times=True)]
-    alike = sorted((each for each in tried if each[0] * ALIKE < unlike), key=lambda each: each[0])
+    most = min(unlike / ALIKE, WELL_ALIKE)
+    alike = sorted((each for each in tried if each[0] < most), key=lambda each: each[0])
     possible = [
         each
         for each in alike[:MOST_NEAR]
