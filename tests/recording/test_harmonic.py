@@ -92,6 +92,31 @@ def test_tests_at_two_temperatures_determine_branches_and_shift():
     assert found.history[-1].loss < 4 * len(frequency_hz)
 
 
+@pytest.mark.long
+def test_a_harmonic_test_of_a_liquid_determines_its_instantaneous_modulus():
+    instantaneous_pa, tau_s = 2e5, 1.5
+    w = 2 * np.pi * np.geomspace(1e-3, 10.0, 9) * tau_s
+    modulus = instantaneous_pa * 1j * w / (1 + 1j * w)
+    noise = 0.01 * np.random.default_rng(0).normal(size=(2, 9)) * np.abs(modulus)
+    specimen = cs.Specimen.harmonic(
+        w / (2 * np.pi * tau_s),
+        np.abs(modulus.real + noise[0]),
+        np.abs(modulus.imag + noise[1]),
+        0.01,
+    )
+    parameters = {
+        "young_pa": cs.Unknown(0.1, lower=1e-3),
+        "poisson": 0.4999,
+        "b.share": 1e6,
+        "b.tau_s": cs.Unknown(),
+    }
+    problem = cs.Problem([specimen.experiment("neo-hookean", "dma", prony=("b",))], parameters)
+    found = cs.solve(problem)
+    assert found.status.converged
+    assert 1e6 * found.parameters["young_pa"] == pytest.approx(instantaneous_pa, rel=0.01)
+    assert found.parameters["b.tau_s"] == pytest.approx(tau_s, rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("arguments", "found"),
     [
