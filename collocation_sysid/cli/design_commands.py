@@ -75,7 +75,8 @@ def design(
     The motion begins and ends at rest in the first pose, respects the limits, and is optimised for
     parameters drawn from their priors. The output folder contains poses.csv, the error bars before
     and after, pictures, a film and a problem file that simulates the motion. Ctrl-C stops the
-    search and keeps the best motion so far; the exit code is then 130.
+    search and keeps the best motion so far; the exit code is then 130
+    (143 after SIGTERM).
     """
     from ..extras.design.design_folder import DESIGN_FILE, design_json, write_design
     from ..extras.design.design_page import design_summary
@@ -140,7 +141,8 @@ def plan(
 
     The motion begins at rest, ends at rest without residual vibration, and respects the limits. The
     output folder contains poses.csv for the robot, the predicted points, pictures, a film and
-    plan.json. Ctrl-C stops the search and keeps the best plan so far; the exit code is then 130.
+    plan.json. Ctrl-C stops the search and keeps the best plan so far; the exit code is then 130
+    (143 after SIGTERM).
     """
     from ..extras.planning import Task, plan_motion
     from ..extras.planning.plan_folder import PLAN_FILE, plan_json, plan_summary, write_plan
