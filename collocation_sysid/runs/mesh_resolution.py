@@ -70,17 +70,17 @@ def estimate_mesh_error(
     nodes = max(len(body.nodes.points_m) for body in bodies)
     if nodes > LARGEST_NODE_COUNT:
         reason = f"a body has {nodes:,} nodes, more than {LARGEST_NODE_COUNT:,}"
-        return known, f"the error of the mesh was not estimated: {reason}; `refine` measures it"
+        return known, _unknown_note(reason)
     try:
         change = mesh_change(collocation, solution.z, fit)
     except (InputError, SimulationError, np.linalg.LinAlgError) as error:
-        return known, f"the error of the mesh was not estimated: {error}"
+        return known, _unknown_note(str(error))
     values = parameter_values(collocation, solution.q + change)
     before = parameter_values(collocation, solution.q)
     modulus = next(_modulus_beyond_first_order(before, values), "")
     if modulus:
         reason = f"to first order, {modulus} would change to {values[modulus]:.2g} Pa"
-        return known, f"the error of the mesh was not estimated: {reason}; `refine` measures it"
+        return known, _unknown_note(reason)
     linear = collocation.parameters.list_linear_names()
     is_linear = np.array([item.name in linear for item in collocation.parameters.free], dtype=bool)
     change = np.where(is_linear, change, np.clip(change, -LARGEST_STEP, LARGEST_STEP))
@@ -92,6 +92,10 @@ def estimate_mesh_error(
         least_order=min(LEAST_ORDERS.get(body.element.name, 1.0) for body in bodies),
         linear=linear,
     ), ""
+
+
+def _unknown_note(reason: str) -> str:
+    return f"the intervals contain no error of the mesh: {reason}; `refine` measures it"
 
 
 def _modulus_beyond_first_order(

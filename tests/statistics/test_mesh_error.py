@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from kit.problems import measured, pressed_cube
 
 import collocation_sysid as cs
+from collocation_sysid.methods.solve_recorder import initial_variables
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.runs import mesh_resolution
 from collocation_sysid.runs.mesh_resolution import estimate_mesh_error, mesh_resolution_concerns
@@ -222,3 +225,16 @@ def test_moduli_that_would_change_sign_are_a_note(monkeypatch):
     assert refinement is None
     assert "mu_pa would change to" in note
     assert "`refine`" in note
+
+
+def test_intervals_of_a_body_that_obstacles_touch_say_that_they_contain_no_error_of_the_mesh():
+    problem = cs.Problem([measured(pressed_cube(2))], GUESS | {"gamma_r_s": 0.01})
+    collocation = problem.collocation()
+    z, _ = initial_variables(collocation)
+    solution = SimpleNamespace(collocation=collocation, z=z, q=z[: collocation.nq])
+    fit = linearise_fit(collocation, z)
+    refinement, note = estimate_mesh_error(problem, solution, fit, {}, None)
+    assert refinement is None
+    assert note == (
+        "the intervals contain no error of the mesh: obstacles touch the body; `refine` measures it"
+    )
