@@ -70,10 +70,11 @@ def probe_section(result: Result) -> TitledParts:
 def probe_lines(result: Result) -> list[str | Table]:
     """Return the table of the probes, how to read it, and their conclusions, for a terminal.
 
-    After the probes of every solve alone, without a significant result, only the conclusions are
-    returned. Empty without probes.
+    After the probes of every solve alone, if none is significant or the verdict is "good" because
+    the budget contains their effects, only the conclusions are returned. Empty without probes.
     """
-    if is_routine(result) and not any(probe.sentences for probe in result.probes):
+    is_found = any(probe.sentences for probe in result.probes)
+    if is_routine(result) and (not is_found or result.trust.verdict == "good"):
         return [*_conclusions(result)] if result.probes else []
     return [each for each in probe_section(result).parts if isinstance(each, (str, Table))]
 

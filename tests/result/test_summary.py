@@ -94,6 +94,16 @@ def test_tests_of_causes_state_that_they_found_none():
     assert NO_CAUSE in lines(tested)
 
 
+def test_a_probe_that_the_budget_explains_is_one_line_and_a_table_in_the_details():
+    first, *others = solved().probes
+    found = replace(first, sentences={"young_pa": "changes"}, chi_squared=30.0)
+    trust = replace(solved().trust, concerns=[])
+    result = replace(solved(), probes=[found, *others], trust=trust)
+    assert sum("the data determine" in line for line in lines(result)) == 1
+    assert not any(line.startswith("refit") for line in lines(result))
+    assert any(line.startswith("refit") for line in lines(result, details=True))
+
+
 def test_a_probe_without_a_finding_is_not_called_insignificant_beside_its_ratio():
     told = "\n".join(lines(solved(), details=True))
     assert "no significant" not in told
