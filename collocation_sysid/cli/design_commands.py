@@ -130,7 +130,11 @@ def plan(
             "reduced-space, or interior-point: IPOPT after it, with all positions as variables."
         ),
     ] = "reduced-space",
+    robust: Annotated[
+        bool, option("Minimise the mean over the uncertainty of a run's constants.")
+    ] = False,
     rate: Annotated[float | None, option("Rate of the poses for the robot.", "HZ")] = None,
+    mcap: Annotated[bool, option("Write trajectory.mcap, a trajectory of ROS, too.")] = False,
     experiment: OneExperiment = None,
     allow_code: AllowCode = False,
     out: OutputFolder = None,
@@ -165,6 +169,7 @@ def plan(
                 experiment=experiment,
                 allow_code=allow_code,
                 solver=solver,
+                robust=robust,
                 say=progress.announce,
                 watch=lambda number, value: progress.announce(
                     f"iteration {number}, objective {value:.4g} (Ctrl-C keeps the best)"
@@ -176,7 +181,9 @@ def plan(
             of_limits = error.where in Limits.model_fields
             of_options = (error.where or "").startswith("--")
             raise (error if of_options else error.located(limits if of_limits else task)) from error
-        write_plan(answer, folder, rate_hz=rate, with_film=film, say=progress.announce)
+        write_plan(
+            answer, folder, rate_hz=rate, with_film=film, with_mcap=mcap, say=progress.announce
+        )
     output.print_result(plan_json(answer), plan_summary(answer, folder))
     if answer.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)

@@ -1170,17 +1170,22 @@ def test_the_command_writes_the_plan(tmp_path: Path):
     (tmp_path / "limits.toml").write_text(LIMITS_TEXT)
     words = ["plan", str(problem), str(tmp_path / "task.toml"), "--limits",
              str(tmp_path / "limits.toml"), "--out", str(tmp_path / "out")]  # fmt: skip
-    outcome = run_command(*words, "--no-film", "--rate", "250")
+    outcome = run_command(*words, "--no-film", "--mcap", "--rate", "250")
     assert outcome.code == 0, outcome.err
     content = json.loads((tmp_path / "out" / "plan.json").read_text())
     assert content["references"][0]["rms_m"] < 1e-4
-    for name in ("poses.csv", "hand.csv", "predicted_points.csv", "hand.png", "tracking.png"):
+    pictures = "hand.png", "tracking.png"
+    for name in ("poses.csv", "hand.csv", "predicted_points.csv", "trajectory.mcap", *pictures):
         assert (tmp_path / "out" / name).stat().st_size
     (tmp_path / "task.toml").write_text(GOOD.replace("low", "lowest"))
     wrong = run_command(*words[:-1], str(tmp_path / "other"))
     assert wrong.code == 2
     assert "task.toml" in wrong.err
     assert not (tmp_path / "other").exists()
+    (tmp_path / "task.toml").write_text(GOOD)
+    robust = run_command(*words[:-1], str(tmp_path / "other"), "--robust")
+    assert robust.code == 2
+    assert "--robust: a robust plan needs a run with uncertainties" in robust.err
 
 
 def test_the_content_of_plan_json_is_that_of_the_plan():
