@@ -233,8 +233,6 @@ def solve_reduced(
     programs = scenarios or (program,)
     drive = program.drive(c)
     motions = [each.simulate(c, drive=drive) for each in programs]
-    matrix, target = program.residuals
-    by_jerk, jerk = program.effort
     value = _mean_objective(programs, c, motions)
     violation = _violation(program, motions)
     multipliers = np.zeros(len(program.hand_limits.names))
@@ -245,25 +243,13 @@ def solve_reduced(
             if watch is not None:
                 watch(len(answer.history) - 1, value)
             slopes = [p.driven.respond(drive, x) for p, x in zip(programs, motions, strict=True)]
-            share = 1 / np.sqrt(len(programs))
-            rows = np.vstack([*(share * (matrix @ s.reshape(-1, len(c))) for s in slopes), by_jerk])
-            residual = np.concatenate(
-                [*(share * (matrix @ x.ravel() - target) for x in motions), by_jerk @ c + jerk]
-            )
-            undamped, present = triangular(rows, residual)
+            undamped, present = _linearised(program, c, motions, slopes)
             near = program.hand_limits.linearise(c)
             while True:
-                root, offset = undamped, present
-                if damping:
-                    lengths = np.sqrt(damping) * np.linalg.norm(undamped, axis=0)
-                    root, offset = triangular(
-                        np.vstack([undamped, np.diag(lengths)]),
-                        np.concatenate([present, np.zeros(len(c))]),
-                    )
+                root, offset = _damped(undamped, present, damping)
                 step, trial_multipliers = _step(program, root, offset, near, motions, slopes)
                 trial = c + step
-                change = undamped @ step
-                predicted = -float(change @ (2 * present + change))
+                predicted = _predicted_decrease(undamped, present, step)
                 size = float(np.abs(step).max())
                 allowed = violation <= LARGEST_SHARE - 1
                 is_flat = allowed and predicted <= limits.decrease * (value + 1e-300)
@@ -310,6 +296,36 @@ def solve_reduced(
     except KeyboardInterrupt:
         answer.status = "interrupted"
     return answer
+
+
+def _linearised(
+    program: PlannedProgram, c: Array, motions: list[Array], slopes: list[Array]
+) -> tuple[Array, Array]:
+    """Return the least-squares problem of a step, without limits, as in `triangular`."""
+    matrix, target = program.residuals
+    by_jerk, jerk = program.effort
+    share = 1 / np.sqrt(len(motions))
+    rows = np.vstack([*(share * (matrix @ s.reshape(-1, len(c))) for s in slopes), by_jerk])
+    residual = np.concatenate(
+        [*(share * (matrix @ x.ravel() - target) for x in motions), by_jerk @ c + jerk]
+    )
+    return triangular(rows, residual)
+
+
+def _damped(undamped: Array, present: Array, damping: float) -> tuple[Array, Array]:
+    """Return a least-squares problem with rows that keep the unknowns small."""
+    if not damping:
+        return undamped, present
+    lengths = np.sqrt(damping) * np.linalg.norm(undamped, axis=0)
+    return triangular(
+        np.vstack([undamped, np.diag(lengths)]),
+        np.concatenate([present, np.zeros(undamped.shape[1])]),
+    )
+
+
+def _predicted_decrease(undamped: Array, present: Array, step: Array) -> float:
+    change = undamped @ step
+    return -float(change @ (2 * present + change))
 
 
 def _step(
