@@ -233,7 +233,7 @@ def validate_as(annotation: Any, value: Any, name: str) -> Any:
     `InputError` about `name` if it is refused.
     """
     try:
-        return _validator(form_of(annotation, {})).validate_python(value)
+        return _validator_of(annotation).validate_python(value)
     except ValidationError as error:
         faults = error.errors(include_url=False)
     part, found = _part_at_fault(value, faults[0])
@@ -243,6 +243,11 @@ def validate_as(annotation: Any, value: Any, name: str) -> Any:
 @cache
 def _validator(form: Any) -> TypeAdapter[Any]:
     return TypeAdapter(form)
+
+
+@cache  # forms that are made of the same annotation differ
+def _validator_of(annotation: Any) -> TypeAdapter[Any]:
+    return _validator(form_of(annotation, {}))
 
 
 def _part_at_fault(value: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:

@@ -15,6 +15,8 @@ are downloaded at their first use.
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..common.time_dependence import at_times, values_over_time
 from ..errors import InputError
 from ..fem.laws.materials import Energy, Material
@@ -241,8 +243,10 @@ def _rubber(
             f"largest_stretch = {limit:g}; expected at least {1 + largest.min():.4g}, the smallest "
             f"stretch of '{name}' of {dataset}"
         )
-    exact = {"strain_zero": 0.0, "area_error": 0.0} if is_exact else {}
-    specimen = Specimen(
-        test, **values_over_time(at_times(table, 1 + largest <= limit)), sigma_pa=sigma_pa, **exact
-    )
+    rows = values_over_time(at_times(table, 1 + largest <= limit))
+    stated: dict[str, Any] = {name: value for name, value in rows.items() if value is not None}
+    stated["sigma_pa"] = sigma_pa
+    if is_exact:
+        stated |= {"strain_zero": 0.0, "area_error": 0.0}
+    specimen = Specimen(test, **stated)
     return specimen.experiment(material, name)

@@ -124,12 +124,14 @@ def _specimen(name: str, gradients: Array, stresses_pa: Array, sigma_pa: float |
     test, component = KINDS[kind]
     strain = gradients[:, *component] - float(component == (0, 0))
     stress_pa = stresses_pa[:, *component]
-    second: dict[str, Array] = {}
+    others: dict[str, Any] = {}
     if test == "biaxial":
-        second = {"second_strain": gradients[:, 1, 1] - 1}
+        others = {"second_strain": gradients[:, 1, 1] - 1}
     if test in ("biaxial", "planar") and stresses_pa[:, 1, 1].any():
-        second["second_stress_pa"] = stresses_pa[:, 1, 1]
-    held = {"axial_stretch": float(gradients[0, 0, 0])} if kind == "CSS" else {}
+        others["second_stress_pa"] = stresses_pa[:, 1, 1]
+    if kind == "CSS":
+        others["axial_stretch"] = float(gradients[0, 0, 0])
     sigma_pa = sigma_pa or RELATIVE_SIGMA * float(np.abs(stress_pa).max())
-    exact = {"strain_zero": 0.0, "area_error": 0.0}
-    return Specimen(test, strain, stress_pa, sigma_pa=sigma_pa, **exact, **second, **held)
+    return Specimen(
+        test, strain, stress_pa, sigma_pa=sigma_pa, strain_zero=0.0, area_error=0.0, **others
+    )

@@ -80,7 +80,7 @@ def undistorted(each: ImageTracks) -> ImageTracks:
     flat = np.asarray(each.pixels).reshape(-1, 2)
     rays = each.camera.points_at_unit_depth(flat)
     shown = each.camera.undistorted_pixels(rays)
-    return replace(each, pixels=shown.reshape(np.shape(each.pixels)))
+    return replace(each, pixels=shown.reshape(np.asarray(each.pixels).shape))
 
 
 def normalised(each: ImageTracks) -> ImageTracks:

@@ -267,6 +267,12 @@ def test_quantities_stated_as_exact_are_probed_too():
         CLOCK: 1e-4,
         ANISOTROPY: 0.05,
         TEMPERATURE.name: 5e-3,
+        "image_focal": 5e-3,
+        "image_centre_px": 2.0,
+        "image_time_s": 5e-3,
+        "image_clock_rate": 1e-4,
+        "image_line_delay_s": 1e-5,
+        "image_drift_px": 0.2,
     }
     assert probed_deviations({**exact, DRIFT: 0.1})[DRIFT] == 0.1
 

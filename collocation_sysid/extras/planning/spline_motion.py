@@ -101,7 +101,7 @@ class SplineSpace:
     @cached_property
     def moves_hand(self) -> NDArray[np.bool_]:
         """Whether each unknown (c,) belongs to the hand, and not to a signal."""
-        return self._map[:, :HAND].any(axis=(0, 1))
+        return np.asarray(self._map[:, :HAND].any(axis=(0, 1)))
 
     @cached_property
     def _given(self) -> Array:

@@ -193,7 +193,7 @@ class Outlines(CameraImages):
         same = len(times) == len(self.sample_times_s) and np.allclose(times, self.sample_times_s)
         if not same or values is None:
             return replace(self, t_s=t_s, masks=None)
-        kept = np.isfinite(np.asarray(values, dtype=float)).any(axis=1)
+        kept = np.asarray(np.isfinite(np.asarray(values, dtype=float)).any(axis=1))
         return replace(
             self, masks=[m if k else None for m, k in zip(self.all_masks, kept, strict=True)]
         )
