@@ -153,15 +153,13 @@ def fetch(name: str) -> Path:
     if name in DATASETS:
         return dataset_folder(name)
     require_among(name, [*COLLECTIONS, *DATASETS], where="dataset")
-    collection = COLLECTIONS[name]
     folder = data_folder() / name
-    for path in collection.files:
-        _fetch_file(name, path, folder)
+    _download(name, COLLECTIONS[name], folder)
     return folder
 
 
-def _fetch_file(name: str, path: str, folder: Path) -> None:
-    """Bring a file of a collection into a folder, unless the same file is there."""
+def _download(name: str, collection: PublicCollection, folder: Path) -> None:
+    """Bring the files of a collection into a folder, unless they are there."""
     try:
         import pooch
     except ImportError as error:
@@ -169,21 +167,22 @@ def _fetch_file(name: str, path: str, folder: Path) -> None:
             f"the data set {name!r} is downloaded by pooch, which is missing; expected {INSTALLATION}",
             where="dataset",
         ) from error
-    collection = COLLECTIONS[name]
-    url, checksum = collection.url(path), collection.files[path]
-    file = PurePosixPath(path).name
-    downloads = pooch.create(folder, "", registry={file: checksum}, urls={file: url})
-    try:
-        downloads.fetch(file)
-    except ValueError as error:  # pooch's, for another checksum
-        raise InputError(
-            f"{url} of the data set {name!r} differs from its checksum; expected SHA-256 "
-            f"{checksum}: the download is incomplete or the source has changed; nothing was kept",
-            where="dataset",
-        ) from error
-    except OSError as error:  # of the network, which requests derives from it, or of the folder
-        raise InputError(
-            f"{url} of the data set {name!r} cannot be downloaded ({type(error).__name__}); "
-            f"expected a network, or a copy of the file as {folder / file}",
-            where="dataset",
-        ) from error
+    urls = {PurePosixPath(path).name: collection.url(path) for path in collection.files}
+    checksums = dict(zip(urls, collection.files.values(), strict=True))
+    downloads = pooch.create(folder, "", registry=checksums, urls=urls)
+    for file, url in urls.items():
+        try:
+            downloads.fetch(file)
+        except ValueError as error:  # pooch's, for another checksum
+            raise InputError(
+                f"{url} of the data set {name!r} differs from its checksum; expected SHA-256 "
+                f"{checksums[file]}: the download is incomplete or the source has changed; nothing "
+                "was kept",
+                where="dataset",
+            ) from error
+        except OSError as error:  # of the network, which requests derives from it, or of the folder
+            raise InputError(
+                f"{url} of the data set {name!r} cannot be downloaded ({type(error).__name__}); "
+                f"expected a network, or a copy of the file as {folder / file}",
+                where="dataset",
+            ) from error

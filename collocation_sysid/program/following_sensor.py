@@ -18,7 +18,7 @@ from .correspondences import Correspondences
 from .custom_sensor_residual import CorrespondingSensorResidual
 from .markers.marker_association import MarkerAssociation
 from .measurement_model import CorrespondenceModel
-from .measurement_residual import GROUP, ResidualExpression, SampledMotion
+from .measurement_residual import GROUP, SampledMotion
 from .observables import PointPositions
 
 
@@ -133,11 +133,6 @@ class FollowingSensorModel(CorrespondenceModel):
     @cached_property
     def _observable(self) -> PointPositions:
         return all_nodes(self.grid.experiment.body, len(self.grid.t_s))
-
-    @cached_property
-    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions, which are the same for all correspondences."""
-        return {}
 
     def first_correspondences(self) -> NodesOfSamples:
         """Return the correspondences with the undeformed body in its grasps."""

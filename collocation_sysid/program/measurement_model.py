@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..model.nuisance_map import NuisanceMap
 from ..recording.experiment import Experiment
 from .association import Association
 from .correspondences import CorrespondenceResidual, Correspondences
-from .measurement_residual import MeasurementResidual
+from .measurement_residual import MeasurementResidual, ResidualExpression
 from .reactions.reaction_resultant import ReactionGrid
 
 
@@ -97,6 +98,11 @@ class MeasurementModel(ABC):
 
 class CorrespondenceModel(MeasurementModel):
     """Measurement that refers to points of the body which follow the estimates."""
+
+    @cached_property
+    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
+        """Generated functions, which are the same for all correspondences."""
+        return {}
 
     @abstractmethod
     def first_correspondences(self) -> Correspondences:

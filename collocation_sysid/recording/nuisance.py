@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -653,47 +654,36 @@ DEPTH_EDGE = Deviation(
 # Errors of ordinary cameras. A camera states its own prior deviations (`CameraImages`); these rows
 # count for those that it does not state. Rows that are "tested" only have no place in the budget by
 # default, because a camera that states zero is exact.
-IMAGE_TURN = Deviation(
+_image_error = partial(Deviation, sigma=None, of="images", changes=(), reach=IMAGE_REACH)
+IMAGE_TURN = _image_error(
     "image_turn_rad",
     "rad",
-    sigma=None,
     key="image_pose",
-    of="images",
     axes="x y z",
-    changes=(),
     applies=_has_image_cameras,
-    reach=IMAGE_REACH,
     by="length",
     label="turn, {axis}, of {which}",
     sentence="rotation of a camera of images: {size}",
     remedy=CALIBRATE_A_POSE,
     description="rotation of each ordinary camera about its axes",
 )
-IMAGE_SHIFT = Deviation(
+IMAGE_SHIFT = _image_error(
     "image_shift_m",
     "m",
-    sigma=None,
     key="image_pose",
-    of="images",
     axes="x y z",
-    changes=(),
     applies=_has_image_cameras,
-    reach=IMAGE_REACH,
     by="length",
     label="shift, {axis}, of {which}",
     sentence="translation of a camera of images: {size}",
     remedy=CALIBRATE_A_POSE,
     description="translation of each ordinary camera along its axes",
 )
-IMAGE_FOCAL = Deviation(
+IMAGE_FOCAL = _image_error(
     "image_focal",
     "1",
-    sigma=None,
     key="image_focal",
-    of="images",
-    changes=(),
     applies=_has_image_cameras,
-    reach=IMAGE_REACH,
     tested=5e-3,
     widening=WIDENING,
     assumed="the focal lengths of the cameras are those of the calibration",
@@ -703,16 +693,12 @@ IMAGE_FOCAL = Deviation(
     sentence="error of a focal length: {signed}",
     description="relative error of both focal lengths of each ordinary camera",
 )
-IMAGE_CENTRE = Deviation(
+IMAGE_CENTRE = _image_error(
     "image_centre_px",
     "px",
-    sigma=None,
     key="image_centre",
-    of="images",
     axes="u v",
-    changes=(),
     applies=_has_image_cameras,
-    reach=IMAGE_REACH,
     tested=2.0,
     widening=WIDENING,
     assumed="the principal points of the cameras are those of the calibration",
@@ -722,15 +708,11 @@ IMAGE_CENTRE = Deviation(
     sentence="error of a principal point: {size}",
     description="error of the principal point of each ordinary camera",
 )
-IMAGE_TIME = Deviation(
+IMAGE_TIME = _image_error(
     "image_time_s",
     "s",
-    sigma=None,
     key="image_time",
-    of="images",
-    changes=(),
     applies=_is_filmed_motion,
-    reach=IMAGE_REACH,
     tested=5e-3,
     widening=WIDENING,
     assumed="the clocks of cameras and gripper agree",
@@ -740,15 +722,11 @@ IMAGE_TIME = Deviation(
     sentence="delay of images: {signed}",
     description="delay of the images of each ordinary camera by the clock of the grasps",
 )
-IMAGE_CLOCK_RATE = Deviation(
+IMAGE_CLOCK_RATE = _image_error(
     "image_clock_rate",
     "1",
-    sigma=None,
     key="image_clock_rate",
-    of="images",
-    changes=(),
     applies=_is_filmed_motion,
-    reach=IMAGE_REACH,
     considered=1e-4,
     widening=WIDENING_OF_FRAME_RATES,
     assumed="the stated frame rates of the cameras are right",
@@ -758,15 +736,11 @@ IMAGE_CLOCK_RATE = Deviation(
     sentence="error of a frame rate: {signed}",
     description="relative error of the time between the images of each ordinary camera",
 )
-IMAGE_LINE_DELAY = Deviation(
+IMAGE_LINE_DELAY = _image_error(
     "image_line_delay_s",
     "s",
-    sigma=None,
     key="image_line_delay",
-    of="images",
-    changes=(),
     applies=_is_filmed_motion,
-    reach=IMAGE_REACH,
     considered=1e-5,
     widening=WIDENING,
     assumed="the rows of an image are exposed as stated (line_delay_s)",
@@ -777,13 +751,10 @@ IMAGE_LINE_DELAY = Deviation(
     sentence="error of a line delay: {signed}",
     description="error of the time from one row of an image to the next, of each ordinary camera",
 )
-IMAGE_DRIFT = Deviation(
+IMAGE_DRIFT = _image_error(
     "image_drift_px",
     "px",
-    sigma=None,
     key="image_drift",
-    of="images",
-    changes=(),
     applies=_is_filmed_motion,
     reach=UNLIMITED_REACH,
     considered=0.2,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import lru_cache
 from itertools import product
 from typing import ClassVar
 
@@ -38,6 +39,10 @@ class Solid(ABC):
         """Return the signed distance of a point (3,) from the surface [m], an expression; negative
         inside.
         """
+
+    def signed_distances_m(self, points_m: Array) -> Array:
+        """Return the signed distances (n,) of points (n, 3) from the surface [m]."""
+        return _distance(self)(points_m.T).full()[0]
 
     @abstractmethod
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
@@ -81,6 +86,12 @@ def _unit_vector_converter(name: str) -> Callable[[ArrayLike], Array]:
         return vector / length
 
     return made
+
+
+@lru_cache(maxsize=64)
+def _distance(solid: Solid) -> ca.Function:
+    point = ca.SX.sym("point", 3)
+    return ca.Function("distance", [point], [solid.signed_distance(point)])
 
 
 @declaration

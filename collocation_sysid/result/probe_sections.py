@@ -190,10 +190,12 @@ def _conclusions(result: Result) -> Iterator[str]:
     elif not significant and is_routine(result):
         tested = listed(source_label(probe.name) for probe in _largest_probes(result))
         first = max(result.probes, key=lambda probe: probe.chi_squared)
-        # Of independent residuals, such a decrease would be a finding.
+        # Of independent residuals, the decrease is the square of the ratio.
+        why = "not significant because the residuals are not independent"
+        if _ratio(first) ** 2 > first.chi_squared / 2:
+            why = "explained as well by deviations that the uncertainty budget grants"
         reason = (
-            f"; χ² decreases by {first.chi_squared:.3g} with {source_label(first.name)}, which is "
-            "not significant because the residuals are not independent"
+            f"; χ² decreases by {first.chi_squared:.3g} with {source_label(first.name)}, which is {why}"
             if first.chi_squared > NOTICEABLE
             else ""
         )

@@ -29,6 +29,14 @@ PLACES_M = {
     "near_top": (0.04, 0.01, 0.02),
 }
 NAMES = tuple(PLACES_M)
+# Statements of a camera without errors, and of exact places.
+EXACT: dict[str, Any] = {
+    "pose_sigma": cs.PoseSigma(turn_deg=0.0, shift_m=0.0),
+    "focal_sigma": 0.0,
+    "centre_sigma_px": 0.0,
+    "clock_sigma_s": 0.0,
+    "place_sigma_m": 0.0,
+}
 
 
 def filming(name: str, **changes: Any) -> cs.Camera:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from kit.depth import looking
 from kit.filmed import (
+    EXACT,
     EYES_M,
     MATRIX,
     NAMES,
@@ -37,13 +38,6 @@ from collocation_sysid.features.image_tracks.track_residual import ImageTrackRes
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.observables import ObservableDerivatives
 
-EXACT: dict[str, Any] = {
-    "pose_sigma": cs.PoseSigma(turn_deg=0.0, shift_m=0.0),
-    "focal_sigma": 0.0,
-    "centre_sigma_px": 0.0,
-    "clock_sigma_s": 0.0,
-    "place_sigma_m": 0.0,
-}
 # Every deviation is estimated.
 FREE: dict[str, Any] = {
     "clock_rate_sigma": 1e-3,

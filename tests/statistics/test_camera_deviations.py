@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from kit.filmed import (
     DISTORTION,
+    EXACT,
     MATRIX,
     NAMES,
     NOISE_PX,
@@ -38,13 +39,6 @@ from collocation_sysid.statistics.probes.relaxed_assumptions import SolvedFit, p
 from collocation_sysid.statistics.probes.routine_probes import probed_deviations, routine_probes
 from collocation_sysid.statistics.uncertainty import AUTO
 
-EXACT: dict[str, Any] = {
-    "pose_sigma": cs.PoseSigma(turn_deg=0.0, shift_m=0.0),
-    "focal_sigma": 0.0,
-    "centre_sigma_px": 0.0,
-    "clock_sigma_s": 0.0,
-    "place_sigma_m": 0.0,
-}
 SINCE_S = T_S - T_S[0]
 
 

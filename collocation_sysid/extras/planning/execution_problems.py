@@ -120,18 +120,18 @@ def _executed_table(table: dict[str, Any], plan: MotionPlan, place: Path) -> dic
             write_poses_csv(place / each["poses"], standing)
     planned = {each.name for each in plan.program.signals}
     template = body.template
-    for kind, unit, actuators in (
-        ("tendon", "tension_n", template.tendons),
-        ("pressure", "pressure_pa", template.pressures),
+    for kind, of_file, of_value, actuators in (
+        ("tendon", "tension", "tension_n", template.tendons),
+        ("pressure", "pressure", "pressure_pa", template.pressures),
     ):
         # Names of the tables are optional.
         for each, actuator in zip(table.get(kind, []), actuators, strict=True):
-            _without(each, {"tension", "pressure", "tension_n", "pressure_pa"})
+            _without(each, {of_file, of_value})
             if actuator.name in planned:
-                each[kind if kind == "pressure" else "tension"] = command_file(actuator.name)
+                each[of_file] = command_file(actuator.name)
             else:
                 each.pop("lag_s", None)
-                each[unit] = standing_value(actuator, template.t_s[0])
+                each[of_value] = standing_value(actuator, template.t_s[0])
     _without(table["markers"], set(OF_MARKERS))
     table["markers"]["file"] = MARKERS_FILE
     return table

@@ -116,8 +116,7 @@ def task_signals(task: Task, template: Experiment) -> tuple[Signal, ...]:
                 where=f"{where}: name",
             )
         actuator = kinds[kind][known.index(section.name)]
-        slope = float(actuator.energy_amplitude(1.0, actuator.factor, 0.0))
-        offset = getattr(actuator, actuator.offset_field) / actuator.factor
+        slope, offset = _amplitude_line(actuator)
         initial = standing_value(actuator, template.t_s[0])
         lowest, highest = section.range
         if kind == "tendon":  # a slack tendon exerts no force
@@ -143,9 +142,15 @@ def standing_value(actuator: Tendon | Pressure, t_s: float) -> float:
     """Return the tension or pressure at a time of the recording, before factor and loss; of a slack
     tendon, the largest with which it is slack.
     """
-    slope = float(actuator.energy_amplitude(1.0, actuator.factor, 0.0))
+    slope, offset = _amplitude_line(actuator)
     (amplitude,) = actuator.energy_amplitude_at(np.array([t_s]))
-    return float(amplitude / slope + getattr(actuator, actuator.offset_field) / actuator.factor)
+    return float(amplitude / slope + offset)
+
+
+def _amplitude_line(actuator: Tendon | Pressure) -> tuple[float, float]:
+    """Return slope and offset of the amplitude, see `Signal`."""
+    slope = float(actuator.energy_amplitude(1.0, actuator.factor, 0.0))
+    return slope, getattr(actuator, actuator.offset_field) / actuator.factor
 
 
 def commanded(

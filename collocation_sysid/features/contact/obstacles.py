@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import casadi as ca
 import numpy as np
 
 from ...common.array_types import Array
@@ -68,15 +67,6 @@ def obstacle_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
             yield from _undriven_load(experiment, obstacle, forces)
             if not experiment.gravity_m_s2.any():
                 yield from _load_without_contact(experiment, obstacle, forces)
-
-
-def signed_distances_m(obstacle: Obstacle, points_m: Array) -> Array:
-    """Return the signed distances (n,) of points (n, 3) in an obstacle's frame from its
-    surface [m], negative inside.
-    """
-    point = ca.SX.sym("point", 3)
-    gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
-    return np.asarray(gap.map(len(points_m))(points_m.T), dtype=np.float64).ravel()
 
 
 def _diagonal_m(experiment: Experiment) -> float:
@@ -285,5 +275,5 @@ def _smallest_gaps_m(experiment: Experiment, obstacle: Obstacle, times_s: Array)
     for k, shape_m in enumerate(shapes_m):
         points_m = (weights @ shape_m[triangles]).reshape(-1, 3)
         in_frame_m = (points_m - translations_m[k]) @ rotations[k]
-        gaps_m[k] = signed_distances_m(obstacle, in_frame_m).min()
+        gaps_m[k] = obstacle.shape.signed_distances_m(in_frame_m).min()
     return gaps_m

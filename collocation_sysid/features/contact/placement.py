@@ -14,7 +14,6 @@ from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.obstacle_solids import Plane
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
-from .obstacles import signed_distances_m
 
 # Penetration of a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01
@@ -63,7 +62,7 @@ def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothes
         0, : len(experiment.body.nodes.points_m)
     ]
     rotations, translations_m = obstacle.poses.at(experiment.t_s[:1])
-    gaps_m = signed_distances_m(obstacle, (nodes_m - translations_m[0]) @ rotations[0])
+    gaps_m = obstacle.shape.signed_distances_m((nodes_m - translations_m[0]) @ rotations[0])
     deep_m = DEEP * float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
     share = float((gaps_m < -deep_m).mean())
     if share <= MOST_INSIDE:

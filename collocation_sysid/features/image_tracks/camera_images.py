@@ -20,7 +20,7 @@ from ...common.declarations import declaration, key
 from ...common.validated_types import NotNegative
 from ...errors import InputError
 from ...program.custom_sensor_residual import CorrespondingSensorResidual
-from ...program.measurement_residual import lagrange_weights
+from ...program.measurement_residual import GROUP, lagrange_weights
 from ...recording.camera import Camera
 from ...recording.custom_sensor import CustomSensor
 from ...recording.deviation import Deviation
@@ -167,6 +167,11 @@ class CameraImages(CustomSensor):
         return {name: float(sigma) for name, sigma in sigmas.items() if sigma}
 
     @property
+    def number_names(self) -> Sequence[str]:
+        """Names of the columns."""
+        return self.columns
+
+    @property
     def camera_name(self) -> str:
         """Name of the camera, which measurements in its images share with its errors."""
         return self.name
@@ -192,6 +197,15 @@ class CameraImagesResidual(CorrespondingSensorResidual):
 
     sensor: CameraImages
     experiment: Experiment
+
+    def position_sigmas_m(self, points_m: Array, translations_m: Array, sigmas: Array) -> Array:
+        """Return the standard deviations (3P,) of the positions of points (P, 3) as one pixel
+        determines them, along any axis: σ [pixels] times the distance from the camera over the
+        focal length.
+        """
+        away_m = np.linalg.norm(points_m - translations_m[0], axis=1)
+        focal_px = self.sensor.camera.require_matrix()[0, 0]
+        return np.repeat(sigmas * away_m / focal_px, GROUP)
 
     def camera_data(self, rotations: Array, translations: Array) -> Array:
         """Return the data (S, k + 14) of the images for `projected`: distances of the k

@@ -23,7 +23,7 @@ from ...program.association import Association
 from ...program.correspondences import Correspondences
 from ...program.custom_sensor_residual import is_within
 from ...program.measurement_model import CorrespondenceModel
-from ...program.measurement_residual import GROUP, ResidualExpression, RowStencil
+from ...program.measurement_residual import GROUP, RowStencil
 from ...program.observables import PointPositions
 from .camera_images import POSE_UNKNOWNS, CameraImagesResidual
 from .tracked_places import TrackedPlaces
@@ -104,13 +104,9 @@ class ImageTrackResidual(CameraImagesResidual):
 
     @property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3N,) of the positions as one pixel determines them, along any axis:
-        σ times the distance of the body from the camera over the focal length.
-        """
+        """Standard deviations (3N,) of the positions of the points, see `position_sigmas_m`."""
         rest_m = self.observable.association.prior_places_m
-        away_m = np.linalg.norm(rest_m - self.correspondences.translations[0], axis=1)
-        focal_px = self.sensor.camera.require_matrix()[0, 0]
-        return np.repeat(self.sigmas * away_m / focal_px, GROUP)
+        return self.position_sigmas_m(rest_m, self.correspondences.translations, self.sigmas)
 
     @property
     def uncompared_count(self) -> int:
@@ -157,11 +153,6 @@ class ImageTracksModel(CorrespondenceModel):
     """Tracks of one camera, whose places on the body follow the estimates."""
 
     measurement: ImageTracks
-
-    @cached_property
-    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions, which are the same for all correspondences."""
-        return {}
 
     @cached_property
     def _coordinate_parameters(self) -> Index:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -454,9 +453,8 @@ def obstacle_distance(obstacle: Obstacle, body: Body, nodes_m: Array) -> Callabl
     origin, *ends = nodes_m[obstacle.nodes]
     size_m = body.frame_nodes_m[1, 0] - body.frame_nodes_m[0, 0]
     axes = (np.array(ends) - origin).T / size_m
-    point = ca.SX.sym("point", 3)
-    gap = ca.Function("gap", [point], [obstacle.shape.signed_distance(point)])
-    return lambda points_m: gap(((points_m - origin) @ axes + body.frame_nodes_m[0]).T).full()[0]
+    distances_m = obstacle.shape.signed_distances_m
+    return lambda points_m: distances_m((points_m - origin) @ axes + body.frame_nodes_m[0])
 
 
 def surface_association(body: Body, places_m: Array, sigmas_m: Array) -> MarkerAssociation:

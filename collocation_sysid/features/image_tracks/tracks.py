@@ -137,11 +137,6 @@ class ImageTracks(CameraImages):
         return f"{len(self.names)} points in images of '{self.name}'"
 
     @property
-    def number_names(self) -> Sequence[str]:
-        """Names of the columns."""
-        return self.columns
-
-    @property
     def identity(self) -> Any:
         """Name of the camera and of the points."""
         return self.name, self.names

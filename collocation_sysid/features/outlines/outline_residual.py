@@ -35,13 +35,7 @@ from ...program.depth.depth_outline import (
 from ...program.depth.visible_surface import VisibleSurface
 from ...program.following_sensor import all_nodes
 from ...program.measurement_model import CorrespondenceModel
-from ...program.measurement_residual import (
-    GROUP,
-    ResidualExpression,
-    RowStencil,
-    SampledMotion,
-    lagrange_weights,
-)
+from ...program.measurement_residual import RowStencil, SampledMotion, lagrange_weights
 from ...program.observables import PointPositions
 from ...recording.experiment import Experiment
 from ..image_tracks.camera_images import POSE_UNKNOWNS, CameraImagesResidual
@@ -276,13 +270,10 @@ class OutlinesResidual(CameraImagesResidual):
 
     @property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3n,) of the node positions as one point determines them, along any
-        axis: σ times the distance of the body from the camera over the focal length.
-        """
-        pairs = self.correspondences
-        away_m = np.linalg.norm(pairs.experiment.body.nodes_m - pairs.translations[0], axis=1)
-        focal_px = self.sensor.camera.require_matrix()[0, 0]
-        return np.repeat(self.sensor.sigma_px * away_m / focal_px, GROUP)
+        """Standard deviations (3n,) of the positions of the nodes, see `position_sigmas_m`."""
+        nodes_m = self.experiment.body.nodes_m
+        sigmas = np.full(len(nodes_m), self.sensor.sigma_px)
+        return self.position_sigmas_m(nodes_m, self.correspondences.translations, sigmas)
 
     def numbers(self, predicted: Array) -> Array:
         """Return the distances (S, E); NaN where there is no edge."""
@@ -365,11 +356,6 @@ class OutlinesModel(CorrespondenceModel):
     """Outlines in the images of one camera, whose points follow the estimates."""
 
     measurement: Outlines
-
-    @cached_property
-    def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions, which are the same for all correspondences."""
-        return {}
 
     @cached_property
     def _observable(self) -> PointPositions:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.array_types import Array, root_mean
+from ...common.array_types import Array
 from ...common.declarations import declaration, identity_or_none, key
 from ...common.validated_types import NotNegative, Positive, Text
 from ...errors import InputError
@@ -171,19 +171,9 @@ class Outlines(CameraImages):
         return f"{sum(mask is not None for mask in self.all_masks)} outlines in images of '{self.name}'"
 
     @property
-    def number_names(self) -> Sequence[str]:
-        """Names of the columns."""
-        return self.columns
-
-    @property
     def identity(self) -> Any:
         """Outlines of two recordings are not compared with each other."""
         return id(self)
-
-    def rms_text(self, difference: Array) -> str:
-        """Return the RMS distance in pixels."""
-        known = difference[np.isfinite(difference)]
-        return f"{root_mean(known**2):.3g} px RMS" if known.size else ""
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with the masks at those times of which any value is finite; at other times

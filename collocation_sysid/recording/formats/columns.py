@@ -160,6 +160,7 @@ QUALIFIERS = {
         *("amplitude", "range", "strength", "limit", "noise"),
     },
 }
+_ALL_QUALIFIERS = frozenset().union(*QUALIFIERS.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -505,8 +506,8 @@ def _words(name: str) -> set[str]:
     """
     words = set(re.findall(r"[^\W\d_]+", name.lower()))
     compounds = [*filter(None, map(_COMPOUND.fullmatch, words))]
-    qualifiers = set().union(*QUALIFIERS.values())
-    return words | {c["last"] for c in compounds} | {c["first"] for c in compounds} & qualifiers
+    firsts = {c["first"] for c in compounds} & _ALL_QUALIFIERS
+    return words | {c["last"] for c in compounds} | firsts
 
 
 # Errors -------------------------------------------------------------------------------------------

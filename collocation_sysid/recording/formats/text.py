@@ -182,16 +182,13 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
         raise InputError(f"this is not a CSV text file: {error}") from error
     if not rows:
         raise InputError(_EMPTY)
+    mixed = [cell for row in rows for cell in row.cells if "," in cell and "." in cell]
     for mark, number in _THOUSANDS:
-        grouped = [
-            (row, k, found)
-            for row in rows
-            for k, cell in enumerate(row.cells)
-            if mark in cell and (found := number.fullmatch(cell))
-        ]
-        if any(found["decimals"] for _, _, found in grouped):
-            for row, k, found in grouped:
-                row.cells[k] = found[0].replace(mark, "")
+        if any((found := number.fullmatch(cell)) and found["decimals"] for cell in mixed):
+            for row in rows:
+                row.cells[:] = [
+                    cell.replace(mark, "") if number.fullmatch(cell) else cell for cell in row.cells
+                ]
     if separator != "," and not any(_POINTED.fullmatch(cell) for row in rows for cell in row.cells):
         for row in rows:
             commas = [_DECIMAL_COMMA.fullmatch(cell) for cell in row.cells]
