@@ -378,9 +378,8 @@ class NewtonSolver:
             with self.stopwatch.evaluating():
                 value = residual(trial)
             following = self.step(iterate.factor, value)
-            length = float(np.linalg.norm(step))
-            with np.errstate(over="ignore"):  # an infinite rate ends the chords as well
-                rate = float(np.linalg.norm(following)) / max(length, 1e-300)
+            length = _length(step)
+            rate = _length(following) / max(length, 1e-300)
             # Rounding ends the contraction of the smallest steps.
             is_rounding = self._is_last(following, OLD_FACTOR_SHARE)
             if not (rate <= SLOWEST_CHORD_RATE or is_rounding):
@@ -424,7 +423,7 @@ class NewtonSolver:
         done = False
         for _ in range(LARGEST_CHORD_STEP_COUNT):
             step = iteration.step_from(improved)
-            length = float(np.linalg.norm(step))
+            length = _length(step)
             rate = length / before if before else 1.0
             if not rate <= 1.0:
                 return x, False
@@ -471,7 +470,7 @@ class NewtonSolver:
         """
         x = iterate.x
         factor = iterate.factor
-        length = np.linalg.norm(iterate.step)
+        length = _length(iterate.step)
         share = 1.0
         update = self.retraction if keep_definite and self._has_no_obstacle else add_increment
         for _ in range(self.options.max_backtracks):
@@ -484,7 +483,7 @@ class NewtonSolver:
                     at = linearise(trial) if share == 1 else None
                     value = residual(trial) if at is None else at.residual
                 next_step = self.step(factor, value)
-                is_shorter = np.linalg.norm(next_step) <= (1 - share / 4) * length
+                is_shorter = _length(next_step) <= (1 - share / 4) * length
                 if is_shorter and not keep_definite and self._is_last(next_step, OLD_FACTOR_SHARE):
                     return _Iterate(trial, factor, step=next_step)
                 if is_shorter or (stress is not None and share == 1):
@@ -495,7 +494,7 @@ class NewtonSolver:
                     try:
                         own = self.factorise(at, trial, keep_definite=keep_definite)
                         own_step = self.step(own, at.residual)
-                        if is_shorter or np.linalg.norm(own_step) <= length:
+                        if is_shorter or _length(own_step) <= length:
                             return _Iterate(trial, own, step=own_step)
                     except NewtonFailure:
                         pass
@@ -587,6 +586,12 @@ class NewtonSolver:
         at x (3n,) [m].
         """
         return int(self.body.volume_ratios(x)[0].min(axis=1).argmin())
+
+
+def _length(step: Array) -> float:
+    """Return the length of a step; infinite if its square overflows, as that of a body that fails."""
+    with np.errstate(over="ignore"):
+        return float(np.linalg.norm(step))
 
 
 class ChordIteration(Protocol):
