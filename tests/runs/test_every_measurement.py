@@ -216,11 +216,11 @@ def size_of_residuals(kind):
 
 
 def small_but_persistent(kind):
-    """Residuals of ten times less than sigma are too small, whether or not they are independent."""
-    errors = white(kind)
-    for k in range(1, len(errors)):
-        errors[k] = 0.9 * errors[k - 1] + np.sqrt(1 - 0.9**2) * errors[k]
-    found = codes(kind, errors / 10)
+    """Residuals of four times less than sigma are too small, also if they are not independent and
+    widen the error bars.
+    """
+    slow = autoregressive(np.random.default_rng(3), SAMPLES, BLOCKS[kind][1][0], 0.99)
+    found = codes(kind, slow / 4)
     assert named(kind, "noise/smaller") in found
     if kind != "specimen":
         assert "residuals/persist" in found
