@@ -216,7 +216,9 @@ def add_noises(table: BenchTable, layout: ForceSensorSection, wrench: Wrench) ->
     for key, column in layout.noise_columns.items():
         noise = NOISES[key]
         table.columns[column] = np.full(len(table.t_s), np.nan)
-        sigma = wrench.sample_sigmas[:, 0 if key == "sigma_n" else 3]
+        own = slice(0, 3) if key == "sigma_n" else slice(3, 6)
+        # A component that is not measured has the median of all samples.
+        sigma = wrench.sample_sigmas[:, own][:, np.argmax(wrench.measured_components[own])]
         factor = si_factor(name_and_unit(column)[1] or noise.unit, noise.dimension) or 1.0
         table.columns[column][rows] = layout.symmetry * sigma / factor
 

@@ -239,6 +239,7 @@ class RecordingReader:
             file = self._table_file(grasp.displacement, self._grasp_key(k, "displacement"))
             layout = grasp.displacement.dump_layout()
             layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
+            layout["other_columns"] = self.section.noise_columns_of(grasp.displacement)
             poses = read_displacement(file, **layout, timed=self._requires_times)
         elif grasp.poses is None:
             return PoseSequence.fixed()
@@ -280,7 +281,8 @@ class RecordingReader:
         if (table := section.displacement) is not None:
             file = self._table_file(table, self._grasp_key(k, "displacement"))
             rest_m = strain_length_m(table, self.body)
-            zero = displaced_axes(file, table.columns, axis=table.axis, length_m=rest_m)
+            others = self.section.noise_columns_of(table)
+            zero = displaced_axes(file, table.columns, table.axis, rest_m, other_columns=others)
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
@@ -314,6 +316,7 @@ class RecordingReader:
         file = self._table_file(section, f"{key}.file")
         layout = section.dump_layout()
         layout["noise_columns"] = section.noise_columns
+        layout["other_columns"] = self.section.noise_columns_of(section)
         return read_wrench_and_noise(
             file, **layout, symmetry=section.symmetry, timed=self._requires_times
         )
@@ -640,7 +643,7 @@ class RecordingReader:
             return Markers.none(t_s)
         section = self.section.markers
         names = table.names
-        sigma_m = _by_marker(section.sigma_m, names, default=np.nan)
+        sigma_m = by_marker(section.sigma_m, names, default=np.nan)
         known_m = section.reference_sigma_m
         if np.isnan(sigma_m).any():
             missing_name = names[int(np.isnan(sigma_m).argmax())]
@@ -655,10 +658,10 @@ class RecordingReader:
         return Markers(
             t_s,
             table.positions_m,
-            sigma_m=sigma_m / np.sqrt(_by_marker(section.weights, names, default=1.0)),
+            sigma_m=sigma_m / np.sqrt(by_marker(section.weights, names, default=1.0)),
             names=names,
             places_m=np.array([section.reference_m.get(name, [np.nan] * 3) for name in names]),
-            places_sigma_m=None if known_m is None else _by_marker(known_m, names, default=np.nan),
+            places_sigma_m=None if known_m is None else by_marker(known_m, names, default=np.nan),
             offsets_s=table.offsets_s,
             **arguments,
         )
@@ -668,7 +671,7 @@ class RecordingReader:
         above `LARGEST_INTERPOLATION_SIGMAS`, estimated from their curved tracks; else "".
         """
         stated = self.section.markers.sigma_m
-        sigma_m = _by_marker(stated, table.names, default=np.nan)
+        sigma_m = by_marker(stated, table.names, default=np.nan)
         error_m = interpolation_error(t_s, table.t_s, table.positions_m)
         errors = np.nan_to_num(error_m / sigma_m)
         if not errors.size or errors.max() < LARGEST_INTERPOLATION_SIGMAS:
@@ -682,7 +685,7 @@ class RecordingReader:
         )
 
 
-def _by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
+def by_marker(values: Mapping[str, float] | float, names: Sequence[str], default: float) -> Array:
     """Return the values (M,) of the markers with these names: one number for all, or the number of
     each name, `default` where the mapping has none; entries of other names are ignored.
     """

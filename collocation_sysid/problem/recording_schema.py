@@ -504,6 +504,12 @@ class ExperimentSection(NamedSection, of=Experiment):
         """
         return table and (table.file or self.file)
 
+    def noise_columns_of(self, table: TableSection) -> list[str]:
+        """Return the columns of the table's file that hold the noise of sensors."""
+        sensors = [each.sensor for each in self.moved_sections if each.sensor is not None]
+        here = [each for each in sensors if self.file_of(each) == self.file_of(table)]
+        return [name for each in here for name in each.noise_columns.values()]
+
     def list_measurement_files(self) -> list[str | None]:
         """Return the files of markers, sensors, grasps and obstacles; None for those that are not
         named.

@@ -4,7 +4,7 @@ files.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -222,6 +222,7 @@ def read_wrench_and_noise(
     symmetry: int = 1,
     timed: bool = True,
     noise_columns: Mapping[str, str] | None = None,
+    other_columns: Collection[str] = (),
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
 
@@ -243,6 +244,8 @@ def read_wrench_and_noise(
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     noise_columns : mapping, optional
         Column by the key, "sigma_n" or "sigma_nm", of the standard deviations that it holds.
+    other_columns : collection of str
+        Columns of the file that hold something else, such as the noise of another sensor.
 
     Returns
     -------
@@ -266,6 +269,7 @@ def read_wrench_and_noise(
         blank_allowed=True,
         requires_times=timed,
         noise_columns=noise_columns,
+        other_columns=other_columns,
     )
     factor = sign * (area_m2 or 1.0) / symmetry
     values = factor * axis_components(table, (*FORCES, *TORQUES), axis=axis)

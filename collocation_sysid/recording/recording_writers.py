@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.files import replaced_file
+from .formats.plain_csv import SIGMA
 from .marker_files import MarkerTable
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
@@ -28,10 +29,14 @@ def write_poses_csv(path: str | Path, poses: PoseSequence) -> None:
 
 
 def write_markers_csv(
-    path: str | Path, t_s: ArrayLike, names: Sequence[str], positions_m: ArrayLike
+    path: str | Path,
+    t_s: ArrayLike,
+    names: Sequence[str],
+    positions_m: ArrayLike,
+    sigma_m: ArrayLike | None = None,
 ) -> None:
-    """Write marker tracks (T, M, 3) [m] as `read_markers` reads them; a sample with a coordinate
-    that is not finite becomes three blank cells.
+    """Write marker tracks (T, M, 3) [m], and σ (T, M) [m] of each sample if given, as `read_markers`
+    reads them; a sample with a coordinate that is not finite becomes three blank cells.
 
     Raises
     ------
@@ -40,8 +45,11 @@ def write_markers_csv(
     """
     table = MarkerTable(np.asarray(t_s), tuple(names), positions_m=np.asarray(positions_m))
     header = ["t_s", *(f"{name}_{axis}" for name in table.names for axis in "xyz")]
-    tracks = table.positions_m.reshape(len(table.t_s), -1)
-    _write_csv(path, header, values=np.column_stack([table.t_s, tracks]))
+    values = [table.t_s, table.positions_m.reshape(len(table.t_s), -1)]
+    if sigma_m is not None:
+        header += [f"{name}{SIGMA}" for name in table.names]
+        values.append(np.asarray(sigma_m))
+    _write_csv(path, header, values=np.column_stack(values))
 
 
 def write_columns_csv(path: str | Path, columns: Mapping[str, ArrayLike]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +113,7 @@ def read_displacement(
     length_m: float | None = None,
     timed: bool = True,
     scale: float = 1.0,
+    other_columns: Collection[str] = (),
 ) -> PoseSequence:
     """Read displacements from the undeformed place over time, such as those of a crosshead.
 
@@ -135,6 +136,8 @@ def read_displacement(
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     scale : float
         Factor on the displacements: share that the modelled part of the specimen has.
+    other_columns : collection of str
+        Columns of the file that hold something else, such as the noise of a force.
 
     Returns
     -------
@@ -147,7 +150,9 @@ def read_displacement(
         If a column is missing, unknown, repeated or without unit, a cell is not a number, or time
         does not increase; the line is named.
     """
-    table = _read_displacements(path, columns, length_m=length_m, timed=timed)
+    table = _read_displacements(
+        path, columns, length_m=length_m, timed=timed, other_columns=other_columns
+    )
     shifts_m = (
         sign
         * scale
@@ -164,27 +169,35 @@ def displaced_axes(
     columns: Mapping[str, str] | None = None,
     axis: str = "z",
     length_m: float | None = None,
+    other_columns: Collection[str] = (),
 ) -> str:
     """Return the axes along which a file has displacements, such as "z" or "xy"; empty if it has
     none, and without regard to their values.
 
     Arguments and errors are those of `read_displacement`; times are not required.
     """
-    shifts = axis_components(
-        _read_displacements(path, columns, length_m=length_m, timed=False), DISPLACEMENTS, axis=axis
+    table = _read_displacements(
+        path, columns, length_m=length_m, timed=False, other_columns=other_columns
     )
+    shifts = axis_components(table, DISPLACEMENTS, axis=axis)
     is_present = np.asarray(np.isfinite(shifts).any(axis=0))
     return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
 
 
 def _read_displacements(
-    path: str | Path, columns: Mapping[str, str] | None, length_m: float | None, timed: bool
+    path: str | Path,
+    columns: Mapping[str, str] | None,
+    length_m: float | None,
+    timed: bool,
+    other_columns: Collection[str],
 ) -> QuantityTable:
     """Read the columns of a displacement, or of a strain if the undeformed length `length_m` [m] is
     given.
     """
     quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
-    return read_columns(path, quantities, column_names=columns, requires_times=timed)
+    return read_columns(
+        path, quantities, column_names=columns, requires_times=timed, other_columns=other_columns
+    )
 
 
 def axis_components(table: QuantityTable, quantities: Sequence[Quantity], axis: str) -> Array:

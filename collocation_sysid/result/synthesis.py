@@ -33,6 +33,7 @@ from ..problem.bench_files import (
     table_name,
 )
 from ..problem.problem_reading import parse_toml
+from ..problem.recording_reader import by_marker
 from ..problem.recording_schema import ExperimentSection, ForceSensorSection
 from ..problem.schema import ProblemFile
 from ..problem.specimen_reader import layout_from_section
@@ -68,7 +69,8 @@ class Recipe:
     timestep_s : float
         Time step of newmark [s]; by default so small that the motion does not depend on it.
     noise_m : float
-        Standard deviation of the noise of each coordinate of a marker [m].
+        Standard deviation of the noise of each coordinate of a marker [m]; if the markers have a σ
+        of each sample, that of samples with the median σ.
     noise_n : float
         Standard deviation of the noise of measured forces [N]. If a quarter of the specimen is
         modelled (``symmetry = 4``), the noise is that of the force on the complete specimen.
@@ -255,11 +257,17 @@ def _write_tables(
             recipe=recipe,
         )
         return
-    noise = recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
-    names = experiment.markers.names
-    tracks = trajectory.markers_m + noise
+    markers = experiment.markers
+    tracks = trajectory.markers_m + recipe.noise_m * rng.normal(size=trajectory.markers_m.shape)
+    sigma_m = None
+    if markers.sigma_ratios is not None:
+        noise = markers.sigma_ratios.reshape(tracks.shape)
+        tracks = trajectory.markers_m + noise * (tracks - trajectory.markers_m)
+        # A file has σ before it is divided by the root of the marker's weight.
+        weights = {} if section is None else section.markers.weights
+        sigma_m = markers.sigma_m * noise[..., 0] * np.sqrt(by_marker(weights, markers.names, 1.0))
     if _MARKERS_KEY in files:
-        write_markers_csv(files[_MARKERS_KEY], experiment.t_s, names=names, positions_m=tracks)
+        write_markers_csv(files[_MARKERS_KEY], experiment.t_s, markers.names, tracks, sigma_m)
     for k, grasp in enumerate(experiment.grasps):
         if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)

@@ -675,6 +675,21 @@ def test_a_simulated_table_reads_back_unchanged(
         np.testing.assert_allclose(ours.wrenches[0].values[:, 2], sensed[:, 2], rtol=1e-9)
 
 
+def test_a_table_with_times_in_seconds_has_the_noise_of_its_force(tmp_path):
+    file = block_problem(tmp_path, SHARED.replace("sigma_n = 0.04", 'sigma_n = "sd_mn"'))
+    rows = "".join(f"{0.1 * k},{1e-4 * k},{2 * k},{k + 1}\n" for k in range(5))
+    for name in ("first", "second"):
+        (tmp_path / f"{name}.csv").write_text(f"t_s,displacement_m,force_n,sd_mn\n{rows}")
+    problem = Problem.read(file)
+    sensed = problem.experiments[1].wrenches[0]
+    np.testing.assert_allclose(sensed.sample_sigmas[:, 2], 1e-3 * np.arange(1, 6) / 4)
+    write_data(problem, tmp_path / "twin")
+    for name in ("block.vtu", "problem.toml"):
+        shutil.copy(tmp_path / name, tmp_path / "twin")
+    again = Problem.read(tmp_path / "twin" / "problem.toml").experiments[1].wrenches[0]
+    np.testing.assert_allclose(again.sample_sigmas, sensed.sample_sigmas)
+
+
 def test_one_table_of_two_recordings_is_not_simulated(tmp_path):
     file = block_problem(tmp_path, SHARED.replace("second.csv", "first.csv"))
     with pytest.raises(

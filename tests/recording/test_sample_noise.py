@@ -13,7 +13,9 @@ import collocation_sysid as cs
 from collocation_sysid.features.measurements import instrument_misfits
 from collocation_sysid.problem.problem_reading import read_problem_file
 from collocation_sysid.problem.specimen_reader import layout_from_section
+from collocation_sysid.recording.marker_files import read_markers
 from collocation_sysid.recording.specimen_files import specimen_columns
+from collocation_sysid.result.synthesis import Recipe, write_data
 
 CUBE = measured(hung_cube())
 COUNT = len(CUBE.t_s)
@@ -231,3 +233,22 @@ def test_a_bench_and_a_sensor_and_markers_have_columns_of_noise(tiny):
         np.repeat(sigmas[:, None] / 100, 3, axis=1)
     )
     assert experiment.markers.sample_sigmas[:, 3:] == pytest.approx(1e-3)
+
+
+def test_simulated_tracks_have_the_noise_of_their_file(tiny):
+    header, *tracks = (tiny / "swing_markers.csv").read_text().splitlines()
+    noisy = [f"{row},{0.001 * (1 + k % 3):.9g}" for k, row in enumerate(tracks)]
+    (tiny / "swing_markers.csv").write_text("\n".join([f"{header},low_sigma", *noisy]))
+    tracks_file = 'file = "swing_markers.csv"'
+    replace_text(tracks_file, f"{tracks_file}\nweights = {{ low = 4.0 }}")(tiny)
+    problem = cs.Problem.read(tiny / "problem.toml", simulation=True)
+    written = write_data(problem, tiny / "twin", recipe=Recipe(noise_m=1e-3))
+    (file,) = [each for each in written if "markers" in each.name]
+    (measured,), table = problem.experiments, read_markers(file)
+    k = table.names.index("low")
+    in_file = 0.001 * (1 + np.arange(len(measured.t_s)) % 3)
+    assert table.sigma_m[:, k] == pytest.approx(in_file[: len(table.t_s)])
+    exact = cs.simulate(measured, problem.parameters).markers_m
+    errors = (table.positions_m - exact)[:, k]
+    by_noise = [np.std(errors[kind::3]) for kind in range(3)]
+    assert by_noise[0] < by_noise[1] < by_noise[2]

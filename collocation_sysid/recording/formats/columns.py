@@ -197,6 +197,7 @@ def read_columns(
     requires_all: bool = False,
     column_advice: Callable[[TextTable], str] | None = None,
     noise_columns: Mapping[str, str] | None = None,
+    other_columns: Collection[str] = (),
 ) -> QuantityTable:
     """Read those of some quantities that a table has, in any order, in SI units.
 
@@ -219,6 +220,8 @@ def read_columns(
         by default the statements that choose one of them, see `column_statement`.
     noise_columns : mapping, optional
         Column name by the key of `NOISES` that names it; these columns hold no other quantity.
+    other_columns : collection of str
+        Names of columns that others read, such as the noise of another sensor in the same file.
 
     Raises
     ------
@@ -232,6 +235,9 @@ def read_columns(
         place, factor = _column_named_by_user(grid, NOISES[key], name=name, where=key)
         noises[key] = factor * numeric_cells(grid, [place], blank_allowed=True)[:, 0]
         grid = grid.without_column(place)
+    for name in other_columns:
+        if column := next((c for c in (name, name_and_unit(name)[0]) if c in grid.columns), None):
+            grid = grid.without_column(grid.columns.index(column))
     if "t_s" in grid.columns and not column_names:
         _require_known_columns(grid, quantities, all_of=requires_all)
     places = _find_columns(grid, quantities, mapped=column_names or {}, column_advice=column_advice)
