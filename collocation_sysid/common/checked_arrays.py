@@ -136,6 +136,18 @@ def unconverted_or_none(values: ArrayLike | None) -> Array | None:
     return cast("Array | None", values)
 
 
+def unconverted_sigma(sigma: ArrayLike) -> float:
+    """Return the value unchanged; converter of a σ that ``__post_init__`` splits into median and
+    ratios of samples.
+    """
+    return cast(float, sigma)
+
+
+def unconverted_sigma_or_none(sigma: ArrayLike | None) -> float | None:
+    """Return the value unchanged, like `unconverted_sigma`; None where the field may be None."""
+    return cast("float | None", sigma)
+
+
 def read_only_coordinates(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
     """Return a read-only copy of marker positions (T, M, 3), in which coordinates that are not
     finite are NaN.

@@ -88,7 +88,8 @@ def key(
     read : callable, optional
         Conversion from the value in the file to the field; a `Key` as `form` has its own instead.
     accepted : type, optional
-        Form of the value in Python, where it differs from `form`.
+        Form of the value in Python, where it differs from `form`; a converter is then one for type
+        checkers alone.
     metadata : mapping, optional
         Further metadata of the field, such as `time_dependence.over_time()`.
     **field_options
@@ -174,8 +175,8 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
 
 def _converter(field: Field[Any]) -> Callable[[Any], Any] | None:
     """Return the function that converts the values of a field."""
-    converter = field.metadata.get("converter")
-    return None if get_origin(converter) is tuple else converter
+    converter, accepted = (field.metadata.get(name) for name in ("converter", "accepted"))
+    return None if accepted or get_origin(converter) is tuple else converter
 
 
 def _refusal(

@@ -34,7 +34,7 @@ from ..recording import (
     prescribed_dofs,
     read_displacement,
     read_poses,
-    read_wrench_and_noise,
+    read_wrench,
 )
 from ..recording.alignment import AlignedRecording
 from ..recording.formats.logs import stored_files
@@ -317,9 +317,7 @@ class RecordingReader:
         layout = section.dump_layout()
         layout["noise_columns"] = section.noise_columns
         layout["other_columns"] = self.section.noise_columns_of(section)
-        return read_wrench_and_noise(
-            file, **layout, symmetry=section.symmetry, timed=self._requires_times
-        )
+        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
 
     def _wrench(self, section: ForceSensorSection, key: str, k: int, t_s: Array) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many

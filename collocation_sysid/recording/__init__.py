@@ -53,7 +53,6 @@ from .markers import Placement as Placement
 from .markers import place_markers as place_markers
 from .measured_wrench import Wrench as Wrench
 from .measured_wrench import read_wrench as read_wrench
-from .measured_wrench import read_wrench_and_noise as read_wrench_and_noise
 from .measured_wrench import write_wrench_csv as write_wrench_csv
 from .nuisance import Nuisance as Nuisance
 from .obstacle import Obstacle as Obstacle

@@ -15,7 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array
-from ..common.checked_arrays import float_array, read_only_floats, unconverted, unconverted_or_none
+from ..common.checked_arrays import (
+    float_array,
+    read_only_floats,
+    unconverted,
+    unconverted_or_none,
+    unconverted_sigma,
+)
 from ..common.declarations import declaration, identity, key
 from ..common.files import reason
 from ..common.schema_tables import Noise, Vector
@@ -363,7 +369,7 @@ class Gauge(CustomSensor):
     expression: Callable[..., SensorValues]
     t_s: Array = key(converter=unconverted)
     values: Array | None = key(converter=unconverted_or_none)
-    sigma: float = key(Noise, accepted=PositivePerSample)
+    sigma: float = key(Noise, converter=unconverted_sigma, accepted=PositivePerSample)
     points_m: Array = key(list[Vector], converter=unconverted, default=())
     unknowns: Mapping[str, float] = key(dict[str, Positive], default_factory=dict)
     grasp: int | None = key(AtLeastOne | None, converter=identity, default=None)

@@ -7,13 +7,20 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array
-from ..common.checked_arrays import as_array_or_none, float_array, float_converter, read_only_floats
+from ..common.checked_arrays import (
+    as_array_or_none,
+    float_array,
+    float_converter,
+    read_only_floats,
+    unconverted_sigma,
+    unconverted_sigma_or_none,
+)
 from ..common.declarations import declaration, key
 from ..common.schema_tables import Noise, Vector
 from ..common.time_dependence import at_times, over_time
@@ -82,8 +89,13 @@ class Wrench(Measurement):
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"), metadata=over_time())
     values: Array = key(converter=_with_torques, metadata=over_time())
-    sigma_n: float = key(Noise, accepted=PositivePerSample)
-    sigma_nm: float | None = key(Noise | None, accepted=PositivePerSample | None, default=None)
+    sigma_n: float = key(Noise, converter=unconverted_sigma, accepted=PositivePerSample)
+    sigma_nm: float | None = key(
+        Noise | None,
+        converter=unconverted_sigma_or_none,
+        accepted=PositivePerSample | None,
+        default=None,
+    )
     frame: Frame = key(Frame, default="world")
     point_m: Array = key(
         Vector, converter=float_converter((3,), "point_m of the wrench"), default=(0.0,) * 3
@@ -213,7 +225,7 @@ class Wrench(Measurement):
         ]
 
 
-def read_wrench_and_noise(
+def read_wrench(
     path: str | Path,
     columns: Mapping[str, str] | None = None,
     axis: str = "z",
@@ -275,15 +287,6 @@ def read_wrench_and_noise(
     values = factor * axis_components(table, (*FORCES, *TORQUES), axis=axis)
     sigmas = {key: column / symmetry for key, column in table.noises.items()}
     return without_rounding(table.t_s), values, sigmas
-
-
-def read_wrench(
-    path: str | Path, columns: Mapping[str, str] | None = None, **layout: Any
-) -> tuple[Array, Array]:
-    """Return times (S,) [s] and values (S, 6) [N, N m] of force and torque of a grasp, see
-    `read_wrench_and_noise`.
-    """
-    return read_wrench_and_noise(path, columns, **layout)[:2]
 
 
 def write_wrench_csv(path: str | Path, t_s: ArrayLike, values: ArrayLike) -> None:

@@ -10,6 +10,7 @@ from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.probes.relaxed_assumptions import EstimateChange, Probe, assumption_name
+from ..statistics.thresholds import SIGNIFICANT_ALONE
 
 # Measures of stiffness, the most important first.
 STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
@@ -29,8 +30,6 @@ EXPLICABLE_CONCERNS = (
 )
 # Topics of a verdict that come first.
 FIRST_TO_CORRECT = ("description", "solve")
-# Decrease of χ² that a reader of the table takes for significant.
-NOTICEABLE = 15.0
 DEEPER_CHECK_ADVICE = (
     "For a deeper check, run `solve --probe` (in Python `cs.run(problem, probe=True)`): it refits "
     "subsets of the data and relaxes each assumption."
@@ -196,7 +195,7 @@ def _conclusions(result: Result) -> Iterator[str]:
             why = "explained as well by deviations that the uncertainty budget grants"
         reason = (
             f"; χ² decreases by {first.chi_squared:.3g} with {source_label(first.name)}, which is {why}"
-            if first.chi_squared > NOTICEABLE
+            if first.chi_squared > SIGNIFICANT_ALONE
             else ""
         )
         yield f"tested without a finding: {tested}{reason}"

@@ -120,7 +120,7 @@ def test_a_machines_columns_are_recognised_with_their_units(written, text, encod
     np.testing.assert_allclose(moved.t_s, TIMES)
     np.testing.assert_allclose(moved.positions_m[:, 2], -1e-3 * np.array(PRESSED_MM))
     assert displaced_axes(file) == "z"
-    t_s, quarter = read_wrench(file, sign=-1, symmetry=4, axis="x")
+    t_s, quarter, _ = read_wrench(file, sign=-1, symmetry=4, axis="x")
     np.testing.assert_allclose(t_s, TIMES)
     np.testing.assert_allclose(quarter[:, 0], -np.array(LOAD_N) / 4)
     assert np.isnan(quarter[:, 1:]).all()
@@ -143,7 +143,7 @@ def test_strain_and_stress_become_displacement_and_force(written, header):
     file = written(f"{header}\n0,0\n1,0.02\n2,0.05\n")
     moved = read_displacement(file, length_m=0.03, timed=False)
     np.testing.assert_allclose(moved.positions_m[:, 2], [0, 3e-4, 6e-4])
-    t_s, values = read_wrench(file, area_m2=1e-4, timed=False)
+    t_s, values, _ = read_wrench(file, area_m2=1e-4, timed=False)
     np.testing.assert_array_equal(t_s, [0, 1, 2])
     np.testing.assert_allclose(values[:, 2], [0, 2.0, 5.0])
 

@@ -35,14 +35,14 @@ def test_written_wrenches_are_read_again(tmp_path: Path, rng: np.random.Generato
     t_s, values = np.arange(5) / 3, rng.normal(size=(5, 6))
     values[2, 1] = np.nan
     write_wrench_csv(tmp_path / "w.csv", t_s, values)
-    read_s, found = read_wrench(tmp_path / "w.csv")
+    read_s, found, _ = read_wrench(tmp_path / "w.csv")
     np.testing.assert_allclose(read_s, t_s, rtol=1e-11)
     np.testing.assert_allclose(found, values, rtol=1e-11)
 
 
 def test_components_that_are_not_measured_are_left_out(tmp_path: Path):
     (tmp_path / "w.csv").write_text("fz_n,t_s\n1.5,0.0\n,0.1\n2.5,0.2\n")
-    t_s, found = read_wrench(tmp_path / "w.csv")
+    t_s, found, _ = read_wrench(tmp_path / "w.csv")
     np.testing.assert_array_equal(found[:, 2], [1.5, np.nan, 2.5])
     wrench = Wrench(t_s, found, 0.1)
     assert wrench.list_component_names() == ("fz",)
@@ -159,7 +159,7 @@ def test_simulate_writes_wrenches_that_the_problem_reads(tiny: Path):
     problem = Problem.read(file, simulation=True)
     written = write_data(problem, tiny / "data", Recipe(noise_n=1e-3))
     assert tiny / "data" / "swing_wrench.csv" in written
-    t_s, values = read_wrench(tiny / "data" / "swing_wrench.csv")
+    t_s, values, _ = read_wrench(tiny / "data" / "swing_wrench.csv")
     (experiment,) = problem.experiments
     np.testing.assert_allclose(t_s, experiment.t_s)
     # The body starts at rest: the grasp carries its weight.

@@ -106,7 +106,7 @@ def test_wrenches_pressures_and_joints_are_read_as_tables(tmp_path: Path) -> Non
         )
     ]
     log = bag(tmp_path / "trial", messages)
-    t_s, wrench = read_wrench(f"{log}#/wrench")
+    t_s, wrench, _ = read_wrench(f"{log}#/wrench")
     np.testing.assert_allclose(t_s, T_S, atol=1e-9)
     np.testing.assert_allclose(wrench[5], [1, 2, T_S[5], 0.1, 0.2, 0.3])
     np.testing.assert_allclose(read_pressure(f"{log}#/chamber")[1], 1e3 + T_S)
