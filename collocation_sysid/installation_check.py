@@ -71,60 +71,30 @@ SELF_TEST_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Dependency:
-    """Required package.
-
-    Attributes
-    ----------
-    name : str
-    installed : str or None
-        Installed version; None if the package is missing.
-    required : str
-        Range of versions, such as ">=2"; empty for any.
-    is_suitable : bool
-        Whether the package is installed in a version of that range.
-    """
+    """Required package."""
 
     name: str
-    installed: str | None
-    required: str
-    is_suitable: bool
+    installed: str | None  # installed version; None if the package is missing
+    required: str  # range of versions, such as ">=2"; empty for any
+    is_suitable: bool  # whether the package is installed in a version of that range
 
 
 @dataclass(frozen=True)
 class Extra:
-    """Optional part of the installation.
-
-    Attributes
-    ----------
-    name : str
-    missing : tuple of str
-        Packages that are missing or too old; empty if the extra is complete.
-    install : str
-        Command that installs the extra.
-    """
+    """Optional part of the installation."""
 
     name: str
-    missing: tuple[str, ...]
-    install: str
+    missing: tuple[str, ...]  # packages that are missing or too old; empty if the extra is complete
+    install: str  # command that installs the extra
 
 
 @dataclass(frozen=True)
 class Solvers:
-    """Solvers that work.
+    """Solvers that work."""
 
-    Attributes
-    ----------
-    nonlinear : tuple of str
-        Nonlinear solvers of CasADi.
-    ipopt_linear : tuple of str
-        Linear solvers with which IPOPT solved a small problem.
-    supernodal : bool
-        Whether the factorisation "supernodal" (MKL's PARDISO) is available.
-    """
-
-    nonlinear: tuple[str, ...]
-    ipopt_linear: tuple[str, ...]
-    supernodal: bool
+    nonlinear: tuple[str, ...]  # nonlinear solvers of CasADi
+    ipopt_linear: tuple[str, ...]  # linear solvers with which IPOPT solved a small problem
+    supernodal: bool  # whether the factorisation "supernodal" (MKL's PARDISO) is available
 
 
 @dataclass(frozen=True)
@@ -164,76 +134,36 @@ class Kernels:
 
 @dataclass(frozen=True)
 class Threads:
-    """Threads of evaluations.
-
-    Attributes
-    ----------
-    count : int
-    cores : int
-        Cores of the machine.
-    source : str
-        What determines the number: an environment variable, or the cores of this process.
-    memory_mb : float or None
-        Memory that this process may have; None if unknown.
-    """
+    """Threads of evaluations."""
 
     count: int
-    cores: int
-    source: str
-    memory_mb: float | None
+    cores: int  # cores of the machine
+    source: str  # what determines the number: an environment variable, or the cores of this process
+    memory_mb: float | None  # memory that this process may have; None if unknown
 
 
 @dataclass(frozen=True)
 class SelfTest:
-    """Identification of a small body from exact data.
-
-    Attributes
-    ----------
-    is_passed : bool
-    message : str
-        Largest deviation of a parameter, or why the test failed.
-    time_s : float
-        Duration, including the compilation of kernels that were not stored.
-    """
+    """Identification of a small body from exact data."""
 
     is_passed: bool
-    message: str
-    time_s: float
+    message: str  # largest deviation of a parameter, or why the test failed
+    time_s: float  # duration, including the compilation of kernels that were not stored
 
 
 @dataclass(frozen=True)
 class InstallationReport:
-    """State of an installation.
-
-    Attributes
-    ----------
-    version : str
-        Version of this package.
-    python : str
-        Version of Python.
-    platform : str
-    location : str
-        Folder of this package.
-    dependencies : tuple of Dependency
-        Required packages.
-    solvers : Solvers or None
-        None if CasADi cannot be imported.
-    kernels : Kernels or None
-        None if llvmlite or numpy cannot be imported.
-    threads : Threads
-    extras : tuple of Extra
-    self_test : SelfTest
-    """
+    """State of an installation."""
 
     SERIALISED_PROPERTIES = ("is_working",)
 
-    version: str
-    python: str
+    version: str  # version of this package
+    python: str  # version of Python
     platform: str
-    location: str
-    dependencies: tuple[Dependency, ...]
-    solvers: Solvers | None
-    kernels: Kernels | None
+    location: str  # folder of this package
+    dependencies: tuple[Dependency, ...]  # required packages
+    solvers: Solvers | None  # none if CasADi cannot be imported
+    kernels: Kernels | None  # none if llvmlite or numpy cannot be imported
     threads: Threads
     extras: tuple[Extra, ...]
     self_test: SelfTest

@@ -28,29 +28,18 @@ S = TypeVar("S")
 
 @dataclass(frozen=True)
 class Key:
-    """Form of a field in a problem file.
-
-    Attributes
-    ----------
-    name : str
-        Name of the key.
-    form : type
-        Type of the value in the file; a form that allows None uses the default of the field.
-    read : callable, optional
-        Conversion from the value in the file to the field; None: the value itself. For a key that
-        names a file, from its path to times and values of a table.
-    constant : str, optional
-        For a key that names a file with a table: the field whose key states a constant instead;
-        None for all other keys.
-    description : str
-        Meaning of a key whose name differs from the field's; "" for all others.
-    """
+    """Form of a field in a problem file."""
 
     name: str
+    # Type of the value in the file; a form that allows None uses the default of the field.
     form: Any
+    # Conversion from the value in the file to the field; None: the value itself. For a key that
+    # names a file, from its path to times and values of a table.
     read: Callable[[Any], Any] | None = None
+    # For a key that names a file with a table: the field whose key states a constant instead; None
+    # for all other keys.
     constant: str | None = None
-    description: str = ""
+    description: str = ""  # meaning of a key whose name differs from the field's; "" for all others
 
 
 def identity(value: T) -> T:

@@ -148,24 +148,12 @@ class Listing:
 
 @dataclass(frozen=True)
 class TitledParts:
-    """Group of parts with a title and optionally a style.
+    """Group of parts with a title and optionally a style."""
 
-    Attributes
-    ----------
-    title : str
-        Heading; "" for none. HTML shows it only without a style.
-    parts : tuple of Shown
-        Content.
-    level : int
-        Level of the heading, 1 for the highest.
-    style : str
-        Class of the enclosing element in HTML; "" for none.
-    """
-
-    title: str
-    parts: tuple[Shown, ...]
-    level: int = 2
-    style: str = ""
+    title: str  # heading; "" for none. HTML shows it only without a style.
+    parts: tuple[Shown, ...]  # content
+    level: int = 2  # level of the heading, 1 for the highest
+    style: str = ""  # class of the enclosing element in HTML; "" for none
 
 
 Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts

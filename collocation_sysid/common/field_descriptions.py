@@ -42,20 +42,12 @@ def documented(kind: type) -> dict[str, str]:
 
 
 class FieldOfRow(NamedTuple):
-    """Field of a class that has one for each row of a table.
-
-    Attributes
-    ----------
-    form : str
-        Type in the documentation.
-    description : str
-        Description in the documentation.
-    """
+    """Field of a class that has one for each row of a table."""
 
     annotation: Any
     default: Any
-    form: str
-    description: str
+    form: str  # type in the documentation
+    description: str  # description in the documentation
 
 
 def with_fields(rows: Mapping[str, FieldOfRow]) -> Callable[[type[T]], type[T]]:

@@ -48,19 +48,12 @@ class Failed(RuntimeError):
 
 @dataclass(frozen=True)
 class ProcessLimits:
-    """Limits of an isolated process.
+    """Limits of an isolated process."""
 
-    Attributes
-    ----------
-    time_s : float
-        Processor time after which the process is killed [s], rounded up to whole seconds; enforced
-        on POSIX systems only.
-    memory_mb : float
-        Memory beyond that of Python and numpy [MB]; enforced on Linux only.
-    """
-
+    # Processor time after which the process is killed [s], rounded up to whole seconds; enforced on
+    # POSIX systems only.
     time_s: float
-    memory_mb: float
+    memory_mb: float  # memory beyond that of Python and numpy [MB]; enforced on Linux only
 
     @classmethod
     def for_file(cls, path: str | Path) -> ProcessLimits:

@@ -39,19 +39,12 @@ class StepUnit(StrEnum):
 
 @dataclass
 class _Phase:
-    """Phase with a known number of steps.
-
-    Attributes
-    ----------
-    total : int
-        Number of steps.
-    completed : float
-        Number of steps that are completed; threads that add at the same time may lose some, which
-        only delays the display.
-    """
+    """Phase with a known number of steps."""
 
     unit: StepUnit
-    total: int
+    total: int  # number of steps
+    # Number of steps that are completed; threads that add at the same time may lose some, which
+    # only delays the display.
     completed: float = 0.0
 
 

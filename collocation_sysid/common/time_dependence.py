@@ -23,21 +23,12 @@ MARK = "time dependence"
 
 @dataclass(frozen=True)
 class TimeDependence:
-    """Mark of a field.
+    """Mark of a field."""
 
-    Attributes
-    ----------
-    axis : int or None
-        Axis of the array along which time runs; None for a value that is the same at all times.
-    is_load : bool
-        Whether the value is a load, or the factor of one.
-    has_parts : bool
-        Whether the value is an object with marked fields, or a tuple of them.
-    """
-
+    # Axis of the array along which time runs; None for a value that is the same at all times.
     axis: int | None = None
-    is_load: bool = False
-    has_parts: bool = False
+    is_load: bool = False  # whether the value is a load, or the factor of one
+    has_parts: bool = False  # whether the value is an object with marked fields, or a tuple of them
 
 
 def over_time(axis: int = 0, *, is_load: bool = False) -> Mapping[str, TimeDependence]:

@@ -24,36 +24,19 @@ def _nothing(*_: object) -> tuple[()]:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCheck:
-    """Simulation at the guess, with which a check compares the description of a problem.
+    """Simulation at the guess, with which a check compares the description of a problem."""
 
-    Attributes
-    ----------
-    problem : Problem
-        Checked problem.
-    collocation : Collocation
-        Its nonlinear program.
-    parts : sequence of ExperimentIterate
-        Experiments simulated at the guess, perhaps only their first samples.
-    causes : sequence of Hypothesis
-        Likely errors that are known already.
-    is_full : bool
-        Whether comparisons are made however long they take.
-    fit_s : callable
-        ``fit_s(samples)``, the estimated time [s] to fit the first samples to the markers.
-    report_progress : callable
-        Called with progress messages.
-    is_simulated : bool
-        Whether `parts` are simulated; false if a simulation failed, and a body is only moved
-        rigidly with its grasp.
-    """
-
-    problem: Problem
-    collocation: Collocation
+    problem: Problem  # checked problem
+    collocation: Collocation  # its nonlinear program
+    # Experiments simulated at the guess, perhaps only their first samples.
     parts: Sequence[ExperimentIterate]
-    causes: Sequence[Hypothesis]
-    is_full: bool
+    causes: Sequence[Hypothesis]  # likely errors that are known already
+    is_full: bool  # whether comparisons are made however long they take
+    # ``fit_s(samples)``, the estimated time [s] to fit the first samples to the markers.
     fit_s: Callable[[int], float]
-    report_progress: Callable[[str], None]
+    report_progress: Callable[[str], None]  # called with progress messages
+    # Whether `parts` are simulated; false if a simulation failed, and a body is only moved rigidly
+    # with its grasp.
     is_simulated: bool = True
 
 

@@ -20,25 +20,18 @@ from ..program.depth.surface_comparison import DepthError
 
 @dataclass(frozen=True)
 class PredictionErrors:
-    """Differences between a prediction and the measurements; None for what is not measured.
+    """Differences between a prediction and the measurements; None for what is not measured."""
 
-    Attributes
-    ----------
-    rms_m, max_m : float or None
-        RMS and largest distance of the markers from their measurements.
-    wrench_rms_n, wrench_rms_nm : float or None
-        Root mean square of the components of force and torque.
-    reading_rms : mapping of name to float, or None
-        RMS difference of custom sensors, in their units.
-    depth : mapping of the camera's name to DepthError, or None
-        Distances of the points of depth cameras from the predicted surface.
-    """
-
+    # RMS and largest distance of the markers from their measurements.
     rms_m: float | None = None
     max_m: float | None = None
+    # Root mean square of the components of force and torque.
     wrench_rms_n: float | None = None
     wrench_rms_nm: float | None = None
+    # mapping of name to float, or None: RMS difference of custom sensors, in their units.
     reading_rms: Mapping[str, float] | None = None
+    # mapping of the camera's name to DepthError, or None: distances of the points of depth cameras
+    # from the predicted surface.
     depth: Mapping[str, DepthError] | None = None
 
     @property
@@ -78,70 +71,46 @@ def _forces_text(*sizes: float | None) -> str:
 
 @dataclass(frozen=True)
 class CopyError:
-    """Differences between the measurements of a recording and those of a fitted one.
+    """Differences between the measurements of a recording and those of a fitted one."""
 
-    Attributes
-    ----------
-    copied : str
-        The name of the fitted recording that is nearest.
-    error : PredictionErrors
-        Errors of its measurements as a prediction.
-    """
-
-    copied: str
-    error: PredictionErrors
+    copied: str  # the name of the fitted recording that is nearest
+    error: PredictionErrors  # errors of its measurements as a prediction
 
 
 @dataclass(frozen=True)
 class FittedExperiment:
-    """Residuals of the fit of an experiment.
+    """Residuals of the fit of an experiment."""
 
-    Attributes
-    ----------
-    rms_m : float
-        RMS distance of the markers from the fit [m]; 0 without markers.
-    samples, missing : int
-        Numbers of marker samples that are present, and that are missing.
-    static : bool
-        Whether it is a series of equilibria.
-    notes : tuple of str
-        Sentences on the nuisance parameters of this recording.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of forces [N] and torques [N m]; None if not measured.
-    reading_rms : mapping of name to float, or None
-        RMS differences of custom sensors in their units; None without any.
-    wrench_sigma_n, wrench_sigma_nm : float or None
-        Stated standard deviations of the noise of forces [N] and torques [N m]; None if not
-        measured.
-    reading_sigma : mapping of name to float, or None
-        Stated standard deviations of the noise of custom sensors; None without any.
-    reading_unit : mapping of name to str, or None
-        Units of the custom sensors that state one; None if none does.
-    friction : mapping of obstacle to FrictionSummary, or None
-        Friction of the obstacles that have some; None without any.
-    depth : mapping of depth camera to DepthError, or None
-        Distances of its points from the fitted surface; None without depth cameras.
-    air_density_kg_m3 : float
-        Density of the air around the body in the model; zero in a vacuum.
-    test : str or None
-        Kind of material test of a specimen without a mesh; None for other experiments.
-    """
-
-    rms_m: float
+    rms_m: float  # RMS distance of the markers from the fit [m]; 0 without markers
+    # Numbers of marker samples that are present, and that are missing.
     samples: int
     missing: int
-    static: bool
-    notes: tuple[str, ...]
+    static: bool  # whether it is a series of equilibria
+    notes: tuple[str, ...]  # sentences on the nuisance parameters of this recording
+    # RMS differences of forces [N] and torques [N m]; None if not measured.
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
+    # mapping of name to float, or None: RMS differences of custom sensors in their units; None
+    # without any.
     reading_rms: Mapping[str, float] | None = optional()
+    # Stated standard deviations of the noise of forces [N] and torques [N m]; None if not measured.
     wrench_sigma_n: float | None = optional()
     wrench_sigma_nm: float | None = optional()
+    # mapping of name to float, or None: stated standard deviations of the noise of custom sensors;
+    # None without any.
     reading_sigma: Mapping[str, float] | None = optional()
+    # mapping of name to str, or None: units of the custom sensors that state one; None if none
+    # does.
     reading_unit: Mapping[str, str] | None = optional()
+    # mapping of obstacle to FrictionSummary, or None: friction of the obstacles that have some;
+    # None without any.
     friction: Mapping[str, FrictionSummary] | None = optional()
+    # mapping of depth camera to DepthError, or None: distances of its points from the fitted
+    # surface; None without depth cameras.
     depth: Mapping[str, DepthError] | None = optional()
+    # Density of the air around the body in the model; zero in a vacuum.
     air_density_kg_m3: float = 0.0
+    # Kind of material test of a specimen without a mesh; None for other experiments.
     test: str | None = optional()
 
     def lines(self, name: str, is_symmetric: bool) -> Iterator[str]:
@@ -168,27 +137,19 @@ class FittedExperiment:
 
 @dataclass(frozen=True)
 class FitResult:
-    """Residuals of the fit of all experiments.
+    """Residuals of the fit of all experiments."""
 
-    Attributes
-    ----------
-    rms_m, noise_rms_m : float
-        RMS distance of all markers, and that expected from the stated noise.
-    experiments : mapping of name to FittedExperiment
-        Residuals of each fitted experiment.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of all forces and torques.
-    symmetry : mapping of experiment to int, optional
-        Of experiments whose loads are reported for the whole specimen: ratio of these to the loads
-        of the modelled part. Energies of friction and nuisance parameters are those of the modelled
-        part.
-    """
-
+    # RMS distance of all markers, and that expected from the stated noise.
     rms_m: float
     noise_rms_m: float
+    # mapping of name to FittedExperiment: residuals of each fitted experiment.
     experiments: Mapping[str, FittedExperiment]
+    # RMS differences of all forces and torques.
     wrench_rms_n: float | None = optional()
     wrench_rms_nm: float | None = optional()
+    # mapping of experiment to int: of experiments whose loads are reported for the whole specimen:
+    # ratio of these to the loads of the modelled part. Energies of friction and nuisance parameters
+    # are those of the modelled part.
     symmetry: Mapping[str, int] | None = optional()
 
 
@@ -253,18 +214,13 @@ class SimulatedExperiment:
 
 @dataclass(frozen=True)
 class ForwardResult:
-    """Forward simulations with the estimates.
+    """Forward simulations with the estimates."""
 
-    Attributes
-    ----------
-    rms_m, max_m : float or None
-        RMS and largest distance of the markers of all fitted experiments; None without any.
-    experiments : mapping of name to SimulatedExperiment
-        Results of each experiment, also of those for validation.
-    """
-
+    # RMS and largest distance of the markers of all fitted experiments; None without any.
     rms_m: float | None
     max_m: float | None
+    # mapping of name to SimulatedExperiment: results of each experiment, also of those for
+    # validation.
     experiments: Mapping[str, SimulatedExperiment]
 
 
@@ -272,23 +228,12 @@ class ForwardResult:
 class PredictionResiduals:
     """Differences by which a prediction of held-out measurements is judged, predicted less
     measured.
-
-    Attributes
-    ----------
-    t_s : (S,) array
-        Times [s], ascending.
-    values : (S, K, d) array
-        Differences of K vectors or numbers.
-    is_counted : (S, K) array of bool
-        Whether something was measured.
-    unit : str
-        Unit of the values.
     """
 
-    t_s: Array
-    values: Array
-    is_counted: NDArray[np.bool_]
-    unit: str
+    t_s: Array  # (S,): times [s], ascending
+    values: Array  # (S, K, d): differences of K vectors or numbers
+    is_counted: NDArray[np.bool_]  # (S, K) of bool: whether something was measured
+    unit: str  # unit of the values
 
     @classmethod
     def in_order_of_time(cls, t_s: Array, values: Array, unit: str) -> PredictionResiduals:

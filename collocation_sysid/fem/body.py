@@ -81,31 +81,19 @@ class Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class SecondDerivatives:
-    """First derivatives by θ and second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states.
+    """First derivatives by θ and second derivatives of φ = wᵀ f(x, v; θ) + σ·S(x; θ) at T states."""
 
-    Attributes
-    ----------
-    position_position, position_velocity : (T, m)
-        Lower triangles of the symmetric parts of ∂²φ/∂x² and ∂²φ/∂x∂v.
-    position_theta, velocity_theta : (T, 3n, k)
-        Mixed derivatives by positions or velocities and θ.
-    theta_theta : (T, k, k)
-        Second derivatives by θ.
-    theta : (T, k)
-        First derivatives ∂φ/∂θ, which the chain rule needs.
-    position_velocity_skew : (T, m) or (T, 0)
-        Lower triangles of the skew part of ∂²φ/∂x∂v; empty if it is zero.
-    velocity_velocity : (T, m) or (T, 0)
-        Lower triangles of ∂²φ/∂v²; only external forces have some.
-    """
-
+    # (T, m): lower triangles of the symmetric parts of ∂²φ/∂x² and ∂²φ/∂x∂v.
     position_position: Array
     position_velocity: Array
+    # (T, 3n, k): mixed derivatives by positions or velocities and θ.
     position_theta: Array
     velocity_theta: Array
-    theta_theta: Array
-    theta: Array
+    theta_theta: Array  # (T, k, k): second derivatives by θ
+    theta: Array  # (T, k): first derivatives ∂φ/∂θ, which the chain rule needs
+    # (T, m) or (T, 0): lower triangles of the skew part of ∂²φ/∂x∂v; empty if it is zero.
     position_velocity_skew: Array
+    # (T, m) or (T, 0): lower triangles of ∂²φ/∂v²; only external forces have some.
     velocity_velocity: Array
 
 

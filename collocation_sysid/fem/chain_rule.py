@@ -20,21 +20,13 @@ PartialIndex = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class SymbolicFunction:
-    """Scalar function of a few arguments whose partial derivatives are symbols.
+    """Scalar function of a few arguments whose partial derivatives are symbols."""
 
-    Attributes
-    ----------
-    arguments : (n,) SX
-        Expressions at which the function is evaluated.
-    evaluate : callable
-        Returns the partial derivatives with some indices as expressions in the symbols on which
-        the arguments depend.
-    symbols : dict of PartialIndex to SX
-        Symbols created so far; `symbol` adds to it.
-    """
-
-    arguments: ca.SX
+    arguments: ca.SX  # (n,) SX: expressions at which the function is evaluated
+    # Returns the partial derivatives with some indices as expressions in the symbols on which the
+    # arguments depend.
     evaluate: Callable[[Sequence[PartialIndex]], list[ca.SX]]
+    # dict of PartialIndex to SX: symbols created so far; `symbol` adds to it.
     symbols: dict[PartialIndex, ca.SX] = field(default_factory=dict)
 
     def symbol(self, index: PartialIndex = ()) -> ca.SX:
@@ -65,15 +57,10 @@ class SymbolicFunction:
 
 @dataclass(frozen=True, eq=False)
 class ChainRule:
-    """Derivatives of expressions in which functions stand as symbols.
+    """Derivatives of expressions in which functions stand as symbols."""
 
-    Attributes
-    ----------
-    functions : tuple of SymbolicFunction
-        Functions whose arguments do not contain symbols of one another; empty by default, where
-        all derivatives are CasADi's.
-    """
-
+    # Functions whose arguments do not contain symbols of one another; empty by default, where all
+    # derivatives are CasADi's.
     functions: tuple[SymbolicFunction, ...] = ()
 
     def jacobian(self, expression: ca.SX, by: ca.SX) -> ca.SX:

@@ -35,21 +35,11 @@ NEAREST_CELLS = 24
 
 @dataclass(frozen=True, eq=False)
 class CoarseBody:
-    """Coarse body and its relation to the given body.
+    """Coarse body and its relation to the given body."""
 
-    Attributes
-    ----------
-    body : Body
-        Given body.
-    coarse : Body
-        Body of the same shape on a coarser mesh.
-    meshes : CoarseMesh
-        Relation of their nodes and elements.
-    """
-
-    body: Body
-    coarse: Body
-    meshes: CoarseMesh
+    body: Body  # given body
+    coarse: Body  # body of the same shape on a coarser mesh
+    meshes: CoarseMesh  # relation of their nodes and elements
 
     def coarse_nodes(self, nodes: Index) -> Index:
         """Return the nodes of the coarse body, sorted, onto which nodes (k,) of the given body were

@@ -31,34 +31,17 @@ RULES = {
 
 @dataclass(frozen=True, eq=False)
 class ContactSurface:
-    """Surface points of a body that may touch an obstacle.
+    """Surface points of a body that may touch an obstacle."""
 
-    Attributes
-    ----------
-    points : ForcePoints
-        Quadrature points of faces; the vectors of each are from the frame's origin to the point and
-        to the ends of the frame's axes.
-    area_m2 : (i,)
-        Area assigned to each point.
-    edge_m : float
-        Mean edge length of all faces.
-    edges_m : (f,)
-        Mean edge length of each face.
-    part : int
-        Index of the part of the body with most of the area.
-    points_per_face : int
-        Number of points of each face.
-    faces : (f,)
-        Rows of the mesh's surface.
-    """
-
+    # Quadrature points of faces; the vectors of each are from the frame's origin to the point and
+    # to the ends of the frame's axes.
     points: ForcePoints
-    area_m2: Array
-    edge_m: float
-    edges_m: Array
-    part: int
-    points_per_face: int
-    faces: Index
+    area_m2: Array  # (i,): area assigned to each point
+    edge_m: float  # mean edge length of all faces
+    edges_m: Array  # (f,): mean edge length of each face
+    part: int  # index of the part of the body with most of the area
+    points_per_face: int  # number of points of each face
+    faces: Index  # (f,): rows of the mesh's surface
 
     @classmethod
     def from_body(cls, body: Body, frame: Index, chosen: Selection | None) -> ContactSurface:

@@ -49,21 +49,13 @@ class PointLaw:
     The constants θ are those of the material, those of the damping law and, with memory, the
     stiffening s. With a stress-free shape that is not the mesh, changes of the shape's inputs
     follow.
-
-    Attributes
-    ----------
-    has_memory : bool
-        Whether the point has a memory.
-    scaled_indices : tuple of int
-        Indices in θ of the constants that a field multiplies.
-    rest : RestPointLayout or None
-        Layout of the data of the stress-free shape; None if the mesh is stress-free.
     """
 
     material: Material
     damping: DampingLaw
-    has_memory: bool = False
-    scaled_indices: tuple[int, ...] = ()
+    has_memory: bool = False  # whether the point has a memory
+    scaled_indices: tuple[int, ...] = ()  # indices in θ of the constants that a field multiplies
+    # Layout of the data of the stress-free shape; None if the mesh is stress-free.
     rest: RestPointLayout | None = None
 
     def count_constants(self) -> int:

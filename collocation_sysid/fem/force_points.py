@@ -24,21 +24,11 @@ CACHED_MATRICES = 32
 
 @dataclass(frozen=True, eq=False)
 class ForcePoints:
-    """Instances of a law on a body.
+    """Instances of a law on a body."""
 
-    Attributes
-    ----------
-    nodes : (i, K)
-        Node indices of each instance.
-    node_weights : (i, L, K)
-        Weights m of the nodes in each vector.
-    node_count : int
-        Number of nodes of the body.
-    """
-
-    nodes: Index
-    node_weights: Array
-    node_count: int
+    nodes: Index  # (i, K): node indices of each instance
+    node_weights: Array  # (i, L, K): weights m of the nodes in each vector
+    node_count: int  # number of nodes of the body
 
     @classmethod
     def at_nodes(cls, nodes: Index, node_count: int) -> ForcePoints:

@@ -33,20 +33,13 @@ OF_POINTS = ("geometry", "carried")
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """One sum over the quadrature points of an element.
+    """One sum over the quadrature points of an element."""
 
-    Attributes
-    ----------
-    pieces : casadi.Function
-        One output for each piece. Inputs are the fields, geometry, θ, the internal variables of the
-        point if it has any, and, except in the first phase, one vector of all uncontracted outputs
-        of earlier phases.
-    contractions : dict of str to Contraction
-        Contraction of each output.
-    """
-
+    # One output for each piece. Inputs are the fields, geometry, θ, the internal variables of the
+    # point if it has any, and, except in the first phase, one vector of all uncontracted outputs of
+    # earlier phases.
     pieces: ca.Function
-    contractions: dict[str, Contraction]
+    contractions: dict[str, Contraction]  # dict of str to Contraction: contraction of each output
 
     def count_nodes(self) -> int:
         """Return the number of nodes per element."""
@@ -93,30 +86,17 @@ class Phase:
 
 @dataclass(frozen=True, eq=False)
 class ElementKernel:
-    """Contribution of the quadrature points of an element, summed.
+    """Contribution of the quadrature points of an element, summed."""
 
-    Attributes
-    ----------
-    pieces : casadi.Function
-        Pieces of the last phase, whose outputs are those of the kernel.
-    fields : tuple of str
-        Names of the first inputs, each 3·nodes long.
-    contractions : dict of str to Contraction
-        Contraction of each output.
-    previous_phases : tuple of Phase
-        Phases before the last one.
-    coupled : dict of str to Contraction
-        Further outputs of the last phase, which are summed for the coupling only.
-    coupling : casadi.Function, optional
-        C or D for each output, sparse, from the vector of all uncontracted sums: those of the
-        earlier phases, then of `coupled`.
-    """
-
-    pieces: ca.Function
-    fields: tuple[str, ...]
-    contractions: dict[str, Contraction]
-    previous_phases: tuple[Phase, ...] = ()
+    pieces: ca.Function  # pieces of the last phase, whose outputs are those of the kernel
+    fields: tuple[str, ...]  # names of the first inputs, each 3·nodes long
+    contractions: dict[str, Contraction]  # dict of str to Contraction: contraction of each output
+    previous_phases: tuple[Phase, ...] = ()  # phases before the last one
+    # dict of str to Contraction: further outputs of the last phase, which are summed for the
+    # coupling only.
     coupled: dict[str, Contraction] = field(default_factory=dict)
+    # C or D for each output, sparse, from the vector of all uncontracted sums: those of the earlier
+    # phases, then of `coupled`.
     coupling: ca.Function | None = None
 
     def count_point_data(self) -> int:
@@ -229,24 +209,14 @@ By = tuple[str, ...]
 
 @dataclass(frozen=True, eq=False)
 class Derivative:
-    """Derivative of a scalar, as a summand of an output.
+    """Derivative of a scalar, as a summand of an output."""
 
-    Attributes
-    ----------
-    scalar : SX
-        Scalar in the symbols of a `QuadraturePoint`.
-    by : tuple of str
-        Variables: none, one or two of "x", "v" and "theta", the last one last.
-    part : {"whole", "symmetric", "skew"}
-        Part of a second derivative by fields; "whole" requires that it is symmetric.
-    known : SX, optional
-        Shorter expression of the derivative by the gradients of the fields, for elements that do
-        not average the dilatation.
-    """
-
-    scalar: ca.SX
-    by: By
+    scalar: ca.SX  # scalar in the symbols of a `QuadraturePoint`
+    by: By  # variables: none, one or two of "x", "v" and "theta", the last one last
+    # Part of a second derivative by fields; "whole" requires that it is symmetric.
     part: Literal["whole", "symmetric", "skew"] = "whole"
+    # Shorter expression of the derivative by the gradients of the fields, for elements that do not
+    # average the dilatation.
     known: ca.SX | None = None
 
     def choose_contraction(self) -> Contraction:
@@ -276,43 +246,28 @@ Pieces = dict[str, tuple[Contraction, ca.SX]]
 
 @dataclass(frozen=True, eq=False)
 class QuadraturePoint:
-    """Symbols of one quadrature point.
+    """Symbols of one quadrature point."""
 
-    Attributes
-    ----------
-    nodes : int
-        Number of nodes of the element.
-    fields : dict of str to SX
-        Node fields (3·nodes,): x and, if needed, v and w.
-    geometry, theta : SX
-        See `expressions`.
-    gradients : dict of str to SX
-        Gradients of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column (9,): F, Ḟ and W.
-    stretches : tuple of SX
-        If the element averages the dilatation: the logarithm m of the stretch that does so and,
-        with v, its derivative along v, and with w, those of both along w; see
-        `mean_dilatation`.
-    point_data : SX
-        Internal variables of the point, see `memory`; with a field, its logarithm comes last.
-    scaled_indices : tuple of int
-        Indices in θ of the constants that a field multiplies, see `spatial_field`.
-    rest : RestPointLayout, optional
-        Layout of a stress-free shape that is not the mesh, see `rest_shape`: its data are the last
-        ones of `point_data`, and the changes of its inputs the last entries of θ.
-    rule : ChainRule
-        Energies that stand as symbols in expressions until `make_phase` replaces them; none by
-        default. Derivatives are taken with `gradient`, `jacobian` and `directional_derivative`.
-    """
-
-    nodes: int
-    fields: dict[str, ca.SX]
+    nodes: int  # number of nodes of the element
+    fields: dict[str, ca.SX]  # dict of str to SX: node fields (3·nodes,): x and, if needed, v and w
+    # See `expressions`.
     geometry: ca.SX
     theta: ca.SX
+    # dict of str to SX: gradients of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column
+    # (9,): F, Ḟ and W.
     gradients: dict[str, ca.SX]
+    # If the element averages the dilatation: the logarithm m of the stretch that does so and, with
+    # v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
     stretches: tuple[ca.SX, ...]
+    # Internal variables of the point, see `memory`; with a field, its logarithm comes last.
     point_data: ca.SX
+    # Indices in θ of the constants that a field multiplies, see `spatial_field`.
     scaled_indices: tuple[int, ...] = ()
+    # Layout of a stress-free shape that is not the mesh, see `rest_shape`: its data are the last
+    # ones of `point_data`, and the changes of its inputs the last entries of θ.
     rest: RestPointLayout | None = None
+    # Energies that stand as symbols in expressions until `make_phase` replaces them; none by
+    # default. Derivatives are taken with `gradient`, `jacobian` and `directional_derivative`.
     rule: ChainRule = field(default_factory=ChainRule)
 
     @classmethod

@@ -38,33 +38,19 @@ SYMMETRY_TOLERANCE = 1e-9
 
 
 class ForceContext(NamedTuple):
-    """Further quantities on which a law may depend, beside position and velocity.
+    """Further quantities on which a law may depend, beside position and velocity."""
 
-    Attributes
-    ----------
-    t_s : SX
-        Time.
-    rest_m : (3,) SX
-        Position on the undeformed body.
-    area_m2, volume_m3 : SX
-        Share of a node in the surface and volume of the undeformed body; for a face its current
-        area, and zero volume.
-    normal : (3,) SX
-        Outward unit normal: of a node that of the undeformed surface, zero inside; of a face the
-        current one.
-    interval_s : SX
-        Time since the previous evaluation.
-    is_start : SX
-        1 at the start, where there is no previous evaluation, else 0.
-    """
-
-    t_s: ca.SX
-    rest_m: ca.SX
+    t_s: ca.SX  # time
+    rest_m: ca.SX  # (3,) SX: position on the undeformed body
+    # Share of a node in the surface and volume of the undeformed body; for a face its current area,
+    # and zero volume.
     area_m2: ca.SX
     volume_m3: ca.SX
+    # (3,) SX: outward unit normal: of a node that of the undeformed surface, zero inside; of a face
+    # the current one.
     normal: ca.SX
-    interval_s: ca.SX
-    is_start: ca.SX
+    interval_s: ca.SX  # time since the previous evaluation
+    is_start: ca.SX  # 1 at the start, where there is no previous evaluation, else 0
 
 
 # Offsets of the attributes of a `ForceContext` in the data of a law, in their order.
@@ -333,22 +319,13 @@ class NodeForce:
 
 @dataclass(frozen=True, eq=False)
 class LocatedForce:
-    """Custom force on the nodes or faces of a body.
-
-    Attributes
-    ----------
-    points : ForcePoints
-        The nodes, or those of each face.
-    data : (8, i)
-        Entries of an `ForceContext` between `t_s` and `interval_s`, for each instance.
-    columns : (c,)
-        Indices in θ of its constants.
-    """
+    """Custom force on the nodes or faces of a body."""
 
     force: NodeForce
-    points: ForcePoints
+    points: ForcePoints  # the nodes, or those of each face
+    # (8, i): entries of an `ForceContext` between `t_s` and `interval_s`, for each instance.
     data: Array
-    columns: Index
+    columns: Index  # (c,): indices in θ of its constants
 
     @classmethod
     def on_mesh(

@@ -19,16 +19,10 @@ class SymmetricPattern:
 
     Row and column 3i + j belong to coordinate j of node i. Entries are sorted by column, then row,
     and every diagonal entry is present.
-
-    Attributes
-    ----------
-    size : int
-        Number 3n of rows.
-    rows, columns : (m,)
-        Row and column of each entry, rows >= columns.
     """
 
-    size: int
+    size: int  # number 3n of rows
+    # (m,): row and column of each entry, rows >= columns.
     rows: Index
     columns: Index
 
@@ -111,17 +105,10 @@ class SymmetricPattern:
 
 @dataclass(frozen=True, eq=False)
 class JointPattern:
-    """Union of several patterns.
+    """Union of several patterns."""
 
-    Attributes
-    ----------
-    pattern : SymmetricPattern
-        Union; the first pattern itself if it contains the others.
-    places : tuple of (m,) int array
-        Positions in the union of the entries of each pattern.
-    """
-
-    pattern: SymmetricPattern
+    pattern: SymmetricPattern  # union; the first pattern itself if it contains the others
+    # tuple of (m,) int array: positions in the union of the entries of each pattern.
     places: tuple[Index, ...]
 
     @staticmethod

@@ -85,48 +85,24 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class BodyPart:
-    """Region of a body, or its remainder, with resolved laws.
+    """Region of a body, or its remainder, with resolved laws."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the region; "" for the cells outside all regions.
-    cells : (k,)
-        Cell indices, ascending.
-    density_kg_m3 : float
-        Stated density; not used where the density is free.
-    prony : tuple of Prony
-        Branches of its memory.
-    per_mass_1_m3 : float
-        Density divided by the mass of the body.
-    has_own_density : bool
-        Whether the density is stated for this part, not for the body.
-    has_free_density : bool
-        Whether the density is an entry of θ.
-    field : FieldModes or None
-        Constant that varies in space within the part.
-    axes : (k, 3, 3) array or None
-        Axes of the fibres of each cell, as columns; None without fibres.
-    oscillates : bool
-        Whether every time step is a quarter of the period of a steady oscillation, whose frequency
-        may change where the strain is zero, as in harmonic tests.
-    shift : TimeShift or None
-        Factor on the times of its memory; None for 1.
-    """
-
-    name: str
-    cells: Index
+    name: str  # name of the region; "" for the cells outside all regions
+    cells: Index  # (k,): cell indices, ascending
     material: Material
     damping: DampingLaw
-    density_kg_m3: float
-    prony: tuple[Prony, ...] = ()
-    per_mass_1_m3: float = 0.0
-    has_own_density: bool = False
-    has_free_density: bool = False
-    field: FieldModes | None = None
+    density_kg_m3: float  # stated density; not used where the density is free
+    prony: tuple[Prony, ...] = ()  # branches of its memory
+    per_mass_1_m3: float = 0.0  # density divided by the mass of the body
+    has_own_density: bool = False  # whether the density is stated for this part, not for the body
+    has_free_density: bool = False  # whether the density is an entry of θ
+    field: FieldModes | None = None  # constant that varies in space within the part
+    # (k, 3, 3) or None: axes of the fibres of each cell, as columns; None without fibres.
     axes: Array | None = None
+    # Whether every time step is a quarter of the period of a steady oscillation, whose frequency
+    # may change where the strain is zero, as in harmonic tests.
     oscillates: bool = False
-    shift: TimeShift | None = None
+    shift: TimeShift | None = None  # factor on the times of its memory; None for 1
 
     @cached_property
     def constants(self) -> tuple[Constant, ...]:

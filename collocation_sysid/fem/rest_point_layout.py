@@ -14,17 +14,10 @@ class RestPointLayout:
     A point has D values: the 9 entries of G = ∂X/∂Y, column after column, and, for elements that
     average the dilatation, ρ = ln(det G / mean of det G over the element). They are followed by
     their D k derivatives by the k inputs, and by the second derivatives by pairs (i, j), i ≤ j.
-
-    Attributes
-    ----------
-    input_count : int
-        Number k of entries of θ on which X depends.
-    averages_dilatation : bool
-        Whether the element averages the dilatation.
     """
 
-    input_count: int
-    averages_dilatation: bool
+    input_count: int  # number k of entries of θ on which X depends
+    averages_dilatation: bool  # whether the element averages the dilatation
 
     def list_input_pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""

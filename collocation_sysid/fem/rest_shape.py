@@ -51,27 +51,15 @@ LARGEST_EXTRAPOLATION = 0.2
 
 @dataclass(frozen=True)
 class InverseOptions:
-    """Limits of Newton's method for the inverse equilibrium.
+    """Limits of Newton's method for the inverse equilibrium."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Largest entry of the last Newton step divided by the size of the body. Convergence is
-        quadratic, so the next step would be at the rounding error.
-    iterations : int
-        Newton steps for one share of the weight.
-    halvings : int
-        How often a step is halved, and how often the increment of the weight.
-    load_steps : int
-        Attempts with a share of the weight.
-    least_volume_ratio : float
-        Smallest det G of an admissible iterate; elements are inverted at zero.
-    """
-
+    # Largest entry of the last Newton step divided by the size of the body. Convergence is
+    # quadratic, so the next step would be at the rounding error.
     tolerance: float = 1e-9
-    iterations: int = 15
-    halvings: int = 6
-    load_steps: int = 25
+    iterations: int = 15  # Newton steps for one share of the weight
+    halvings: int = 6  # how often a step is halved, and how often the increment of the weight
+    load_steps: int = 25  # attempts with a share of the weight
+    # Smallest det G of an admissible iterate; elements are inverted at zero.
     least_volume_ratio: float = 0.02
 
 
@@ -168,18 +156,10 @@ class UnderGravity:
 
 @dataclass(frozen=True, eq=False)
 class RestShape:
-    """Stress-free positions at one θ, with derivatives.
+    """Stress-free positions at one θ, with derivatives."""
 
-    Attributes
-    ----------
-    positions_m : (n, 3)
-        Positions X.
-    by_input : (k, n, 3)
-        Derivatives of X by each input.
-    """
-
-    positions_m: Array
-    by_input: Array
+    positions_m: Array  # (n, 3): positions X
+    by_input: Array  # (k, n, 3): derivatives of X by each input
 
 
 @lru_cache(32)
@@ -211,23 +191,13 @@ def _point_stress(material: Material, averages: bool, slopes: bool) -> ca.Functi
 
 @dataclass(frozen=True, eq=False)
 class _PartForces:
-    """Elastic forces of the cells of one part at the mesh, with derivatives.
+    """Elastic forces of the cells of one part at the mesh, with derivatives."""
 
-    Attributes
-    ----------
-    dofs : (E, d)
-        Dofs of the cells.
-    force_n : (E, d)
-        Elastic forces.
-    by_position : (E, d, d)
-        Derivatives by X, with rows of the force; empty without derivatives.
-    by_theta : (E, d, c)
-        Derivatives by the constants of the material; empty without derivatives.
-    """
-
-    dofs: Index
-    force_n: Array
+    dofs: Index  # (E, d): dofs of the cells
+    force_n: Array  # (E, d): elastic forces
+    # (E, d, d): derivatives by X, with rows of the force; empty without derivatives.
     by_position: Array
+    # (E, d, c): derivatives by the constants of the material; empty without derivatives.
     by_theta: Array
 
 
@@ -297,20 +267,11 @@ def _average_pressure(stress: Array, shares: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _AssembledForces:
-    """Elastic forces at the mesh, assembled, with derivatives.
+    """Elastic forces at the mesh, assembled, with derivatives."""
 
-    Attributes
-    ----------
-    force_n : (3n,)
-    by_position : (3n, 3n) sparse
-        Derivatives by X.
-    by_theta : (3n, k)
-        Derivatives by the inputs.
-    """
-
-    force_n: Array
-    by_position: sp.csc_array
-    by_theta: Array
+    force_n: Array  # (3n,)
+    by_position: sp.csc_array  # (3n, 3n) sparse: derivatives by X
+    by_theta: Array  # (3n, k): derivatives by the inputs
 
 
 class InverseEquilibrium:

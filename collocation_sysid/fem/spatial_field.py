@@ -198,47 +198,28 @@ class Laplacian:
 
 @dataclass(frozen=True)
 class FieldResolution:
-    """Resolution of a field by its shapes.
+    """Resolution of a field by its shapes."""
 
-    Attributes
-    ----------
-    modes : int
-        Number of shapes.
-    length_m, amplitude : float
-        Correlation length and prior standard deviation.
-    share : float
-        Share of the prior variance that the shapes represent; finer shapes have the rest.
-    detail_m : float
-        Half the shortest wavelength.
-    """
-
-    modes: int
+    modes: int  # number of shapes
+    # Correlation length and prior standard deviation.
     length_m: float
     amplitude: float
+    # Share of the prior variance that the shapes represent; finer shapes have the rest.
     share: float
-    detail_m: float
+    detail_m: float  # half the shortest wavelength
 
 
 @dataclass(frozen=True, eq=False)
 class FieldModes:
-    """Shapes of a field, evaluated in every cell of a part.
-
-    Attributes
-    ----------
-    scaled_indices : tuple of int
-        Indices of the constants of material and damping law that the field multiplies; empty for a
-        density.
-    length_m : float
-        Correlation length in use.
-    volumes_m3 : (E,)
-        Volumes of the cells.
-    """
+    """Shapes of a field, evaluated in every cell of a part."""
 
     field: Field
     laplacian: Laplacian
+    # Indices of the constants of material and damping law that the field multiplies; empty for a
+    # density.
     scaled_indices: tuple[int, ...]
-    length_m: float
-    volumes_m3: Array
+    length_m: float  # correlation length in use
+    volumes_m3: Array  # (E,): volumes of the cells
 
     @classmethod
     def from_field(
@@ -372,19 +353,11 @@ class FieldModes:
 
 @dataclass(frozen=True, eq=False)
 class FieldAssembly:
-    """Assembly of derivatives by the logarithm of each cell into derivatives by the coefficients.
-
-    Attributes
-    ----------
-    dofs : (E, d)
-        Dofs of the nodes of each cell.
-    size : int
-        Number of dofs of the body.
-    """
+    """Assembly of derivatives by the logarithm of each cell into derivatives by the coefficients."""
 
     field: FieldModes
-    dofs: Index
-    size: int
+    dofs: Index  # (E, d): dofs of the nodes of each cell
+    size: int  # number of dofs of the body
 
     @cached_property
     def _incidence(self) -> sp.csr_array:

@@ -22,90 +22,54 @@ from .spatial_field import SMOOTH, Field, FieldModes
 
 @dataclass(frozen=True, eq=False)
 class PhaseSamples:
-    """Samples of the posterior of the phases.
+    """Samples of the posterior of the phases."""
 
-    Attributes
-    ----------
-    logarithms : (K, E)
-        Logarithm of the constant in every element, relative to its mean.
-    contrasts : (K,)
-        Logarithm of the contrast.
-    volumes_m3 : (K,)
-        Volume of the inclusions.
-    names : (p,)
-        Names of the parameters of `deviations`.
-    deviations : (p, p)
-        Second moments, about the estimates, of the conditional means of these parameters given each
-        sample of the phases, in the solver's coordinates: the part of their covariance due to
-        unknown phases.
-    misfit : float
-        χ² per measurement of the solution, with the given standard deviations.
-    smooth_misfit : float
-        χ² per measurement of the smooth field with which the search for the phases started.
-    scale_reduction : float
-        Potential scale reduction of the contrast, see
-        `statistics.phase_sampling.PosteriorDraws.scale_reduction`.
-    is_simulated : bool
-        Whether the linearised measurements were corrected with simulations of samples.
-    """
-
-    logarithms: Array
-    contrasts: Array
-    volumes_m3: Array
-    names: tuple[str, ...]
+    logarithms: Array  # (K, E): logarithm of the constant in every element, relative to its mean
+    contrasts: Array  # (K,): logarithm of the contrast
+    volumes_m3: Array  # (K,): volume of the inclusions
+    names: tuple[str, ...]  # (p,): names of the parameters of `deviations`
+    # (p, p): second moments, about the estimates, of the conditional means of these parameters
+    # given each sample of the phases, in the solver's coordinates: the part of their covariance due
+    # to unknown phases.
     deviations: Array
-    misfit: float
+    misfit: float  # χ² per measurement of the solution, with the given standard deviations
+    # χ² per measurement of the smooth field with which the search for the phases started.
     smooth_misfit: float
+    # Potential scale reduction of the contrast, see
+    # `statistics.phase_sampling.PosteriorDraws.scale_reduction`.
     scale_reduction: float = 1.0
+    # Whether the linearised measurements were corrected with simulations of samples.
     is_simulated: bool = True
 
 
 @dataclass(frozen=True)
 class PhaseSummary:
-    """Summary of the phases of a two-phase field.
+    """Summary of the phases of a two-phase field."""
 
-    Attributes
-    ----------
-    contrast : (lower, median, upper)
-        Ratio of the inclusion to the surroundings, with the 95 % interval of its statistical error
-        and of the phases.
-    volume_m3 : (lower, median, upper)
-        Volume of the inclusion, with the same interval.
-    deviation : float
-        Standard deviation of the logarithm in an element whose two phases are equally likely.
-    misfit, smooth_misfit : float
-        χ² per measurement of the solution, and of the smooth field before it.
-    elements : int
-        Number of elements of the smaller phase.
-    scale_reduction : float
-        Potential scale reduction of the contrast, about 1 if all chains of samples agree.
-    is_simulated : bool
-        Whether the linearised measurements were corrected with simulations of samples.
-    """
-
+    # (lower, median, upper): ratio of the inclusion to the surroundings, with the 95 % interval of
+    # its statistical error and of the phases.
     contrast: tuple[float, float, float]
+    # (lower, median, upper): volume of the inclusion, with the same interval.
     volume_m3: tuple[float, float, float]
+    # Standard deviation of the logarithm in an element whose two phases are equally likely.
     deviation: float
+    # χ² per measurement of the solution, and of the smooth field before it.
     misfit: float
     smooth_misfit: float
-    elements: int
+    elements: int  # number of elements of the smaller phase
+    # Potential scale reduction of the contrast, about 1 if all chains of samples agree.
     scale_reduction: float = 1.0
+    # Whether the linearised measurements were corrected with simulations of samples.
     is_simulated: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class TwoPhaseModes(FieldModes):
-    """Two-phase field of a part; its only coefficient is the contrast r.
+    """Two-phase field of a part; its only coefficient is the contrast r."""
 
-    Attributes
-    ----------
-    phase : (E,)
-        0 in the surroundings, 1 in inclusions; 0 everywhere until phases are known.
-    samples : PhaseSamples or None
-        Samples of the posterior of the phases; None before there is a solution.
-    """
-
+    # (E,): 0 in the surroundings, 1 in inclusions; 0 everywhere until phases are known.
     phase: Array = field(default_factory=lambda: np.zeros(0))
+    # Samples of the posterior of the phases; None before there is a solution.
     samples: PhaseSamples | None = None
 
     @classmethod
@@ -201,13 +165,9 @@ class TwoPhaseModes(FieldModes):
 class ElementLogarithms(FieldModes):
     """Field with one coefficient per element, relative to given logarithms: for derivatives by each
     one.
-
-    Attributes
-    ----------
-    base : (E,)
-        Logarithm of the constant relative to its mean where all coefficients are zero.
     """
 
+    # (E,): logarithm of the constant relative to its mean where all coefficients are zero.
     base: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod

@@ -30,19 +30,14 @@ LARGEST_BLOCK = 1000
 
 @dataclass(frozen=True)
 class Certificate:
-    """Conditions of optimality at a solution, in the scaling of the program.
+    """Conditions of optimality at a solution, in the scaling of the program."""
 
-    Attributes
-    ----------
-    stationarity, feasibility, complementarity : float
-        Largest violations of the conditions of first order.
-    curvatures : (free parameters,) array
-        Eigenvalues of the reduced Hessian, ascending; parameters at a bound are not varied.
-    """
-
+    # Largest violations of the conditions of first order.
     stationarity: float
     feasibility: float
     complementarity: float
+    # (free parameters,): eigenvalues of the reduced Hessian, ascending; parameters at a bound are
+    # not varied.
     curvatures: Array
 
     @property

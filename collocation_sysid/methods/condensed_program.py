@@ -76,24 +76,12 @@ def complete_multipliers(program: Collocation, z: Array, multipliers: Array) -> 
 
 @dataclass(frozen=True, eq=False)
 class EliminatedDofs:
-    """Grasped dofs of one experiment, as functions of its φ.
+    """Grasped dofs of one experiment, as functions of its φ."""
 
-    Attributes
-    ----------
-    transcription : Transcription
-        Transcription of the experiment.
-    variables : (h,) array of int
-        Indices of the dofs in z of the complete program.
-    rows : (h,) array of int
-        Indices in g of the constraints that prescribe them.
-    phi : (k,) array of int
-        Indices in z of the φ that move the body in its grasps.
-    """
-
-    transcription: Transcription
-    variables: Index
-    rows: Index
-    phi: Index
+    transcription: Transcription  # transcription of the experiment
+    variables: Index  # (h,) of int: indices of the dofs in z of the complete program
+    rows: Index  # (h,) of int: indices in g of the constraints that prescribe them
+    phi: Index  # (k,) of int: indices in z of the φ that move the body in its grasps
 
     @classmethod
     def from_segment(cls, transcription: Transcription, complete: Collocation) -> EliminatedDofs:
@@ -131,24 +119,13 @@ class EliminatedDofs:
 
 @dataclass(frozen=True, eq=False)
 class EliminatedColumns:
-    """Columns of a sparse matrix that belong to eliminated variables.
+    """Columns of a sparse matrix that belong to eliminated variables."""
 
-    Attributes
-    ----------
-    entries : array of int
-        Indices of the columns' entries among the values of the matrix.
-    rows : (r,) array of int
-        Row indices in which the columns have entries, and further rows; ascending.
-    row : array of int
-        Index in `rows` of each entry.
-    column : array of int
-        Index among the eliminated columns of each entry.
-    """
-
-    entries: Index
+    entries: Index  # indices of the columns' entries among the values of the matrix
+    # (r,) of int: row indices in which the columns have entries, and further rows; ascending.
     rows: Index
-    row: Index
-    column: Index
+    row: Index  # index in `rows` of each entry
+    column: Index  # index among the eliminated columns of each entry
 
     @classmethod
     def from_entries(
@@ -186,21 +163,11 @@ class EliminatedColumns:
 
 @dataclass(frozen=True, eq=False)
 class ColumnEntries:
-    """Entries of some columns of a sparse matrix in compressed columns.
+    """Entries of some columns of a sparse matrix in compressed columns."""
 
-    Attributes
-    ----------
-    positions : (e,) array of int
-        Index of each entry among the values of the matrix.
-    rows : (e,) array of int
-        Row of each entry.
-    columns : (e,) array of int
-        Index of the column of each entry among the selected ones.
-    """
-
-    positions: Index
-    rows: Index
-    columns: Index
+    positions: Index  # (e,) of int: index of each entry among the values of the matrix
+    rows: Index  # (e,) of int: row of each entry
+    columns: Index  # (e,) of int: index of the column of each entry among the selected ones
 
     @classmethod
     def select(cls, structure: tuple[Index, Index], selected: Index) -> ColumnEntries:
@@ -241,24 +208,15 @@ class ColumnEntries:
 
 @dataclass(frozen=True, eq=False)
 class CondensedPattern:
-    """Sparsity pattern of a condensed matrix, and the origin of its values.
+    """Sparsity pattern of a condensed matrix, and the origin of its values."""
 
-    Attributes
-    ----------
-    assembly : SparseAssembly
-        Structure, with the values that remain as initial ones, and the contributions by each
-        experiment's eliminated dofs as groups.
-    is_remaining : array of bool
-        Mask of the complete matrix's values that remain; they keep their order.
-    remaining_count : int
-        Number of these values.
-    eliminated : sequence of EliminatedColumns
-        Columns of the complete matrix that give the contributions of each experiment.
-    """
-
+    # Structure, with the values that remain as initial ones, and the contributions by each
+    # experiment's eliminated dofs as groups.
     assembly: SparseAssembly
+    # Mask of the complete matrix's values that remain; they keep their order.
     is_remaining: NDArray[np.bool_]
-    remaining_count: int
+    remaining_count: int  # number of these values
+    # Columns of the complete matrix that give the contributions of each experiment.
     eliminated: Sequence[EliminatedColumns]
 
     @classmethod

@@ -39,26 +39,14 @@ from .trajectory_sweeps import (
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
-    """Parameters and trajectories with the linearised least-squares problem there.
+    """Parameters and trajectories with the linearised least-squares problem there."""
 
-    Attributes
-    ----------
-    p : (np,) array
-        All parameters (q, φ), see `Collocation.pack`.
-    trajectories : list of LinearisedTrajectory
-        Sweep of each experiment, stored by the workers.
-    reports : list of SweepReport
-        Reports of the sweeps.
-    fit : SquareRootInformation
-        Residuals linearised in a step from p: measurements after the feasibility step, and priors.
-    previous_slopes_residual : (np,) array
-        S_0ᵀ r of its residuals r, with the slopes S_0 of the previous iterate.
-    """
-
-    p: Array
-    trajectories: list[Any]
+    p: Array  # (np,): all parameters (q, φ), see `Collocation.pack`
+    trajectories: list[Any]  # sweep of each experiment, stored by the workers
     reports: list[SweepReport]
+    # Residuals linearised in a step from p: measurements after the feasibility step, and priors.
     fit: SquareRootInformation
+    # (np,): S_0ᵀ r of its residuals r, with the slopes S_0 of the previous iterate.
     previous_slopes_residual: Array
 
     @cached_property

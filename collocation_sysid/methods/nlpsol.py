@@ -207,24 +207,15 @@ class _SolverAbandoned(Exception):
 
 
 class _NlpsolResult(NamedTuple):
-    """Result of a solver of `nlpsol`.
+    """Result of a solver of `nlpsol`."""
 
-    Attributes
-    ----------
-    variables : (variables,) array
-        Last variables; NaN if the solver failed or was abandoned.
-    multipliers : (constraints,) array
-        Multipliers of the constraints; empty if the solver failed or was abandoned.
-    return_status : str
-        Status that the solver states; if it raised a `RuntimeError` the last line of the message,
-        and if it was abandoned "left behind".
-    iterations : int
-        Number of iterations; 0 if the solver does not count them, failed or was abandoned.
-    """
-
-    variables: Array
+    variables: Array  # (variables,): last variables; NaN if the solver failed or was abandoned
+    # (constraints,): multipliers of the constraints; empty if the solver failed or was abandoned.
     multipliers: Array
+    # Status that the solver states; if it raised a `RuntimeError` the last line of the message, and
+    # if it was abandoned "left behind".
     return_status: str
+    # Number of iterations; 0 if the solver does not count them, failed or was abandoned.
     iterations: int
 
     @classmethod

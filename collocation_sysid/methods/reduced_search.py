@@ -133,21 +133,11 @@ class SearchOptions(MethodOptions):
 
 @dataclass(frozen=True, eq=False)
 class _ReassociatedTrial:
-    """Trial whose correspondences have been found again at its own estimates.
+    """Trial whose correspondences have been found again at its own estimates."""
 
-    Attributes
-    ----------
-    trial : Iterate
-        Trial with the association of the point before it.
-    collocation : Collocation
-        Problem with the association at the trial.
-    reassociated : Iterate
-        Trial with that association.
-    """
-
-    trial: Iterate
-    collocation: Collocation
-    reassociated: Iterate
+    trial: Iterate  # trial with the association of the point before it
+    collocation: Collocation  # problem with the association at the trial
+    reassociated: Iterate  # trial with that association
 
 
 class ReducedSearch:

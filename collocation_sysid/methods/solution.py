@@ -142,24 +142,12 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Timing:
-    """Computing times of a solve [s].
+    """Computing times of a solve [s]."""
 
-    Attributes
-    ----------
-    build : float
-        Time to set up the program.
-    evaluations : float
-        Time to evaluate residuals and derivatives.
-    linear_algebra : float
-        Time to factorise and solve.
-    total : float
-        Total time, which includes what the other three do not count.
-    """
-
-    build: float = 0.0
-    evaluations: float = 0.0
-    linear_algebra: float = 0.0
-    total: float = 0.0
+    build: float = 0.0  # time to set up the program
+    evaluations: float = 0.0  # time to evaluate residuals and derivatives
+    linear_algebra: float = 0.0  # time to factorise and solve
+    total: float = 0.0  # total time, which includes what the other three do not count
 
     def __add__(self, other: Timing) -> Timing:
         """Return new times, the sums of the entries of both [s]."""

@@ -36,24 +36,12 @@ SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, checks_stability=False)
 
 @dataclass(frozen=True)
 class FitSummary:
-    """Fit of one trajectory to its measurements.
+    """Fit of one trajectory to its measurements."""
 
-    Attributes
-    ----------
-    rows : int
-        Number of grid rows.
-    violation_n : float
-        Largest residual of the equations of motion, |c| [N].
-    squares_m2 : float
-        Sum of the squared distances between predicted and measured markers [m²].
-    samples : int
-        Number of these distances.
-    """
-
-    rows: int
-    violation_n: float
-    squares_m2: float
-    samples: int
+    rows: int  # number of grid rows
+    violation_n: float  # largest residual of the equations of motion, |c| [N]
+    squares_m2: float  # sum of the squared distances between predicted and measured markers [m²]
+    samples: int  # number of these distances
 
     @classmethod
     def from_iterate(cls, iterate: ExperimentIterate, x: Array, violation_n: float) -> FitSummary:
@@ -79,45 +67,26 @@ class SweepReport(FitSummary):
     steps.
 
     The fit to the measurements is that of the positions after the feasibility step.
-
-    Attributes
-    ----------
-    fit : SquareRootInformation
-        Residuals linearised in a step of the k parameters.
-    previous_slopes_residual : (k,) array
-        S_0ᵀ r with the slopes S_0 of the previous trajectory; zeros without one.
-    feasibility_m : float
-        Largest coordinate of the feasibility step [m].
-    position_change_m : float
-        Largest change of a coordinate since the previous trajectory [m].
-    indefinite_steps : int
-        Number of time steps whose matrix is not positive definite.
-    times_s : tuple of three floats
-        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     """
 
-    fit: SquareRootInformation
+    fit: SquareRootInformation  # residuals linearised in a step of the k parameters
+    # (k,): S_0ᵀ r with the slopes S_0 of the previous trajectory; zeros without one.
     previous_slopes_residual: Array
-    feasibility_m: float
-    position_change_m: float
-    indefinite_steps: int
+    feasibility_m: float  # largest coordinate of the feasibility step [m]
+    position_change_m: float  # largest change of a coordinate since the previous trajectory [m]
+    indefinite_steps: int  # number of time steps whose matrix is not positive definite
+    # Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     times_s: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class LinearisedTrajectory(SweepResult):
-    """Result of a sweep with the linearised residuals of the measurements.
+    """Result of a sweep with the linearised residuals of the measurements."""
 
-    Attributes
-    ----------
-    slope : (M, k) array
-        Derivatives S of all M measurement residuals by the parameters, after the feasibility step.
-    report : SweepReport
-        Result that the search needs.
-    """
-
+    # (M, k): derivatives S of all M measurement residuals by the parameters, after the feasibility
+    # step.
     slope: Array
-    report: SweepReport
+    report: SweepReport  # result that the search needs
 
     @classmethod
     def from_sweep(
@@ -137,20 +106,11 @@ class LinearisedTrajectory(SweepResult):
 
 @dataclass(frozen=True, eq=False)
 class SimulationResult:
-    """Simulated trajectory, complete or not.
+    """Simulated trajectory, complete or not."""
 
-    Attributes
-    ----------
-    x : (rows, 3n) array
-        Positions [m], as far as the simulation succeeded.
-    failure : SimulationError or None
-        Reason why the simulation ended early; None if it is complete.
-    times_s : tuple of three floats
-        Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
-    """
-
-    x: Array
-    failure: SimulationError | None
+    x: Array  # (rows, 3n): positions [m], as far as the simulation succeeded
+    failure: SimulationError | None  # reason why the simulation ended early; None if it is complete
+    # Times of building, evaluations and linear algebra, as for `Stopwatch.add` [s].
     times_s: tuple[float, float, float]
 
 

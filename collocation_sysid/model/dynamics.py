@@ -37,21 +37,14 @@ from .weight import DofMasses
 
 @dataclass(frozen=True, eq=False)
 class StencilTables:
-    """Stencil coefficients of every row, padded with zeros to the largest lag of the scheme.
+    """Stencil coefficients of every row, padded with zeros to the largest lag of the scheme."""
 
-    Attributes
-    ----------
-    p, q, w, s : (N, reach + 1)
-        Coefficients of each row by lag, see `schemes.Stencil`.
-    r : (N,)
-        Coefficient of the start velocity.
-    """
-
+    # (N, reach + 1): coefficients of each row by lag, see `schemes.Stencil`.
     p: Array = field(metadata=over_time())
     q: Array = field(metadata=over_time())
     w: Array = field(metadata=over_time())
     s: Array = field(metadata=over_time())
-    r: Array = field(metadata=over_time())
+    r: Array = field(metadata=over_time())  # (N,): coefficient of the start velocity
 
     @classmethod
     def from_scheme(cls, scheme: Scheme, rows: int, first_row: int) -> StencilTables:
@@ -537,24 +530,15 @@ def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class StencilRow:
-    """Coefficients of row t of the equations of motion, with the time step included.
+    """Coefficients of row t of the equations of motion, with the time step included."""
 
-    Attributes
-    ----------
-    p, q, w, s : tuple of float
-        Coefficients by lag, q and s divided by Δt and Δt².
-    r : float
-        Coefficient of the start velocity, divided by Δt.
-    mass_kg : (3n,)
-        Mass of every dof, including added mass of the air.
-    """
-
+    # Coefficients by lag, q and s divided by Δt and Δt².
     p: tuple[float, ...]
     q: tuple[float, ...]
     w: tuple[float, ...]
     s: tuple[float, ...]
-    r: float
-    mass_kg: Array
+    r: float  # coefficient of the start velocity, divided by Δt
+    mass_kg: Array  # (3n,): mass of every dof, including added mass of the air
 
     @classmethod
     def from_dynamics(cls, dynamics: Dynamics, t: int) -> StencilRow:

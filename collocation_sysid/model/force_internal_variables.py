@@ -35,24 +35,14 @@ CHUNK = 16
 
 @dataclass(frozen=True, eq=False)
 class ForceHistory:
-    """Internal variables of all instances of one force at N evaluations.
+    """Internal variables of all instances of one force at N evaluations."""
 
-    Attributes
-    ----------
-    forces : Forces
-        Forces at all evaluations.
-    number : int
-        Index of the force in `Forces.external_terms`.
-    xi, nu : (N, 3n)
-        Positions [m] and velocities [m/s] at the evaluations.
-    previous_state : PreviousState
-        Internal variables of the previous evaluation, at each evaluation.
-    """
-
-    forces: Forces
-    number: int
+    forces: Forces  # forces at all evaluations
+    number: int  # index of the force in `Forces.external_terms`
+    # (N, 3n): positions [m] and velocities [m/s] at the evaluations.
     xi: Array
     nu: Array
+    # Internal variables of the previous evaluation, at each evaluation.
     previous_state: PreviousState
 
     @classmethod
@@ -219,21 +209,11 @@ class ForceHistory:
 
 @dataclass(frozen=True, eq=False)
 class ForcePreviousState:
-    """Internal variables of one force at one time, for time marching.
+    """Internal variables of one force at one time, for time marching."""
 
-    Attributes
-    ----------
-    number : int
-        Index of the force in `Forces.external_terms`.
-    term : Pointwise
-        Force at that time, with the internal variables before it.
-    after : (n, 1, I)
-        Internal variables h after that time.
-    """
-
-    number: int
-    term: Pointwise
-    after: Array
+    number: int  # index of the force in `Forces.external_terms`
+    term: Pointwise  # force at that time, with the internal variables before it
+    after: Array  # (n, 1, I): internal variables h after that time
 
     @classmethod
     def from_state(cls, forces: Forces, number: int, x: Array, v: Array) -> ForcePreviousState:

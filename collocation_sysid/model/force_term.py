@@ -25,37 +25,21 @@ from .local_force import LocalForce
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """States at which forces are evaluated.
+    """States at which forces are evaluated."""
 
-    Attributes
-    ----------
-    xi : (T, 3n)
-        Positions ξ [m].
-    nu : (T, 3n)
-        Velocities ν [m/s]; in a static experiment the displacements since the previous sample [m].
-    theta : (k,)
-        Constants θ of the body.
-    """
-
-    xi: Array
+    xi: Array  # (T, 3n): positions ξ [m]
+    # (T, 3n): velocities ν [m/s]; in a static experiment the displacements since the previous
+    # sample [m].
     nu: Array
-    theta: Array
+    theta: Array  # (k,): constants θ of the body
 
 
 @dataclass(frozen=True, eq=False)
 class AssemblyIndices:
-    """Positions in the shared arrays to which a term adds its derivatives.
+    """Positions in the shared arrays to which a term adds its derivatives."""
 
-    Attributes
-    ----------
-    inputs : slice
-        Columns of the term's inputs.
-    entries : (m,)
-        Positions of the term's couplings in the shared sparsity pattern.
-    """
-
-    inputs: slice
-    entries: Index
+    inputs: slice  # columns of the term's inputs
+    entries: Index  # (m,): positions of the term's couplings in the shared sparsity pattern
 
 
 class ForceTerm(ABC):
@@ -193,17 +177,10 @@ class ShapeFunctional(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Potential(ForceTerm):
-    """Force −c ∂S/∂x of an energy c S(x) at T times.
+    """Force −c ∂S/∂x of an energy c S(x) at T times."""
 
-    Attributes
-    ----------
-    scalar : ShapeFunctional
-        Function S of the positions.
-    amplitude : (T, 1)
-        Factor c of the energy; the only input of the force.
-    """
-
-    scalar: ShapeFunctional
+    scalar: ShapeFunctional  # function S of the positions
+    # (T, 1): factor c of the energy; the only input of the force.
     amplitude: Array = field(metadata=over_time(is_load=True))
 
     @property

@@ -29,22 +29,12 @@ class GeneratedFunction:
     The expression is called at the first use of a method, not by the constructor, and its errors
     come then. The first evaluation of values, of slopes and of second derivatives generates, and
     with `is_compiled` compiles, their code; it is kept with the object.
-
-    Attributes
-    ----------
-    expression : callable
-        ``expression(u, data) -> y`` in CasADi operations on column vectors.
-    input_size : int
-        Length k of u.
-    data_size : int
-        Length d of the data.
-    is_compiled : bool
-        Whether to compile the expression to native code; worthwhile at many instances.
     """
 
-    expression: Expression
-    input_size: int
-    data_size: int
+    expression: Expression  # ``expression(u, data) -> y`` in CasADi operations on column vectors
+    input_size: int  # length k of u
+    data_size: int  # length d of the data
+    # Whether to compile the expression to native code; worthwhile at many instances.
     is_compiled: bool = False
 
     def evaluate(self, u: Array, data: Array) -> Array:

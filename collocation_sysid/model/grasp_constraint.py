@@ -25,21 +25,12 @@ from .nuisance_map import NuisanceMap
 
 @dataclass(frozen=True, eq=False)
 class PrescribedDisplacements:
-    """Prescribed positions of the dofs that are grasped at some time, on the time grid.
+    """Prescribed positions of the dofs that are grasped at some time, on the time grid."""
 
-    Attributes
-    ----------
-    dofs : (g,)
-        Indices of these dofs, ascending.
-    positions_m : (N, g)
-        Prescribed positions; NaN while a dof is free.
-    by_phi : (N, g, m)
-        Derivatives by the m nuisance parameters that affect the motion, zero while a dof is free;
-        m = 0 if none of them affects the grasps.
-    """
-
-    dofs: Index
-    positions_m: Array
+    dofs: Index  # (g,): indices of these dofs, ascending
+    positions_m: Array  # (N, g): prescribed positions; NaN while a dof is free
+    # (N, g, m): derivatives by the m nuisance parameters that affect the motion, zero while a dof
+    # is free; m = 0 if none of them affects the grasps.
     by_phi: Array
 
     @property
@@ -50,19 +41,11 @@ class PrescribedDisplacements:
 
 @dataclass(frozen=True, eq=False)
 class GraspConstraint:
-    """Grasps of an experiment on its time grid.
-
-    Attributes
-    ----------
-    experiment : Experiment
-    nuisance : NuisanceMap
-    t_s : (N,)
-        Times of the grid.
-    """
+    """Grasps of an experiment on its time grid."""
 
     experiment: Experiment
     nuisance: NuisanceMap
-    t_s: Array
+    t_s: Array  # (N,): times of the grid
 
     @cached_property
     def dofs(self) -> Index:

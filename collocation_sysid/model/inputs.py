@@ -32,23 +32,13 @@ Expression = Callable[[ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True, eq=False)
 class Input:
-    """Group of consecutive entries of u, with one expression.
+    """Group of consecutive entries of u, with one expression."""
 
-    Attributes
-    ----------
-    size : int
-        Number of entries.
-    expression : callable
-        ``expression(p, data) -> (size,)`` in CasADi operations.
-    data : (d, N) or (d, 1)
-        Data at the N evaluations; (d, 1) for entries that are constant in time.
-    is_coupled_to_state : bool
-        Whether the mixed second derivative of the forces by these entries and the state is nonzero.
-    """
-
-    size: int
-    expression: Expression
+    size: int  # number of entries
+    expression: Expression  # ``expression(p, data) -> (size,)`` in CasADi operations
+    # (d, N) or (d, 1): data at the N evaluations; (d, 1) for entries that are constant in time.
     data: Array
+    # Whether the mixed second derivative of the forces by these entries and the state is nonzero.
     is_coupled_to_state: bool = True
 
 

@@ -23,29 +23,14 @@ from ..fem.pattern import SymmetricPattern, dofs_of
 
 @dataclass(frozen=True, eq=False)
 class CandidatePoints:
-    """Points of a body on which a local force may act in a time step.
+    """Points of a body on which a local force may act in a time step."""
 
-    Attributes
-    ----------
-    point_indices : (i,) array
-        Indices of the points among all points of the force.
-    nodes : (i, k) array
-        Nodes of the face of each point.
-    weights : (i, k) array
-        Shape functions of these nodes.
-    dofs : (i, 3k) array
-        Dofs of these nodes.
-    entries : (i, 3k, 3k) array
-        Positions of the pairs of dofs in the pattern.
-    symmetric_factors, skew_factors : (i, 3k, 3k) arrays
-        Factors of the entries in the symmetric and the skew part of a matrix.
-    """
-
-    point_indices: Index
-    nodes: Index
-    weights: Array
-    dofs: Index
-    entries: Index
+    point_indices: Index  # (i,): indices of the points among all points of the force
+    nodes: Index  # (i, k): nodes of the face of each point
+    weights: Array  # (i, k): shape functions of these nodes
+    dofs: Index  # (i, 3k): dofs of these nodes
+    entries: Index  # (i, 3k, 3k): positions of the pairs of dofs in the pattern
+    # (i, 3k, 3k): factors of the entries in the symmetric and the skew part of a matrix.
     symmetric_factors: Array
     skew_factors: Array
 
@@ -97,31 +82,16 @@ class CandidatePoints:
 
 @dataclass(frozen=True, eq=False)
 class ActivePoints:
-    """Candidates on which a local force acts, and the force on them.
+    """Candidates on which a local force acts, and the force on them."""
 
-    Attributes
-    ----------
-    source : hashable
-        Identifies the force and all of its points.
-    candidates : CandidatePoints
-        All candidates of the force.
-    indices : (t,) array
-        Indices of the points among the candidates.
-    force : (3, t) array
-        Forces on the points [N].
-    slopes : (3, 3, i) or (3, 6, i) array
-        Derivatives of the forces on all candidates by their positions and, if the force depends on
-        them, their velocities.
-    rates : (float, float)
-        Derivatives of ξ and of ν by the unknown positions.
-    """
-
-    source: Hashable
-    candidates: CandidatePoints
-    indices: Index
-    force: Array
+    source: Hashable  # identifies the force and all of its points
+    candidates: CandidatePoints  # all candidates of the force
+    indices: Index  # (t,): indices of the points among the candidates
+    force: Array  # (3, t): forces on the points [N]
+    # (3, 3, i) or (3, 6, i): derivatives of the forces on all candidates by their positions and, if
+    # the force depends on them, their velocities.
     slopes: Array
-    rates: tuple[float, float]
+    rates: tuple[float, float]  # (float, float): derivatives of ξ and of ν by the unknown positions
 
     @property
     def key(self) -> tuple[Hashable, bytes, bytes]:
@@ -190,18 +160,10 @@ class LocalForce(ABC):
 
 @dataclass(frozen=True, eq=False)
 class LocalForces:
-    """Sum of the local forces in one time step.
+    """Sum of the local forces in one time step."""
 
-    Attributes
-    ----------
-    parts : sequence of LocalForce
-        The forces; may be empty.
-    pattern : SymmetricPattern
-        Pattern of the matrices.
-    """
-
-    parts: Sequence[LocalForce]
-    pattern: SymmetricPattern
+    parts: Sequence[LocalForce]  # the forces; may be empty
+    pattern: SymmetricPattern  # pattern of the matrices
 
     @property
     def has_forces(self) -> bool:

@@ -68,17 +68,10 @@ CHANGES_OF_MOTION = {"gravity", "grasps", "loads", "drives", "stiffness"}
 
 
 class TimedLoad(NamedTuple):
-    """Load that joins or leaves at an estimated time.
-
-    Attributes
-    ----------
-    load : PointMass or Force
-    change : {"from_s", "until_s"}
-        Which time of the load is estimated.
-    """
+    """Load that joins or leaves at an estimated time."""
 
     load: PointMass | Force
-    change: LoadTime
+    change: LoadTime  # which time of the load is estimated
 
     @property
     def declared_s(self) -> float:
@@ -88,29 +81,15 @@ class TimedLoad(NamedTuple):
 
 @dataclass(frozen=True)
 class NuisanceEntry:
-    """One nuisance parameter.
+    """One nuisance parameter."""
 
-    Attributes
-    ----------
-    row : Deviation
-        Row of the table of nuisance parameters.
-    number : int
-        Index of the component among those of the kind `row.of`: marker, grasp, actuator (tendons,
-        then pressures), load, camera or sensor of the experiment; 0 for a parameter of the
-        recording.
-    axis : int
-        Index of the axis of a vector-valued row.
-    label : str
-        Label with unit, such as "place of tip, x [m]".
-    sigma : float
-        Prior standard deviation, in the unit of the label.
-    """
-
-    row: Deviation
+    row: Deviation  # row of the table of nuisance parameters
+    # Index of the component among those of the kind `row.of`: marker, grasp, actuator (tendons,
+    # then pressures), load, camera or sensor of the experiment; 0 for a parameter of the recording.
     number: int
-    axis: int
-    label: str
-    sigma: float
+    axis: int  # index of the axis of a vector-valued row
+    label: str  # label with unit, such as "place of tip, x [m]"
+    sigma: float  # prior standard deviation, in the unit of the label
 
     def unit_in_label(self) -> str:
         """Return the unit of the parameter, taken from its label."""
@@ -123,36 +102,22 @@ class NuisanceMap(RecordingQuantities):
 
     All methods take φ in prior standard deviations, all k of them unless an argument is described
     otherwise; values with units are φ · `scales`.
-
-    Attributes
-    ----------
-    entries : (k,)
-        Definition of each parameter.
-    names : (k,)
-        Names with units, such as "swing: place of tip, x [m]".
-    scales : (k,)
-        Prior standard deviations, in the units of the names.
-    step_limits : (k,)
-        Largest change of φ in one step of the solver; infinite for parameters that enter linearly.
-    grasp_pivot_m : (3,)
-        Pivot c_h of the motion of the body in its grasp.
-    declared_calibration : (A, 3)
-        Factor f, loss b and logarithm of the lag over the stated lag of each tension and pressure,
-        as stated.
-    timed_loads : tuple of TimedLoad
-        Loads with an estimated time, in the order of their parameters.
-    strain_shifts_m : (G, 3)
-        Displacement of the node of each grasp per unit of strain [m]; empty unless the experiment
-        is a specimen without a mesh.
     """
 
-    entries: tuple[NuisanceEntry, ...]
-    names: tuple[str, ...]
-    scales: Array
+    entries: tuple[NuisanceEntry, ...]  # (k,): definition of each parameter
+    names: tuple[str, ...]  # (k,): names with units, such as "swing: place of tip, x [m]"
+    scales: Array  # (k,): prior standard deviations, in the units of the names
+    # (k,): largest change of φ in one step of the solver; infinite for parameters that enter
+    # linearly.
     step_limits: Array
-    grasp_pivot_m: Array
+    grasp_pivot_m: Array  # (3,): pivot c_h of the motion of the body in its grasp
+    # (A, 3): factor f, loss b and logarithm of the lag over the stated lag of each tension and
+    # pressure, as stated.
     declared_calibration: Array
+    # Loads with an estimated time, in the order of their parameters.
     timed_loads: tuple[TimedLoad, ...]
+    # (G, 3): displacement of the node of each grasp per unit of strain [m]; empty unless the
+    # experiment is a specimen without a mesh.
     strain_shifts_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod

@@ -29,17 +29,11 @@ PERIOD_ERROR = 0.01
 
 @dataclass(frozen=True)
 class NumericalMode:
-    """Numerical damping and period error of one mode.
+    """Numerical damping and period error of one mode."""
 
-    Attributes
-    ----------
-    damping_ratio : float
-        Damping ratio of the computed oscillation minus the physical damping ratio.
-    period_error : float
-        Relative lengthening of the period; infinite where the computed mode does not oscillate.
-    """
-
+    # Damping ratio of the computed oscillation minus the physical damping ratio.
     damping_ratio: float
+    # Relative lengthening of the period; infinite where the computed mode does not oscillate.
     period_error: float
 
 

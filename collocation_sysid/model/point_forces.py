@@ -32,17 +32,10 @@ from .generated_functions import GeneratedFunction
 
 
 class PreviousState(NamedTuple):
-    """Internal variables of the previous evaluation, given at T evaluations.
+    """Internal variables of the previous evaluation, given at T evaluations."""
 
-    Attributes
-    ----------
-    before : (n, T, I)
-        Variables h_{k−1} of I instances.
-    since_s : (T,)
-        Time since the previous evaluation; zero at the start, where there is none.
-    """
-
-    before: Array
+    before: Array  # (n, T, I): variables h_{k−1} of I instances
+    # (T,): time since the previous evaluation; zero at the start, where there is none.
     since_s: Array
 
 
@@ -328,24 +321,12 @@ class Pointwise(ForceTerm):
 
 
 class LawDerivatives(NamedTuple):
-    """Derivatives by y, ẏ, c and h_{k−1} of a law.
+    """Derivatives by y, ẏ, c and h_{k−1} of a law."""
 
-    Attributes
-    ----------
-    y : array
-        By the vectors y of the instance.
-    v : array
-        By their velocities ẏ.
-    c : array
-        By the constants.
-    b : array
-        By the previous internal variables h_{k−1}.
-    """
-
-    y: Array
-    v: Array
-    c: Array
-    b: Array
+    y: Array  # by the vectors y of the instance
+    v: Array  # by their velocities ẏ
+    c: Array  # by the constants
+    b: Array  # by the previous internal variables h_{k−1}
 
 
 class ComplementarityForce(Pointwise):
@@ -373,20 +354,13 @@ class ComplementarityForce(Pointwise):
 
 @dataclass(frozen=True, eq=False)
 class _LawInputs:
-    """Inputs u = (y, ẏ, c, h_{k−1}) and data of a law at some states.
+    """Inputs u = (y, ẏ, c, h_{k−1}) and data of a law at some states."""
 
-    Attributes
-    ----------
-    chosen : (i,) or None
-        Indices of the instances; None for all.
-    u, data : (…, T, i)
-    velocity_offset, constants_offset, variables_offset : int
-        Offsets of ẏ, c and h_{k−1} in u.
-    """
-
-    chosen: Index | None
+    chosen: Index | None  # (i,) or None: indices of the instances; None for all
+    # (…, T, i): .
     u: Array
     data: Array
+    # Offsets of ẏ, c and h_{k−1} in u.
     velocity_offset: int
     constants_offset: int
     variables_offset: int
@@ -426,26 +400,14 @@ class _LawInputs:
 
 @dataclass(frozen=True, eq=False)
 class CustomForce(Pointwise):
-    """Custom force, or the drag of the air, at T times.
+    """Custom force, or the drag of the air, at T times."""
 
-    Attributes
-    ----------
-    placed : LocatedForce
-        Law and the points on which it acts.
-    t_s : (T,)
-        Times.
-    factor : float
-        Factor of the force.
-    previous_state : PreviousState, optional
-        Internal variables of the previous evaluations, see `Pointwise`.
-    variable_weights : (n, T, I), optional
-        Weights of the internal variables in second derivatives.
-    """
-
-    placed: LocatedForce
-    t_s: Array = field(metadata=over_time())
+    placed: LocatedForce  # law and the points on which it acts
+    t_s: Array = field(metadata=over_time())  # (T,): times
     factor: float = field(default=1.0, metadata=LOAD)
+    # Internal variables of the previous evaluations, see `Pointwise`.
     previous_state: PreviousState | None = None
+    # (n, T, I): weights of the internal variables in second derivatives.
     variable_weights: Array | None = None
     size = 0
 

@@ -29,45 +29,25 @@ Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
 
 
 class HistoryGradient(NamedTuple):
-    """Gradient, through internal variables, of a scalar along a motion with N evaluations.
+    """Gradient, through internal variables, of a scalar along a motion with N evaluations."""
 
-    Attributes
-    ----------
-    by_xi, by_nu : (N, 3n)
-        Derivatives by positions and velocities at the evaluations.
-    by_parameters : (m,)
-        Derivatives by the parameters p.
-    """
-
+    # (N, 3n): derivatives by positions and velocities at the evaluations.
     by_xi: Array
     by_nu: Array
-    by_parameters: Array
+    by_parameters: Array  # (m,): derivatives by the parameters p
 
 
 @dataclass(frozen=True, eq=False)
 class Recursion:
-    """Recursion function R of one instance, with generated derivatives.
+    """Recursion function R of one instance, with generated derivatives."""
 
-    Attributes
-    ----------
-    expression : callable
-        ``expression(before, now, last, constants, data) -> state`` in CasADi operations on column
-        vectors: h_{k−1}, s_k, s_{k−1}, c and the data at k; returns h_k.
-    state_size : int
-        Length n of the state h.
-    signal_size : int
-        Length i of the signal s.
-    constant_count : int
-        Length C of the constants c.
-    data_size : int
-        Length d of the data at each time.
-    """
-
+    # ``expression(before, now, last, constants, data) -> state`` in CasADi operations on column
+    # vectors: h_{k−1}, s_k, s_{k−1}, c and the data at k; returns h_k.
     expression: Expression
-    state_size: int
-    signal_size: int
-    constant_count: int
-    data_size: int
+    state_size: int  # length n of the state h
+    signal_size: int  # length i of the signal s
+    constant_count: int  # length C of the constants c
+    data_size: int  # length d of the data at each time
 
     def compute_input_offsets(self) -> list[int]:
         """Return the end indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of
@@ -110,26 +90,13 @@ class Recursion:
 
 @dataclass(frozen=True, eq=False)
 class RecursionTrajectory:
-    """States of a recursion along a given signal, with derivatives forward and backward in time.
-
-    Attributes
-    ----------
-    recursion : Recursion
-    constants : (C,)
-        Constants c.
-    data : (d, N, I)
-        Data at each time and instance.
-    signal : (i, N, I)
-        Signal s.
-    states : (n, N, I)
-        States h.
-    """
+    """States of a recursion along a given signal, with derivatives forward and backward in time."""
 
     recursion: Recursion
-    constants: Array
-    data: Array
-    signal: Array
-    states: Array
+    constants: Array  # (C,): constants c
+    data: Array  # (d, N, I): data at each time and instance
+    signal: Array  # (i, N, I): signal s
+    states: Array  # (n, N, I): states h
 
     @classmethod
     def from_signal(

@@ -31,20 +31,12 @@ def stiffness_change_terms(experiment: Experiment, t_s: Array) -> Iterator[Stiff
 
 @dataclass(frozen=True, eq=False)
 class StiffnessChange(ForceTerm):
-    """Internal forces of a body without memory, and without γ_m, times a share.
-
-    Attributes
-    ----------
-    body : Body
-    share : (T, 1)
-        Relative change of the stiffness; the only input.
-    is_static : bool
-        Whether the experiment is static, so that nothing depends on velocities.
-    """
+    """Internal forces of a body without memory, and without γ_m, times a share."""
 
     body: Body
+    # (T, 1): relative change of the stiffness; the only input.
     share: Array = field(metadata=over_time())
-    is_static: bool
+    is_static: bool  # whether the experiment is static, so that nothing depends on velocities
 
     size = 1
 

@@ -101,28 +101,16 @@ INTERVAL = GeneratedFunction(_interval_coefficients, 2, data_size=2)
 
 @dataclass(frozen=True, eq=False)
 class FadingCoefficients:
-    """Coefficients c, d and a of B branches at N evaluations, with derivatives by g and τ.
+    """Coefficients c, d and a of B branches at N evaluations, with derivatives by g and τ."""
 
-    Attributes
-    ----------
-    places : (2, B)
-        Indices of g and τ in θ.
-    u : (2, B, N)
-        Values of g and τ.
-    data : (4, B, N)
-        Times, see `_overstress`.
-    c, d, a : (B, N)
-    by : (3, 2, B, N)
-        Derivatives of c, d and a by g and τ.
-    """
-
-    places: Index
-    u: Array
-    data: Array
+    places: Index  # (2, B): indices of g and τ in θ
+    u: Array  # (2, B, N): values of g and τ
+    data: Array  # (4, B, N): times, see `_overstress`
+    # (B, N): .
     c: Array
     d: Array
     a: Array
-    by: Array
+    by: Array  # (3, 2, B, N): derivatives of c, d and a by g and τ
 
     @classmethod
     def from_body(
@@ -164,29 +152,14 @@ class FadingCoefficients:
 
 @dataclass(frozen=True, eq=False)
 class MemoryHistory:
-    """Memory of the material at the evaluations of a motion.
-
-    Attributes
-    ----------
-    body : Body
-    theta : (k,)
-        Constants of the body.
-    xi : (N, 3n)
-        Positions at the evaluations [m].
-    stress : (N, width)
-        Long-term stress S at all points.
-    fading : FadingCoefficients
-        Coefficients of the recursion.
-    previous_variables : (N, all branches)
-        Internal variables m_{k−1} at each evaluation.
-    """
+    """Memory of the material at the evaluations of a motion."""
 
     body: Body
-    theta: Array
-    xi: Array
-    stress: Array
-    fading: FadingCoefficients
-    previous_variables: Array
+    theta: Array  # (k,): constants of the body
+    xi: Array  # (N, 3n): positions at the evaluations [m]
+    stress: Array  # (N, width): long-term stress S at all points
+    fading: FadingCoefficients  # coefficients of the recursion
+    previous_variables: Array  # (N, all branches): internal variables m_{k−1} at each evaluation
 
     @classmethod
     def from_states(
@@ -419,23 +392,12 @@ class MemoryHistory:
 
 @dataclass(frozen=True, eq=False)
 class MemoryState:
-    """State of the material's memory at one time, for time marching.
-
-    Attributes
-    ----------
-    body : Body
-    theta : (k,)
-        Constants of the body.
-    stress : (width,)
-        Long-term stress S.
-    overstress : (all branches,)
-        Overstress Q of each branch.
-    """
+    """State of the material's memory at one time, for time marching."""
 
     body: Body
-    theta: Array
-    stress: Array
-    overstress: Array
+    theta: Array  # (k,): constants of the body
+    stress: Array  # (width,): long-term stress S
+    overstress: Array  # (all branches,): overstress Q of each branch
 
     @classmethod
     def at_start(cls, body: Body, x: Array, theta: Array, loaded_s: float) -> MemoryState:

@@ -34,23 +34,13 @@ from .force_term import AssemblyIndices, ForceTerm, States
 
 @dataclass(frozen=True, eq=False)
 class DofMasses:
-    """Masses of every dof at T times: the body, what is tied to it, and the air.
+    """Masses of every dof at T times: the body, what is tied to it, and the air."""
 
-    Attributes
-    ----------
-    own_kg : (3n,)
-        Mass of the body itself.
-    tied_kg : (T, 3n)
-        Point masses.
-    displaced_kg : (3n,)
-        Air that the body displaces; buoyancy reduces the weight by the weight of this air.
-    added_kg : (3n,)
-        Air that moves with the body: inertia without weight and mass-proportional damping.
-    """
-
-    own_kg: Array
-    tied_kg: Array = field(metadata=over_time())
+    own_kg: Array  # (3n,): mass of the body itself
+    tied_kg: Array = field(metadata=over_time())  # (T, 3n): point masses
+    # (3n,): air that the body displaces; buoyancy reduces the weight by the weight of this air.
     displaced_kg: Array
+    # (3n,): air that moves with the body: inertia without weight and mass-proportional damping.
     added_kg: Array
 
     @cached_property

@@ -32,18 +32,10 @@ _CASADI_TEXTS |= {"none", "regularize", "eigen-reflect", "eigen-clip"}
 
 @dataclass(frozen=True)
 class CodeLoader:
-    """Loader of Python files, which runs them only if that is allowed.
+    """Loader of Python files, which runs them only if that is allowed."""
 
-    Attributes
-    ----------
-    folder : Path
-        Folder that contains the files.
-    is_allowed : bool
-        Whether files may be run.
-    """
-
-    folder: Path
-    is_allowed: bool
+    folder: Path  # folder that contains the files
+    is_allowed: bool  # whether files may be run
 
     def material(self, section: CodeSection, key: str) -> Material:
         """Return the custom material that a section names.

@@ -25,25 +25,14 @@ _REFERENCE = "#/$defs/"
 
 @dataclass(frozen=True)
 class KeyDescription:
-    """A key of the problem file.
+    """A key of the problem file."""
 
-    Attributes
-    ----------
-    path : str
-        Key with the tables that contain it, such as "experiment.markers.sigma_m"; names that a user
-        chooses are NAME.
-    form : str
-        Values that are allowed, in words; empty if the schema does not state them.
-    default : str
-        Default as JSON; empty for none, and for keys that must be stated.
-    description : str
-        Meaning; empty if the schema does not state it.
-    """
-
+    # Key with the tables that contain it, such as "experiment.markers.sigma_m"; names that a user
+    # chooses are NAME.
     path: str
-    form: str
-    default: str
-    description: str
+    form: str  # values that are allowed, in words; empty if the schema does not state them
+    default: str  # default as JSON; empty for none, and for keys that must be stated
+    description: str  # meaning; empty if the schema does not state it
 
 
 def find_keys(name: str) -> list[KeyDescription]:

@@ -59,24 +59,12 @@ class NamedSection(Section):
 
 @dataclass(frozen=True)
 class RecordingFolder:
-    """Folder of the files of one experiment, and how they are read.
+    """Folder of the files of one experiment, and how they are read."""
 
-    Attributes
-    ----------
-    path : Path
-        Folder that contains the files.
-    is_static : bool
-        Whether the samples are equilibria.
-    is_simulation : bool
-        Whether measurements are simulated, so that their files need not exist.
-    add_note : callable
-        Called with a sentence about what was read or assumed.
-    """
-
-    path: Path
-    is_static: bool
-    is_simulation: bool
-    add_note: Callable[[str], None]
+    path: Path  # folder that contains the files
+    is_static: bool  # whether the samples are equilibria
+    is_simulation: bool  # whether measurements are simulated, so that their files need not exist
+    add_note: Callable[[str], None]  # called with a sentence about what was read or assumed
 
     def must_read(self, name: str | None) -> bool:
         """Return whether a file must be read: in a solve always, also without a name (None); in a

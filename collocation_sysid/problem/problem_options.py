@@ -80,18 +80,8 @@ class UncertaintyOptions(ErrorModel):
 
 @dataclass(frozen=True)
 class Origin:
-    """Problem file of a problem.
+    """Problem file of a problem."""
 
-    Attributes
-    ----------
-    path : Path
-        Path of the problem file.
-    text : str
-        Text of the problem with the overrides that were applied.
-    files : tuple of Path
-        Data files that the problem names.
-    """
-
-    path: Path
-    text: str = field(repr=False)
-    files: tuple[Path, ...] = ()
+    path: Path  # path of the problem file
+    text: str = field(repr=False)  # text of the problem with the overrides that were applied
+    files: tuple[Path, ...] = ()  # data files that the problem names

@@ -33,22 +33,13 @@ SMALLEST_TILT_DEG = 1.0
 
 @dataclass(frozen=True)
 class SensorMounting:
-    """Pose of a force sensor, from the transforms of a log.
+    """Pose of a force sensor, from the transforms of a log."""
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor's frame.
-    frame : {"grasp", "world"}
-        Frame in which the sensor is fixed: that of the undeformed body as the grasp carries it, or
-        the world.
-    pose : (4, 4) array
-        Pose of the sensor in that frame.
-    """
-
-    sensor: str
+    sensor: str  # name of the sensor's frame
+    # Frame in which the sensor is fixed: that of the undeformed body as the grasp carries it, or
+    # the world.
     frame: Frame
-    pose: Array
+    pose: Array  # (4, 4): pose of the sensor in that frame
 
     @property
     def point_m(self) -> Array:
@@ -90,18 +81,10 @@ class SensorMounting:
 
 @dataclass
 class RecordingFrames:
-    """Frames in which the recordings of one experiment are stated, as far as logs name them.
+    """Frames in which the recordings of one experiment are stated, as far as logs name them."""
 
-    Attributes
-    ----------
-    section : ExperimentSection
-        Table of the experiment.
-    folder : Path
-        Folder that contains the files.
-    """
-
-    section: ExperimentSection
-    folder: Path
+    section: ExperimentSection  # table of the experiment
+    folder: Path  # folder that contains the files
 
     @cached_property
     def poses(self) -> list[TopicFrames | None]:

@@ -82,42 +82,19 @@ LARGEST_INTERPOLATION_SIGMAS = 0.3
 
 @dataclass
 class RecordingReader:
-    """Reader of one experiment's files.
+    """Reader of one experiment's files."""
 
-    Attributes
-    ----------
-    section : ExperimentSection
-        Table of the experiment.
-    folder : Path
-        Folder that contains the files.
-    body : Body
-        Body of the experiment.
-    parameters : Parameters
-        Parameters, from which markers' plausibility is judged.
-    simulation : bool
-        Whether files of measurements may be missing.
-    code : CodeLoader
-        Loader of Python files.
-    air_density_kg_m3 : float or "none"
-        Density of the air.
-    notes : list of str
-        Assumptions that were made; reading adds to them.
-    size : Size or None
-        Size of the problem with one sample; None skips the check of memory.
-    say : callable or None
-        Function that is called with a sentence before long work.
-    """
-
-    section: ExperimentSection
-    folder: Path
-    body: Body
-    parameters: Parameters
-    simulation: bool
-    code: CodeLoader
+    section: ExperimentSection  # table of the experiment
+    folder: Path  # folder that contains the files
+    body: Body  # body of the experiment
+    parameters: Parameters  # parameters, from which markers' plausibility is judged
+    simulation: bool  # whether files of measurements may be missing
+    code: CodeLoader  # loader of Python files
     air_density_kg_m3: float | Literal["none"]
+    # Assumptions that were made; reading adds to them.
     notes: list[str] = field(default_factory=list)
-    size: Size | None = None
-    say: Say | None = None
+    size: Size | None = None  # size of the problem with one sample; None skips the check of memory
+    say: Say | None = None  # function that is called with a sentence before long work
 
     def read(self) -> Experiment:
         """Read all files of the experiment and return it; notes are added to `notes`.

@@ -44,15 +44,9 @@ MethodName = Annotated[str, Among(tuple(METHODS)), BeforeValidator(_require_offe
 
 @dataclass(frozen=True)
 class OptionTable:
-    """Annotation of a key whose value is the table of a method's options.
+    """Annotation of a key whose value is the table of a method's options."""
 
-    Attributes
-    ----------
-    kind : type
-        Class of the method.
-    """
-
-    kind: type[MethodOptions]
+    kind: type[MethodOptions]  # class of the method
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema by which pydantic converts the table of options to the method, see

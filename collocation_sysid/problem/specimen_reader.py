@@ -30,26 +30,13 @@ UNKNOWN_PAST = 0.05
 
 @dataclass
 class SpecimenReader:
-    """Reader of one material test.
+    """Reader of one material test."""
 
-    Attributes
-    ----------
-    section : SpecimenSection
-        Table of the experiment.
-    folder : Path
-        Folder that contains the file.
-    body : Body
-        Homogeneous cell of the test.
-    simulation : bool
-        Whether the problem is simulated: then every row is used.
-    notes : list of str
-        Assumptions that were made; reading adds to them.
-    """
-
-    section: SpecimenSection
-    folder: Path
-    body: Body
-    simulation: bool = False
+    section: SpecimenSection  # table of the experiment
+    folder: Path  # folder that contains the file
+    body: Body  # homogeneous cell of the test
+    simulation: bool = False  # whether the problem is simulated: then every row is used
+    # Assumptions that were made; reading adds to them.
     notes: list[str] = field(default_factory=list)
 
     def read(self) -> tuple[Specimen, Experiment]:

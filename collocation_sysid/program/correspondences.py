@@ -39,15 +39,9 @@ class Correspondences(ABC):
 
 @dataclass(frozen=True, eq=False)
 class CorrespondenceResidual(MeasurementResidual):
-    """Measurement model of one sensor at given correspondences.
+    """Measurement model of one sensor at given correspondences."""
 
-    Attributes
-    ----------
-    correspondences : Correspondences
-        Corresponding points on the body.
-    """
-
-    correspondences: Correspondences
+    correspondences: Correspondences  # corresponding points on the body
 
     @property
     @abstractmethod

@@ -45,21 +45,12 @@ STATIC_NEIGHBOURS = 2
 
 @dataclass(frozen=True, eq=False)
 class CustomSensorResidual(MeasurementResidual):
-    """Measurement model of one custom sensor.
+    """Measurement model of one custom sensor."""
 
-    Attributes
-    ----------
-    sensor : CustomSensor
-        The user's sensor with its samples.
-    observable_s : (n,) array
-        Times of the observable [s].
-    is_static : bool
-        Whether the experiment is static: there are no velocities, and two times around a sample are
-        used.
-    """
-
-    sensor: CustomSensor
-    observable_s: Array
+    sensor: CustomSensor  # the user's sensor with its samples
+    observable_s: Array  # (n,): times of the observable [s]
+    # Whether the experiment is static: there are no velocities, and two times around a sample are
+    # used.
     is_static: bool
 
     sigma_key = "sigma"

@@ -24,21 +24,11 @@ from .observables import PointPositions
 
 @dataclass(frozen=True, eq=False)
 class NodesOfSamples(Correspondences):
-    """Nodes to which the samples of a sensor refer.
-
-    Attributes
-    ----------
-    sensor : FollowingSensor
-        The sensor with its samples.
-    body : Body
-        The body.
-    nodes : (S, P) array
-        Nodes of each sample.
-    """
+    """Nodes to which the samples of a sensor refer."""
 
     sensor: FollowingSensor
     body: Body
-    nodes: NDArray[np.integer]
+    nodes: NDArray[np.integer]  # (S, P): nodes of each sample
 
     @property
     def measured(self) -> FollowingSensor:

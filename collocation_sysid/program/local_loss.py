@@ -21,24 +21,13 @@ from .observables import PointPositions, SparseEntries
 
 @dataclass(frozen=True, eq=False)
 class LocalLoss:
-    """Hessian of the loss of the local measurements of one experiment.
+    """Hessian of the loss of the local measurements of one experiment."""
 
-    Attributes
-    ----------
-    residuals : tuple of (MeasurementResidual, PointPositions)
-        Measurements with their local observables.
-    position_count : int
-        Number of position variables, all of which precede φ.
-    nuisance_count : int
-        Number of nuisance parameters φ.
-    dof_count : int
-        Number of dofs of the body.
-    """
-
+    # tuple of (MeasurementResidual, PointPositions): measurements with their local observables.
     residuals: tuple[tuple[MeasurementResidual, PointPositions], ...]
-    position_count: int
-    nuisance_count: int
-    dof_count: int
+    position_count: int  # number of position variables, all of which precede φ
+    nuisance_count: int  # number of nuisance parameters φ
+    dof_count: int  # number of dofs of the body
 
     @cached_property
     def structure(self) -> tuple[Index, Index]:

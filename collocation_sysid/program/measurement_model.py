@@ -25,33 +25,16 @@ from .reactions.reaction_resultant import ReactionGrid
 
 @dataclass(frozen=True, eq=False)
 class MotionGrid:
-    """Times at which the motion of an experiment is known, and what its measurements share.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        The experiment.
-    nuisance : NuisanceMap
-        Its nuisance parameters φ.
-    t_s : (N,) array
-        Times of the rows of x [s].
-    reaction_grid : ReactionGrid
-        Times at which reaction forces are known.
-    sample_rows : (T,) array
-        Rows of x at the samples of the experiment.
-    huber : float or None
-        Threshold of Huber's loss in standard deviations; None for the default of each kind.
-    is_initially_at_rest : bool
-        Whether the body is at rest before the first time.
-    """
+    """Times at which the motion of an experiment is known, and what its measurements share."""
 
     experiment: Experiment
-    nuisance: NuisanceMap
-    t_s: Array
-    reaction_grid: ReactionGrid
-    sample_rows: Index
+    nuisance: NuisanceMap  # its nuisance parameters φ
+    t_s: Array  # (N,): times of the rows of x [s]
+    reaction_grid: ReactionGrid  # times at which reaction forces are known
+    sample_rows: Index  # (T,): rows of x at the samples of the experiment
+    # Threshold of Huber's loss in standard deviations; None for the default of each kind.
     huber: float | None = None
-    is_initially_at_rest: bool = True
+    is_initially_at_rest: bool = True  # whether the body is at rest before the first time
 
     @classmethod
     def at_samples(cls, experiment: Experiment, grid: ReactionGrid | None = None) -> MotionGrid:
@@ -65,21 +48,12 @@ class MotionGrid:
 
 @dataclass(frozen=True, eq=False)
 class MeasurementModel(ABC):
-    """One measurement of an experiment in its nonlinear program, for any association.
-
-    Attributes
-    ----------
-    measurement : Measurement
-        The measurement.
-    number : int
-        Its index among the experiment's markers, wrenches, custom sensors, or depth cameras.
-    grid : MotionGrid
-        Times at which the motion is known.
-    """
+    """One measurement of an experiment in its nonlinear program, for any association."""
 
     measurement: Any
+    # Its index among the experiment's markers, wrenches, custom sensors, or depth cameras.
     number: int
-    grid: MotionGrid
+    grid: MotionGrid  # times at which the motion is known
 
     @abstractmethod
     def residuals(

@@ -41,33 +41,20 @@ Expression = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
 @dataclass(frozen=True, eq=False)
 class ResidualExpression:
-    """Residual and loss of one sample as generated functions.
+    """Residual and loss of one sample as generated functions."""
 
-    Attributes
-    ----------
-    expression : callable
-        ``expression(c, phi, data) -> y`` in CasADi operations; c is (3, vectors).
-    vector_count, nuisance_count, data_count : int
-        Numbers of vectors, of nuisance parameters and of data.
-    measured_count : int
-        Length of y, a multiple of the group.
-    huber : float or None
-        Threshold of Huber's loss in standard deviations: ρ(d) = d² up to it, linear beyond; None
-        means ρ(d) = d².
-    group_size : int
-        How many numbers of y the loss takes as one vector.
-    is_compiled : bool
-        Whether to compile the residual to native code.
-    """
-
+    # ``expression(c, phi, data) -> y`` in CasADi operations; c is (3, vectors).
     expression: Expression
+    # Numbers of vectors, of nuisance parameters and of data.
     vector_count: int
     nuisance_count: int
     data_count: int
-    measured_count: int
+    measured_count: int  # length of y, a multiple of the group
+    # Threshold of Huber's loss in standard deviations: ρ(d) = d² up to it, linear beyond; None
+    # means ρ(d) = d².
     huber: float | None = None
-    group_size: int = GROUP
-    is_compiled: bool = False
+    group_size: int = GROUP  # how many numbers of y the loss takes as one vector
+    is_compiled: bool = False  # whether to compile the residual to native code
 
     @cached_property
     def residual(self) -> GeneratedFunction:
@@ -193,59 +180,31 @@ def huber_as_weights(
 
 
 class RowStencil(NamedTuple):
-    """Vectors and data from which the first S samples are computed.
+    """Vectors and data from which the first S samples are computed."""
 
-    Attributes
-    ----------
-    indices : (S, E, v) array
-        Indices of v vectors among the n e vectors of the observable, time by time: time · e +
-        point.
-    data : (d, S, E) array
-        Data of the expression.
-    """
-
+    # (S, E, v): indices of v vectors among the n e vectors of the observable, time by time: time ·
+    # e + point.
     indices: Index
-    data: Array
+    data: Array  # (d, S, E): data of the expression
 
 
 @dataclass(frozen=True, eq=False)
 class PooledResiduals:
-    """Residuals as statistics use them, in M groups of three.
+    """Residuals as statistics use them, in M groups of three."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Name of each group.
-    sigmas : (M,) array
-        Standard deviations.
-    is_compared : (S, M, 3) array of bool
-        True for numbers that are compared.
-    places_m : (3M, 3) array or None
-        Place of each number on the undeformed body [m]; None if they have none.
-    """
-
-    names: tuple[str, ...]
-    sigmas: Array
-    is_compared: NDArray[np.bool_]
+    names: tuple[str, ...]  # name of each group
+    sigmas: Array  # (M,): standard deviations
+    is_compared: NDArray[np.bool_]  # (S, M, 3) of bool: true for numbers that are compared
+    # (3M, 3) or None: place of each number on the undeformed body [m]; None if they have none.
     places_m: Array | None = None
 
 
 class SampledMotion(NamedTuple):
-    """Motion that is known at the samples of an experiment.
+    """Motion that is known at the samples of an experiment."""
 
-    Attributes
-    ----------
-    t_s : (T,) array
-        Times of the samples [s].
-    reaction_grid : ReactionGrid
-        Times at which reaction forces are known.
-    observed : ObservedMotion
-        Positions at the samples, and reaction forces.
-    """
-
-    t_s: Array
-    reaction_grid: ReactionGrid
-    observed: ObservedMotion
+    t_s: Array  # (T,): times of the samples [s]
+    reaction_grid: ReactionGrid  # times at which reaction forces are known
+    observed: ObservedMotion  # positions at the samples, and reaction forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -841,43 +800,21 @@ class MeasurementResidual(ABC):
 
 @dataclass(frozen=True, eq=False)
 class _SampleInputs:
-    """Inputs of the generated functions for the first s samples.
+    """Inputs of the generated functions for the first s samples."""
 
-    Attributes
-    ----------
-    functions : ResidualExpression
-        Generated functions for this stencil.
-    stencil : RowStencil
-        Stencil of the samples.
-    u : (k, s, E) array
-        Vectors of the observable, then nuisance parameters of the entity.
-    data : (d + 2 m, s, E) array
-        Data of the stencil, measurements ŷ and 1/σ.
-    """
-
-    functions: ResidualExpression
+    functions: ResidualExpression  # generated functions for this stencil
     stencil: RowStencil
-    u: Array
-    data: Array
+    u: Array  # (k, s, E): vectors of the observable, then nuisance parameters of the entity
+    data: Array  # (d + 2 m, s, E): data of the stencil, measurements ŷ and 1/σ
 
 
 @dataclass(frozen=True, eq=False)
 class _LinearisedSamples:
-    """Residuals of the first s samples and their derivatives by the inputs u.
-
-    Attributes
-    ----------
-    stencil : RowStencil
-        Stencil of the samples.
-    residuals : (s, E, m) array
-        Residuals in standard deviations.
-    by_inputs : (s, E, m, u) array
-        Derivatives.
-    """
+    """Residuals of the first s samples and their derivatives by the inputs u."""
 
     stencil: RowStencil
-    residuals: Array
-    by_inputs: Array
+    residuals: Array  # (s, E, m): residuals in standard deviations
+    by_inputs: Array  # (s, E, m, u): derivatives
 
 
 def _gather(by: Array, places: Index) -> Array:

@@ -29,28 +29,15 @@ from .linear_algebra.block_band import (
 
 @dataclass(frozen=True, eq=False)
 class MotionJacobian:
-    """Structure and values of ∂c/∂x of one experiment; row indices count from its first row.
+    """Structure and values of ∂c/∂x of one experiment; row indices count from its first row."""
 
-    Attributes
-    ----------
-    dynamics : Dynamics
-        Equations of motion with inputs as stated; determines the structure.
-    constrained_dofs : (k,) array
-        Dof of each row of a grid time, ascending.
-    free_dofs : array
-        Those of `constrained_dofs` with an equation of motion; the others are prescribed at all
-        times.
-    length_m : float
-        Unit of positions [m].
-    force_n : float
-        Unit of forces [N].
-    """
-
-    dynamics: Dynamics
-    constrained_dofs: Index
+    dynamics: Dynamics  # equations of motion with inputs as stated; determines the structure
+    constrained_dofs: Index  # (k,): dof of each row of a grid time, ascending
+    # Those of `constrained_dofs` with an equation of motion; the others are prescribed at all
+    # times.
     free_dofs: Index
-    length_m: float
-    force_n: float
+    length_m: float  # unit of positions [m]
+    force_n: float  # unit of forces [N]
 
     @cached_property
     def structure(self) -> BlockBand:
@@ -225,47 +212,26 @@ def shifted_back(values: Array, steps: int) -> Array:
 class _DroppedForce:
     """Entries a G + b C of one evaluation that the Jacobian does not have, because a grasp
     prescribed the dof.
-
-    Attributes
-    ----------
-    positions : (e,) array
-        Positions in the values of the Jacobian.
-    evaluation : int
-        Index of the evaluation.
-    source : (e,) array
-        Entries in lower triangles.
-    complete : (e,) array
-        Entries in both triangles, in the order of `full_skew_values`.
-    a, b : float
-        Coefficients of G = ∂F/∂ξ and C = ∂F/∂ν.
     """
 
-    positions: Index
-    evaluation: int
-    source: Index
-    complete: Index
+    positions: Index  # (e,): positions in the values of the Jacobian
+    evaluation: int  # index of the evaluation
+    source: Index  # (e,): entries in lower triangles
+    complete: Index  # (e,): entries in both triangles, in the order of `full_skew_values`
+    # Coefficients of G = ∂F/∂ξ and C = ∂F/∂ν.
     a: float
     b: float
 
 
 @dataclass(frozen=True, eq=False)
 class ReleasedGrasps:
-    """Corrections of ∂c/∂x for grasps that hold for a part of the time; empty without any.
+    """Corrections of ∂c/∂x for grasps that hold for a part of the time; empty without any."""
 
-    Attributes
-    ----------
-    dropped : tuple of _DroppedForce
-        Forces to subtract.
-    zeros : array
-        Positions in the values of the Jacobian that are set to zero: the rows of dofs while they
-        are prescribed.
-    ones : array
-        Positions that are set to one: the diagonal entries of these rows.
-    """
-
-    dropped: tuple[_DroppedForce, ...]
+    dropped: tuple[_DroppedForce, ...]  # forces to subtract
+    # Positions in the values of the Jacobian that are set to zero: the rows of dofs while they are
+    # prescribed.
     zeros: Index
-    ones: Index
+    ones: Index  # positions that are set to one: the diagonal entries of these rows
 
     @classmethod
     def from_dynamics(

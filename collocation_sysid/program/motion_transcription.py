@@ -54,37 +54,19 @@ WeightedHistory = tuple[AnyHistory, Array]
 
 @dataclass(frozen=True)
 class SegmentOffsets:
-    """Offsets of a transcription in the nonlinear program.
+    """Offsets of a transcription in the nonlinear program."""
 
-    Attributes
-    ----------
-    position : int
-        Index in z of its first position.
-    row : int
-        Index in g of its first constraint.
-    """
-
-    position: int
-    row: int
+    position: int  # index in z of its first position
+    row: int  # index in g of its first constraint
 
 
 @dataclass(frozen=True, eq=False)
 class RowWeights:
-    """Weights of the constraints and forces of one transcription in a Lagrangian.
+    """Weights of the constraints and forces of one transcription in a Lagrangian."""
 
-    Attributes
-    ----------
-    multipliers : (constraints,) array
-        Weights of the scaled constraints.
-    rows : (N, 3n) array
-        The same for the residuals c in newtons [1/N].
-    forces : (N, 3n) array
-        Weights of the forces at the evaluations [1/N].
-    """
-
-    multipliers: Array
-    rows: Array
-    forces: Array
+    multipliers: Array  # (constraints,): weights of the scaled constraints
+    rows: Array  # (N, 3n): the same for the residuals c in newtons [1/N]
+    forces: Array  # (N, 3n): weights of the forces at the evaluations [1/N]
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,67 +24,36 @@ from .markers.marker_association import MarkerAssociation, ShapeFunctions
 
 @dataclass(frozen=True, eq=False)
 class ReactionForces:
-    """Reaction forces on the g sensed dofs at the first grid times.
+    """Reaction forces on the g sensed dofs at the first grid times."""
 
-    Attributes
-    ----------
-    reaction : (N, g) array
-        Reaction forces R [N].
-    position_m : (N, g) array
-        Positions of the dofs [m].
-    reaction_by, position_by : (N, g, c) arrays or None
-        Their changes with c columns, such as derivatives by parameters; None where they are not
-        needed.
-    """
-
-    reaction: Array
-    position_m: Array
+    reaction: Array  # (N, g): reaction forces R [N]
+    position_m: Array  # (N, g): positions of the dofs [m]
+    # (N, g, c) or None: their changes with c columns, such as derivatives by parameters; None where
+    # they are not needed.
     reaction_by: Array | None = None
     position_by: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedMotion:
-    """A motion with its changes, as one observable uses it.
+    """A motion with its changes, as one observable uses it."""
 
-    Attributes
-    ----------
-    x : (rows, 3n) array
-        Positions of the first grid times [m].
-    reactions : ReactionForces or None
-        Reaction forces on the sensed dofs; None for observables that do not measure them.
-    changes : (R, p, c) array or None
-        Changes with c columns of the p values of an observable's operator applied to the R rows of
-        x at which it is observed; None means no change.
-    """
-
-    x: Array
+    x: Array  # (rows, 3n): positions of the first grid times [m]
+    # Reaction forces on the sensed dofs; None for observables that do not measure them.
     reactions: ReactionForces | None = None
+    # (R, p, c) or None: changes with c columns of the p values of an observable's operator applied
+    # to the R rows of x at which it is observed; None means no change.
     changes: Array | None = None
 
 
 class ObservableDerivatives(NamedTuple):
-    """Derivatives of the values c (n, e, 3) of an observable.
+    """Derivatives of the values c (n, e, 3) of an observable."""
 
-    Attributes
-    ----------
-    columns : (c,) array
-        Indices of the common parameters.
-    by_common : (n, e, 3, c) array
-        Derivatives by the common parameters.
-    entities : (E,) array
-        Indices of points that have parameters of their own.
-    own_parameters : (E, k) array
-        Indices in φ of these parameters.
-    by_own : (n, E, 3, k) array
-        Derivatives of these points by them.
-    """
-
-    columns: Index
-    by_common: Array
-    entities: Index
-    own_parameters: Index
-    by_own: Array
+    columns: Index  # (c,): indices of the common parameters
+    by_common: Array  # (n, e, 3, c): derivatives by the common parameters
+    entities: Index  # (E,): indices of points that have parameters of their own
+    own_parameters: Index  # (E, k): indices in φ of these parameters
+    by_own: Array  # (n, E, 3, k): derivatives of these points by them
 
     @classmethod
     def without_own(cls, columns: Index, by: Array) -> ObservableDerivatives:
@@ -98,21 +67,12 @@ class ObservableDerivatives(NamedTuple):
 
 
 class VectorJacobianProduct(NamedTuple):
-    """Derivatives of a scalar by positions, reaction forces and nuisance parameters.
+    """Derivatives of a scalar by positions, reaction forces and nuisance parameters."""
 
-    Attributes
-    ----------
-    by_x : (N, 3n) array
-        Derivatives by the positions [1/m].
-    by_reaction : (N, g) array or None
-        Derivatives by the reaction forces [1/N]; None if it does not depend on them.
-    by_phi : (k,) array
-        Derivatives by φ.
-    """
-
-    by_x: Array
+    by_x: Array  # (N, 3n): derivatives by the positions [1/m]
+    # (N, g) or None: derivatives by the reaction forces [1/N]; None if it does not depend on them.
     by_reaction: Array | None
-    by_phi: Array
+    by_phi: Array  # (k,): derivatives by φ
 
 
 class SparseEntries(NamedTuple):

@@ -35,20 +35,14 @@ OF_MARKERS = (
 
 @dataclass(frozen=True, eq=False)
 class NuisanceIndices:
-    """Indices of an experiment's nuisance parameters φ in p.
+    """Indices of an experiment's nuisance parameters φ in p."""
 
-    Attributes
-    ----------
-    indices : (k,) array
-        Index in p = (q, φ_1, φ_2, …) of each, that of the first experiment that shares it.
-    is_first : (k,) array of bool
-        False for those that an earlier experiment has already.
-    pivot_m : (3,) array or None
-        Point about which the shared camera pose rotates [m]; None means the experiment's own.
-    """
-
+    # (k,): index in p = (q, φ_1, φ_2, …) of each, that of the first experiment that shares it.
     indices: Index
+    # (k,) of bool: false for those that an earlier experiment has already.
     is_first: NDArray[np.bool_]
+    # (3,) or None: point about which the shared camera pose rotates [m]; None means the
+    # experiment's own.
     pivot_m: Array | None = None
 
 

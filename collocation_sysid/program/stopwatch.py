@@ -10,21 +10,11 @@ from typing import NamedTuple
 
 
 class ComputingTimes(NamedTuple):
-    """Computing times by kind of work.
+    """Computing times by kind of work."""
 
-    Attributes
-    ----------
-    build : float
-        Time of symbolic work and tables [s].
-    evaluations : float
-        Time of element kernels [s].
-    linear_algebra : float
-        Time of factorisations and substitutions [s].
-    """
-
-    build: float
-    evaluations: float
-    linear_algebra: float
+    build: float  # time of symbolic work and tables [s]
+    evaluations: float  # time of element kernels [s]
+    linear_algebra: float  # time of factorisations and substitutions [s]
 
 
 class Stopwatch:

@@ -48,24 +48,12 @@ ROW_TOLERANCE = 1e-3
 
 
 class StreamStencil(NamedTuple):
-    """Rows that samples of an instrument need, in a recording that continues.
+    """Rows that samples of an instrument need, in a recording that continues."""
 
-    Attributes
-    ----------
-    neighbours : int
-        Number of rows around a sample if its clock is right.
-    clock_error : float
-        Largest error of its clock, in rows.
-    first : int
-        Index of the first row at which the observed quantity exists.
-    delay : int
-        Number of rows after which it is available.
-    """
-
-    neighbours: int
-    clock_error: float = 0.0
-    first: int = 0
-    delay: int = 0
+    neighbours: int  # number of rows around a sample if its clock is right
+    clock_error: float = 0.0  # largest error of its clock, in rows
+    first: int = 0  # index of the first row at which the observed quantity exists
+    delay: int = 0  # number of rows after which it is available
 
     def rows_of_sample(self, at: float) -> range:
         """Return the rows that a sample at a position `at`, in rows and not necessarily a whole
@@ -84,13 +72,9 @@ class StencilMatrices(NamedTuple):
     Each has the shape (rows, rows); p, q and s apply to positions and give the states ξ [m] and ν
     [m/s] of the evaluations and the accelerations [m/s²], w applies to the forces at the
     evaluations. The time step is included in q and s.
-
-    Attributes
-    ----------
-    p, q, w, s : (rows, rows) arrays
-        Coefficients of row t and time t − i at [t, t − i], see `model.schemes`.
     """
 
+    # (rows, rows): coefficients of row t and time t − i at [t, t − i], see `model.schemes`.
     p: Array
     q: Array
     w: Array
@@ -98,21 +82,12 @@ class StencilMatrices(NamedTuple):
 
 
 class StreamInstrument(NamedTuple):
-    """Instrument whose samples come with frames: a custom sensor, or the sensor of a grasp.
+    """Instrument whose samples come with frames: a custom sensor, or the sensor of a grasp."""
 
-    Attributes
-    ----------
-    reading : MeasurementResidual
-        Sensor model.
-    stencil : StreamStencil
-        Rows that its samples need.
-    observable : slice or int
-        Slice of its points among all observed points, those of the markers first; or the index of
-        the resultant in `StreamingModel.reaction_sensors`.
-    """
-
-    reading: MeasurementResidual
-    stencil: StreamStencil
+    reading: MeasurementResidual  # sensor model
+    stencil: StreamStencil  # rows that its samples need
+    # Slice of its points among all observed points, those of the markers first; or the index of the
+    # resultant in `StreamingModel.reaction_sensors`.
     observable: slice | int
 
 
@@ -121,21 +96,13 @@ class StreamingModel:
     """Program whose recording arrives frame by frame.
 
     Its cached buffers are shared by all sweeps with this model, so that only one may run at a time.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        Fitted experiment, as declared in the problem.
-    collocation : Collocation
-        Program of the still recording, the template of all rows.
-    rows_per_chunk : int
-        Largest number of rows that are linearised together.
     """
 
+    # Largest number of rows that are linearised together.
     rows_per_chunk: ClassVar[int] = ROWS_PER_CHUNK
 
-    experiment: Experiment
-    collocation: Collocation
+    experiment: Experiment  # fitted experiment, as declared in the problem
+    collocation: Collocation  # program of the still recording, the template of all rows
 
     @classmethod
     def from_collocation(cls, experiment: Experiment, collocation: Collocation) -> StreamingModel:

@@ -49,74 +49,40 @@ LARGEST_SAMPLE_DELAY = 5
 
 
 class Sample(NamedTuple):
-    """Measured values of a time between or at rows.
+    """Measured values of a time between or at rows."""
 
-    Attributes
-    ----------
-    rows_back : float
-        Time of the sample, in rows before the row after which it is evaluated; 0 for that row
-        itself.
-    values : (M, 3) or (m,)
-        Marker positions [m], or values of an instrument; NaN where missing.
-    instrument : int
-        0 for markers, or the number of the instrument in `StreamingModel.instruments`, from 1 on.
-    """
-
+    # Time of the sample, in rows before the row after which it is evaluated; 0 for that row itself.
     rows_back: float
+    # (M, 3) or (m,): marker positions [m], or values of an instrument; NaN where missing.
     values: Array
+    # 0 for markers, or the number of the instrument in `StreamingModel.instruments`, from 1 on.
     instrument: int = 0
 
 
 class LoggedRow(NamedTuple):
-    """Input of one row of the grid.
+    """Input of one row of the grid."""
 
-    Attributes
-    ----------
-    poses : Poses
-        Poses of the grasps that move, in the order of `StreamingModel.moving_grasps`.
-    samples : list of Sample
-        Samples that are evaluated after this row; often empty.
-    """
-
-    poses: Poses
-    samples: list[Sample]
+    poses: Poses  # poses of the grasps that move, in the order of `StreamingModel.moving_grasps`
+    samples: list[Sample]  # samples that are evaluated after this row; often empty
 
 
 class StoredRow(NamedTuple):
-    """Initial guess of a row for a later pass.
+    """Initial guess of a row for a later pass."""
 
-    Attributes
-    ----------
-    transformed : (P,)
-        Transformed parameters of the pass, see `StreamingModel.transformed`.
-    x : (3n,)
-        Positions [m].
-    columns : (3n, m) float32
-        Derivatives Z of the positions by these transformed parameters.
-    """
-
-    transformed: Array
-    x: Array
+    transformed: Array  # (P,): transformed parameters of the pass, see `StreamingModel.transformed`
+    x: Array  # (3n,): positions [m]
+    # (3n, m) float32: derivatives Z of the positions by these transformed parameters.
     columns: NDArray[np.float32]
 
 
 class LinearisedResidual(NamedTuple):
-    """Residuals of a sample, linear in the parameters of `StreamingModel.transformed`.
+    """Residuals of a sample, linear in the parameters of `StreamingModel.transformed`."""
 
-    Attributes
-    ----------
-    at_zero : (G, 3)
-        Residuals in standard deviations, extrapolated to transformed parameters of zero; NaN where
-        missing.
-    slope : (G, 3, P)
-        Derivatives by the transformed parameters.
-    instrument : int
-        Instrument, see `Sample`.
-    """
-
+    # (G, 3): residuals in standard deviations, extrapolated to transformed parameters of zero; NaN
+    # where missing.
     at_zero: Array
-    slope: Array
-    instrument: int = 0
+    slope: Array  # (G, 3, P): derivatives by the transformed parameters
+    instrument: int = 0  # instrument, see `Sample`
 
     def evaluate_at(self, transformed: Array) -> Array:
         """Return the residuals (G, 3) at transformed parameters (P,), to first order; NaN where
@@ -132,33 +98,18 @@ ObservedRow = tuple[StoredRow, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class SweepState:
-    """State on which the next row depends.
+    """State on which the next row depends."""
 
-    Attributes
-    ----------
-    row : int
-        Number of rows done since the start of the recording.
-    end : int
-        Index of the next row in the template, whose rows before it are the latest ones.
-    x, force : (rows, 3n)
-        Positions [m] and forces [N] of the rows of the template.
-    prescribed_columns : (rows, g, 1 + m)
-        Columns of the prescribed positions of the grasped dofs.
-    reactions : GraspReactions
-        Reaction forces of grasps with a sensor.
-    last_rows : ForwardState or None
-        Columns of the last rows; None at the start.
-    observed_rows : tuple of ObservedRow
-        Observed quantities of the last rows, the latest one last.
-    """
-
-    row: int
-    end: int
+    row: int  # number of rows done since the start of the recording
+    end: int  # index of the next row in the template, whose rows before it are the latest ones
+    # (rows, 3n): positions [m] and forces [N] of the rows of the template.
     x: Array
     force: Array
+    # (rows, g, 1 + m): columns of the prescribed positions of the grasped dofs.
     prescribed_columns: Array
-    reactions: GraspReactions
-    last_rows: ForwardState | None
+    reactions: GraspReactions  # reaction forces of grasps with a sensor
+    last_rows: ForwardState | None  # columns of the last rows; None at the start
+    # Observed quantities of the last rows, the latest one last.
     observed_rows: tuple[ObservedRow, ...]
 
 

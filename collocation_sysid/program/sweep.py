@@ -104,74 +104,45 @@ class SweepResult:
 
 @dataclass(frozen=True, eq=False)
 class ForwardState:
-    """State of a forward substitution: all that the next row depends on, most recent row first.
+    """State of a forward substitution: all that the next row depends on, most recent row first."""
 
-    Attributes
-    ----------
-    solutions : tuple of (3n, c) arrays
-        Y_{t−i} for i = 1, 2, … up to the largest lag.
-    increments : tuple of (free, c) arrays
-        Force changes dF_{t−j} for j = 1, 2, …
-    forces : tuple of (free,) arrays
-        Total forces F_{t−j} at the evaluations [N].
-    history_columns : tuple of arrays
-        Columns of the history variables, body first, then forces; empty without any.
-    """
-
+    # tuple of (3n, c) arrays: Y_{t−i} for i = 1, 2, … up to the largest lag.
     solutions: tuple[Array, ...]
+    # tuple of (free, c) arrays: force changes dF_{t−j} for j = 1, 2, ….
     increments: tuple[Array, ...]
+    # tuple of (free,) arrays: total forces F_{t−j} at the evaluations [N].
     forces: tuple[Array, ...] = ()
+    # Columns of the history variables, body first, then forces; empty without any.
     history_columns: tuple[Array, ...] = ()
 
 
 class FactorisedStep(NamedTuple):
-    """Linearised and factorised equations of one time step.
+    """Linearised and factorised equations of one time step."""
 
-    Attributes
-    ----------
-    t : int
-        Index of the grid time.
-    row : StencilRow
-        Coefficients of the scheme, with the time step in q and s, and masses.
-    force : (3n,) array
-        Force F at the evaluation [N].
-    by_position, by_velocity : (m,) arrays
-        Lower triangles of the symmetric parts of G = ∂F/∂ξ and C = ∂F/∂ν, in the order of the
-        sparsity pattern.
-    factor : Factor
-        Factorised matrix −∂c_t/∂x_t on the free dofs. If it is a `ReusedFactor`, the time steps
-        must be solved in their order.
-    skew, rate_skew : arrays
-        Lower triangles of the skew parts of G and C; empty where there is none.
-    """
-
-    t: int
-    row: StencilRow
-    force: Array
+    t: int  # index of the grid time
+    row: StencilRow  # coefficients of the scheme, with the time step in q and s, and masses
+    force: Array  # (3n,): force F at the evaluation [N]
+    # (m,): lower triangles of the symmetric parts of G = ∂F/∂ξ and C = ∂F/∂ν, in the order of the
+    # sparsity pattern.
     by_position: Array
     by_velocity: Array
+    # Factorised matrix −∂c_t/∂x_t on the free dofs. If it is a `ReusedFactor`, the time steps must
+    # be solved in their order.
     factor: Factor
+    # Lower triangles of the skew parts of G and C; empty where there is none.
     skew: Array
     rate_skew: Array
 
 
 @dataclass(frozen=True, eq=False)
 class PrescribedColumns:
-    """Prescribed rows of the solution Y: changes of the displacements of grasped dofs.
+    """Prescribed rows of the solution Y: changes of the displacements of grasped dofs."""
 
-    Attributes
-    ----------
-    dofs : (g,) array
-        Grasped dofs whose displacement changes.
-    columns : (N, g, c) array
-        Changes of their positions [m]: the step to the prescribed position, and derivatives by φ.
-    is_prescribed : (N, g) array of bool
-        Whether a dof is prescribed at a grid time.
-    """
-
-    dofs: Index
+    dofs: Index  # (g,): grasped dofs whose displacement changes
+    # (N, g, c): changes of their positions [m]: the step to the prescribed position, and
+    # derivatives by φ.
     columns: Array
-    is_prescribed: NDArray[np.bool_]
+    is_prescribed: NDArray[np.bool_]  # (N, g) of bool: whether a dof is prescribed at a grid time
 
     @classmethod
     def from_columns(cls, sweep: Sweep, dofs: Index, columns: Array) -> PrescribedColumns:
@@ -214,30 +185,17 @@ class PrescribedColumns:
 
 @dataclass(frozen=True, eq=False)
 class SweepColumns:
-    """Right-hand sides of a forward substitution.
+    """Right-hand sides of a forward substitution."""
 
-    Attributes
-    ----------
-    equations : EquationsAtParameters
-        Equations of motion at the parameters.
-    count : int
-        Number of columns.
-    has_parameters : bool
-        Whether the last columns are derivatives by the parameters that change the motion; otherwise
-        only prescribed changes act.
-    has_step : bool
-        Whether the first column is the feasibility step.
-    prescribed : PrescribedColumns or None
-        Prescribed changes of grasped dofs; None if their displacements are fixed.
-    start_m : (3n, c) array or None
-        Changes of given start positions [m]; None if they are fixed.
-    """
-
-    equations: EquationsAtParameters
-    count: int
+    equations: EquationsAtParameters  # equations of motion at the parameters
+    count: int  # number of columns
+    # Whether the last columns are derivatives by the parameters that change the motion; otherwise
+    # only prescribed changes act.
     has_parameters: bool = True
-    has_step: bool = False
+    has_step: bool = False  # whether the first column is the feasibility step
+    # Prescribed changes of grasped dofs; None if their displacements are fixed.
     prescribed: PrescribedColumns | None = None
+    # (3n, c) or None: changes of given start positions [m]; None if they are fixed.
     start_m: Array | None = None
 
     @classmethod

@@ -37,18 +37,10 @@ from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
 
 @dataclass(frozen=True, eq=False)
 class WrenchResidual(MeasurementResidual):
-    """Measurement model of the force–torque sensor of one grasp.
+    """Measurement model of the force–torque sensor of one grasp."""
 
-    Attributes
-    ----------
-    observable : ReactionResultant
-        Resultant of the reactions on the grid as an observable.
-    wrench : Wrench
-        Measured samples.
-    """
-
-    observable: ReactionResultant
-    wrench: Wrench
+    observable: ReactionResultant  # resultant of the reactions on the grid as an observable
+    wrench: Wrench  # measured samples
 
     sigma_key = "sigma_n"
     has_offsets = True

@@ -44,17 +44,10 @@ class Calibration(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BodyMeasure(Generic[S]):
-    """A scalar S of the shape of a given body: the length of a tendon, or a volume.
-
-    Attributes
-    ----------
-    body : Body
-    measure : PolylineLength or EnclosedVolume
-        The scalar S of that body.
-    """
+    """A scalar S of the shape of a given body: the length of a tendon, or a volume."""
 
     body: Body
-    measure: S
+    measure: S  # the scalar S of that body
 
 
 class Actuator(ABC, Generic[S]):

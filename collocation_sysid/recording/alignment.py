@@ -22,24 +22,12 @@ _FEWEST_SAMPLES = 3
 
 @dataclass(frozen=True, eq=False)
 class AlignedRecording:
-    """Poses and markers on one time grid.
+    """Poses and markers on one time grid."""
 
-    Attributes
-    ----------
-    t_s : (T,) array
-        The grid, evenly spaced unless the experiment is static.
-    poses : tuple of PoseSequence
-        Poses of each grasp.
-    table : MarkerTable
-        Markers on the grid.
-    notes : tuple of str
-        What was cut or interpolated, without a full stop.
-    """
-
-    t_s: Array
-    poses: tuple[PoseSequence, ...]
-    table: MarkerTable
-    notes: tuple[str, ...]
+    t_s: Array  # (T,): the grid, evenly spaced unless the experiment is static
+    poses: tuple[PoseSequence, ...]  # poses of each grasp
+    table: MarkerTable  # markers on the grid
+    notes: tuple[str, ...]  # what was cut or interpolated, without a full stop
 
 
 def align(

@@ -52,27 +52,13 @@ WIDENING = 10.0
 
 @dataclass(frozen=True, eq=False)
 class RecordingQuantities:
-    """Quantities of a recording on which nuisance parameters may depend.
+    """Quantities of a recording on which nuisance parameters may depend."""
 
-    Attributes
-    ----------
-    recorded_s : (float, float)
-        First and last time of the recording.
-    interval_s : float
-        Time between samples.
-    duration_s : float
-        Duration of the recording.
-    gravity_m_s2 : (3,)
-        Gravity as stated.
-    pivot_m : (3,)
-        Pivot c of the rigid motion in the frame of the markers.
-    """
-
-    recorded_s: tuple[float, float]
-    interval_s: float
+    recorded_s: tuple[float, float]  # (float, float): first and last time of the recording
+    interval_s: float  # time between samples
     duration_s: float
-    gravity_m_s2: Array
-    pivot_m: Array
+    gravity_m_s2: Array  # (3,): gravity as stated
+    pivot_m: Array  # (3,): pivot c of the rigid motion in the frame of the markers
 
 
 @dataclass(frozen=True)

@@ -33,24 +33,13 @@ ASSIGNMENTS = 3
 
 @dataclass(frozen=True, eq=False)
 class FrameAssignment:
-    """Evenly spaced samples, and the sample of each frame.
+    """Evenly spaced samples, and the sample of each frame."""
 
-    Attributes
-    ----------
-    t_s : (T,) array
-        Times of the samples [s].
-    samples : (F,) array of int
-        Index, from 0, of the sample of each frame, increasing.
-    offsets_s : (F,) array
-        Time of each frame less that of its sample [s]; 0 for the first and the last frame.
-    jitter_s : (F,) array
-        Deviation of the times of the frames from the line fitted to them [s].
-    """
-
-    t_s: Array
-    samples: Index
+    t_s: Array  # (T,): times of the samples [s]
+    samples: Index  # (F,) of int: index, from 0, of the sample of each frame, increasing
+    # (F,): time of each frame less that of its sample [s]; 0 for the first and the last frame.
     offsets_s: Array
-    jitter_s: Array
+    jitter_s: Array  # (F,): deviation of the times of the frames from the line fitted to them [s]
 
     def compute_interval_s(self) -> float:
         """Return the time between samples [s]."""

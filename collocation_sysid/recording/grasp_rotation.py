@@ -25,27 +25,14 @@ _KEY = "transcription.substeps"
 
 @dataclass(frozen=True)
 class GraspRotation:
-    """The largest rotation of a grasp between two times of the grid.
-
-    Attributes
-    ----------
-    experiment : str
-        Name of the experiment.
-    angle_rad : float
-        Angle of the rotation within the step.
-    time_s : float
-        Begin of the step.
-    step_s : float
-        Length of the step.
-    remedy : str
-        What to change in the problem, for messages: the substeps that reduce the angle to
-        `TARGET_ANGLE_RAD`, or, for poses held between samples, a smooth interpolation.
-    """
+    """The largest rotation of a grasp between two times of the grid."""
 
     experiment: str
-    angle_rad: float
-    time_s: float
-    step_s: float
+    angle_rad: float  # angle of the rotation within the step
+    time_s: float  # begin of the step
+    step_s: float  # length of the step
+    # What to change in the problem, for messages: the substeps that reduce the angle to
+    # `TARGET_ANGLE_RAD`, or, for poses held between samples, a smooth interpolation.
     remedy: str
 
 

@@ -31,53 +31,33 @@ AXES = "xyz"
 class HomogeneousDeformation:
     """Deformation of one kind of material test, F = I + H + s (e₁ D₁ + e₂ D₂), apart from its free
     components.
-
-    Attributes
-    ----------
-    test : str
-        Name of the test.
-    first : tuple of str
-        Components of D₁ that are 1, such as ("zz",): displacement direction, then node.
-    second : tuple of str
-        Components of D₂ that are 1, or −1 with a "-" in front; empty if the test has one strain.
-    scale : float
-        Factor s of the strains.
-    held : tuple of (str, float)
-        Components of the constant H with their values, such as those of a pre-stretch.
-    free : str
-        Axes along which the normal stress vanishes and the stretch is free.
-    free_shear : tuple of str
-        Other components of F that are free, because their stress vanishes.
-    first_stress : str
-        Component of the nominal stress that belongs to e₁: its direction, then the normal.
-    second_stress : str
-        Component of a second nominal stress; empty if there is none.
-    lateral : str
-        Axis of the free stretch that may be measured; empty if there is none.
-    young_ratio : float
-        Initial slope of stress over strain, of an incompressible material, over Young's modulus;
-        NaN if it is not determined by Young's modulus.
-    area_over_length_m : float
-        Undeformed area over undeformed length [m] of a specimen whose strain e₁ is the displacement
-        of a test bench over that length, so that the compliance of the bench adds to it; 0 if the
-        strain was measured on the specimen.
-    columns : tuple of str
-        Quantities of the columns of its file, such as "displacement" and "lateral_strain"; empty
-        without a file.
     """
 
     test: str
+    # Components of D₁ that are 1, such as ("zz",): displacement direction, then node.
     first: tuple[str, ...]
+    # Components of D₂ that are 1, or −1 with a "-" in front; empty if the test has one strain.
     second: tuple[str, ...] = ()
-    scale: float = 1.0
+    scale: float = 1.0  # factor s of the strains
+    # tuple of (str, float): components of the constant H with their values, such as those of a
+    # pre-stretch.
     held: tuple[tuple[str, float], ...] = ()
-    free: str = ""
+    free: str = ""  # axes along which the normal stress vanishes and the stretch is free
+    # Other components of F that are free, because their stress vanishes.
     free_shear: tuple[str, ...] = ()
+    # Component of the nominal stress that belongs to e₁: its direction, then the normal.
     first_stress: str = "zz"
-    second_stress: str = ""
-    lateral: str = ""
+    second_stress: str = ""  # component of a second nominal stress; empty if there is none
+    lateral: str = ""  # axis of the free stretch that may be measured; empty if there is none
+    # Initial slope of stress over strain, of an incompressible material, over Young's modulus; NaN
+    # if it is not determined by Young's modulus.
     young_ratio: float = 1.0
+    # Undeformed area over undeformed length [m] of a specimen whose strain e₁ is the displacement
+    # of a test bench over that length, so that the compliance of the bench adds to it; 0 if the
+    # strain was measured on the specimen.
     area_over_length_m: float = 0.0
+    # Quantities of the columns of its file, such as "displacement" and "lateral_strain"; empty
+    # without a file.
     columns: tuple[str, ...] = ()
 
     @property

@@ -49,23 +49,12 @@ def _require_selection(faces: Selection | None) -> Selection | None:
 
 @dataclass(frozen=True, eq=False)
 class ObstacleForces:
-    """Measured forces of an obstacle on the body.
+    """Measured forces of an obstacle on the body."""
 
-    Attributes
-    ----------
-    t_s : (S,) array
-        Sample times [s].
-    forces_n : (S, 3) array
-        Forces along the axes of the sensor [N]; NaN where missing.
-    sigma_n : float
-        Standard deviation of their noise [N].
-    frame_poses : PoseSequence or None
-        Motion of the axes of the sensor; None if they are those of the world.
-    """
-
-    t_s: Array
-    forces_n: Array
-    sigma_n: float
+    t_s: Array  # (S,): sample times [s]
+    forces_n: Array  # (S, 3): forces along the axes of the sensor [N]; NaN where missing
+    sigma_n: float  # standard deviation of their noise [N]
+    # Motion of the axes of the sensor; None if they are those of the world.
     frame_poses: PoseSequence | None
 
     def rotate_to_world_n(self) -> Array:

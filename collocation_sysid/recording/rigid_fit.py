@@ -138,19 +138,12 @@ def fit_poses(
 
 
 class TemplateFit(NamedTuple):
-    """A rigid change of frame, x → rotation x + translation_m, and its residuals.
+    """A rigid change of frame, x → rotation x + translation_m, and its residuals."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) array
-    translation_m : (3,) array
-    residual_m : (k,) array
-        Distance of each marker of the template from its place; NaN for a marker without a sample in
-        the window.
-    """
-
-    rotation: Array
-    translation_m: Array
+    rotation: Array  # (3, 3)
+    translation_m: Array  # (3,)
+    # (k,): distance of each marker of the template from its place; NaN for a marker without a
+    # sample in the window.
     residual_m: Array
 
     def apply(self, table: MarkerTable) -> MarkerTable:

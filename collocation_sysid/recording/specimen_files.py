@@ -60,45 +60,28 @@ StressMeasure = Literal["engineering", "true"]
 
 @dataclass(frozen=True, kw_only=True)
 class SpecimenLayout:
-    """Meaning of the columns of a table of a material test.
+    """Meaning of the columns of a table of a material test."""
 
-    Attributes
-    ----------
-    test : str
-        Kind of test, see `Specimen`.
-    columns : mapping of str to str
-        Name of the column by quantity, where it is not recognised.
-    strain_sign, stress_sign : {1, -1}
-        Factors on strains or displacements, and on stresses or forces: −1 where compression is
-        positive. Stretches, volume ratios and pressures have none.
-    stress : {"engineering", "true"}
-        Area by which the force was divided: the undeformed or the deformed one.
-    length_m : float or None
-        Undeformed length that divides a displacement.
-    area_m2 : float or None
-        Undeformed area by which a force is divided.
-    requires_times : bool
-        Whether the table must have times.
-    axial_stretch, transverse_stretch
-        Those of `Specimen`.
-    is_relaxation : bool
-        Whether the table has the relaxation modulus over time, E(t) of a "uniaxial" and G(t) of a
-        "simple-shear" test.
-    noise_columns : mapping of str to str
-        Columns of standard deviations by their keys "sigma_pa" or "sigma_n", and "lateral_sigma".
-    """
-
-    test: str
+    test: str  # kind of test, see `Specimen`
+    # mapping of str to str: name of the column by quantity, where it is not recognised.
     columns: Mapping[str, str]
+    # Factors on strains or displacements, and on stresses or forces: −1 where compression is
+    # positive. Stretches, volume ratios and pressures have none.
     strain_sign: Sign = 1
     stress_sign: Sign = 1
+    # Area by which the force was divided: the undeformed or the deformed one.
     stress: StressMeasure = "engineering"
-    length_m: float | None = None
-    area_m2: float | None = None
-    requires_times: bool = False
+    length_m: float | None = None  # undeformed length that divides a displacement
+    area_m2: float | None = None  # undeformed area by which a force is divided
+    requires_times: bool = False  # whether the table must have times
+    # Those of `Specimen`.
     axial_stretch: float = 1.0
     transverse_stretch: float | None = None
+    # Whether the table has the relaxation modulus over time, E(t) of a "uniaxial" and G(t) of a
+    # "simple-shear" test.
     is_relaxation: bool = False
+    # mapping of str to str: columns of standard deviations by their keys "sigma_pa" or "sigma_n",
+    # and "lateral_sigma".
     noise_columns: Mapping[str, str] = field(default_factory=dict)
 
     def list_quantities(self) -> tuple[Quantity, ...]:
@@ -152,36 +135,25 @@ class SpecimenLayout:
 
 @dataclass(frozen=True, eq=False)
 class SpecimenTable:
-    """Measurements of a material test in the terms of `Specimen`.
+    """Measurements of a material test in the terms of `Specimen`."""
 
-    Attributes
-    ----------
-    t_s : (T,) array
-        Times; the number of the row in seconds if the table has none.
-    strain, stress_pa : (T,) array
-        Strain without NaN; stress NaN where the cell is blank.
-    second_strain, second_stress_pa, lateral_stretch : (T,) array or None
-        None if the table has no such column; stress and stretch NaN where the cell is blank.
-    is_incompressible : bool
-        Whether true stresses, or their difference, count as those of an incompressible specimen.
-    columns : tuple of str
-        Quantities that the table has, such as "stretch" and "lateral_strain".
-    unread : tuple of str
-        Columns with a unit that are not read.
-    sigma_pa, lateral_sigma : (T,) array or None
-        Standard deviations of stress, or of the modulus, and of the lateral stretch; None without a
-        column of them.
-    """
-
+    # (T,): times; the number of the row in seconds if the table has none.
     t_s: Array = field(metadata=over_time())
+    # (T,): strain without NaN; stress NaN where the cell is blank.
     strain: Array = field(metadata=over_time())
     stress_pa: Array = field(metadata=over_time())
+    # (T,) or None: none if the table has no such column; stress and stretch NaN where the cell is
+    # blank.
     second_strain: Array | None = field(metadata=over_time())
     second_stress_pa: Array | None = field(metadata=over_time())
     lateral_stretch: Array | None = field(metadata=over_time())
+    # Whether true stresses, or their difference, count as those of an incompressible specimen.
     is_incompressible: bool
+    # Quantities that the table has, such as "stretch" and "lateral_strain".
     columns: tuple[str, ...]
-    unread: tuple[str, ...]
+    unread: tuple[str, ...]  # columns with a unit that are not read
+    # (T,) or None: standard deviations of stress, or of the modulus, and of the lateral stretch;
+    # None without a column of them.
     sigma_pa: Array | None = field(default=None, metadata=over_time())
     lateral_sigma: Array | None = field(default=None, metadata=over_time())
 

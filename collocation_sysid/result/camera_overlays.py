@@ -42,22 +42,13 @@ VIEWER_DISTANCE_RATIO = 1e3
 class DepthProjection:
     """Projection into the image of a depth camera or, for a point cloud, onto the body's broad
     side.
-
-    Attributes
-    ----------
-    view : DepthCameraModel
-        Model of the depth camera.
-    skin : VisibleSurface
-        Visible surface of the body.
-    phi : (k,)
-        Nuisance parameters, of which those of the camera correct its pose, bias and scale.
-    parallel_camera : ParallelCamera
-        Parallel projection for point clouds, which have no image of their own.
     """
 
     view: DepthCameraModel
-    skin: VisibleSurface
+    skin: VisibleSurface  # visible surface of the body
+    # (k,): nuisance parameters, of which those of the camera correct its pose, bias and scale.
     phi: Array
+    # Parallel projection for point clouds, which have no image of their own.
     parallel_camera: ParallelCamera
 
     @classmethod

@@ -31,18 +31,10 @@ FIELD_NAMES = ("det_f", "energy_density_j_m3", "von_mises_pa")
 
 @dataclass(frozen=True, eq=False)
 class ElementFields:
-    """Evaluator of the fields of a body at any node positions.
+    """Evaluator of the fields of a body at any node positions."""
 
-    Attributes
-    ----------
-    body : Body
-        Body whose fields are evaluated.
-    theta : (k,)
-        Constants of the body.
-    """
-
-    body: Body
-    theta: Array
+    body: Body  # body whose fields are evaluated
+    theta: Array  # (k,): constants of the body
     _evaluators: Sequence[Evaluator]
     _volumes: Array
 

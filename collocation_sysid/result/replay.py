@@ -92,102 +92,67 @@ def image_unit(has_matrix: bool) -> str:
 
 @dataclass(frozen=True, eq=False)
 class MotionRecord:
-    """Measured, fitted and simulated motion of an experiment at T samples of n nodes and M markers.
+    """Measured, fitted and simulated motion of an experiment at T samples of n nodes and M markers."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the experiment.
-    t_s : (T,)
-        Times of the samples.
-    undeformed_m : (n, 3)
-        Nodes of the undeformed body.
-    tetrahedra : (E, 4)
-        Corner nodes of the elements.
-    surface : (F, 3)
-        Boundary triangles, counter-clockwise when seen from outside.
-    surface_parts : (F,)
-        Index of the part of the body that each boundary triangle belongs to.
-    surface_nodes : (F, 3) or (F, 6)
-        Nodes of each boundary triangle; of quadratic elements also those on its sides.
-    part_names : (P,) str
-        Names of the parts; "" for elements outside all regions.
-    is_prescribed : (T, n) bool
-        Whether a node has a prescribed displacement along some axis.
-    up : (3,)
-        Unit vector against gravity; z where there is no gravity.
-    marker_names : (M,) str
-        Names of the markers.
-    marker_places_m : (M, 3)
-        Estimated places of the markers on the undeformed body.
-    declared_places_m : (M, 3)
-        Stated places of the markers, NaN where none was stated.
-    measured_m : (T, M, 3)
-        Measured markers, NaN where missing.
-    positions_m, markers_m : (T, n, 3) and (T, M, 3), or None
-        Fitted nodes and markers; None for a validation experiment.
-    rolled_out_positions_m, rolled_out_m : (T, n, 3) and (T, M, 3), or None
-        Nodes and markers of the forward simulation; None if it failed.
-    natural_hz : (k,), or None
-        Natural frequencies at the estimate, ascending; None if they are unknown.
-    wrenches : sequence of (S, 19)
-        For each force–torque sensor: time [s], and force and torque [N, N m] as measured, fitted
-        and simulated; NaN where one of these is missing.
-    static : bool
-        Whether every sample is an equilibrium of its own.
-    tendons_m : (p, 3), or None
-        Points of the tendons on the undeformed body, a row of NaN after each tendon.
-    readings : mapping of name to (S, 1 + 3m)
-        For each custom sensor: time [s], and its m numbers as measured, fitted and simulated.
-    obstacles_m : (T, o, 3), or None
-        Points of the obstacles' outlines, NaN after each line.
-    gaps_m, pressures_pa : (T, F), or None
-        Gap and pressure of obstacles on the fitted or else simulated surface; None without any.
-    fields : mapping of name to (E, 4)
-        For each spatially varying constant: the estimate, the ends of its 95 % interval, and its
-        posterior over its prior standard deviation; NaN in elements of other regions.
-    visible_points : mapping of name to (k, 8)
-        For each camera, rows of its points, with the time [s] in column 0, the distance behind the
-        surface [m] (NaN for points that do not count) in column 4 and the position in the world [m]
-        from column 5, and rows of outlines; `camera_overlays` describes them completely.
-    reading_units : mapping of name to str
-        Units of the custom sensors that state one, and of image coordinates, see `image_key`.
-    strain : (T,), or None
-        Strain of a specimen without a mesh; None for other experiments.
-    travel_m : (T, 3), or None
-        Displacement along a line of a test bench whose force is measured; None for other motions.
-    """
-
-    name: str
-    t_s: Array
-    undeformed_m: Array
-    tetrahedra: NDArray[np.integer]
+    name: str  # name of the experiment
+    t_s: Array  # (T,): times of the samples
+    undeformed_m: Array  # (n, 3): nodes of the undeformed body
+    tetrahedra: NDArray[np.integer]  # (E, 4): corner nodes of the elements
+    # (F, 3): boundary triangles, counter-clockwise when seen from outside.
     surface: NDArray[np.integer]
+    # (F,): index of the part of the body that each boundary triangle belongs to.
     surface_parts: NDArray[np.integer]
+    # (F, 3) or (F, 6): nodes of each boundary triangle; of quadratic elements also those on its
+    # sides.
     surface_nodes: NDArray[np.integer]
-    part_names: Sequence[str]
+    part_names: Sequence[str]  # (P,) str: names of the parts; "" for elements outside all regions
+    # (T, n) bool: whether a node has a prescribed displacement along some axis.
     is_prescribed: NDArray[np.bool_]
-    up: Array
-    marker_names: Sequence[str]
-    marker_places_m: Array
-    declared_places_m: Array
-    measured_m: Array
+    up: Array  # (3,): unit vector against gravity; z where there is no gravity
+    marker_names: Sequence[str]  # (M,) str: names of the markers
+    marker_places_m: Array  # (M, 3): estimated places of the markers on the undeformed body
+    declared_places_m: Array  # (M, 3): stated places of the markers, NaN where none was stated
+    measured_m: Array  # (T, M, 3): measured markers, NaN where missing
+    # (T, n, 3) and (T, M, 3), or None: fitted nodes and markers; None for a validation experiment.
     positions_m: Array | None = None
     markers_m: Array | None = None
+    # (T, n, 3) and (T, M, 3), or None: nodes and markers of the forward simulation; None if it
+    # failed.
     rolled_out_positions_m: Array | None = None
     rolled_out_m: Array | None = None
+    # (k,), or None: natural frequencies at the estimate, ascending; None if they are unknown.
     natural_hz: Array | None = None
+    # sequence of (S, 19): for each force–torque sensor: time [s], and force and torque [N, N m] as
+    # measured, fitted and simulated; NaN where one of these is missing.
     wrenches: Sequence[Array] = ()
-    static: bool = False
+    static: bool = False  # whether every sample is an equilibrium of its own
+    # (p, 3), or None: points of the tendons on the undeformed body, a row of NaN after each tendon.
     tendons_m: Array | None = None
+    # mapping of name to (S, 1 + 3m): for each custom sensor: time [s], and its m numbers as
+    # measured, fitted and simulated.
     readings: Mapping[str, Array] = field(default_factory=dict)
+    # (T, o, 3), or None: points of the obstacles' outlines, NaN after each line.
     obstacles_m: Array | None = None
+    # (T, F), or None: gap and pressure of obstacles on the fitted or else simulated surface; None
+    # without any.
     gaps_m: Array | None = None
     pressures_pa: Array | None = None
+    # mapping of name to (E, 4): for each spatially varying constant: the estimate, the ends of its
+    # 95 % interval, and its posterior over its prior standard deviation; NaN in elements of other
+    # regions.
     fields: Mapping[str, Array] = field(default_factory=dict)
+    # mapping of name to (k, 8): for each camera, rows of its points, with the time [s] in column 0,
+    # the distance behind the surface [m] (NaN for points that do not count) in column 4 and the
+    # position in the world [m] from column 5, and rows of outlines; `camera_overlays` describes
+    # them completely.
     visible_points: Mapping[str, Array] = field(default_factory=dict)
+    # mapping of name to str: units of the custom sensors that state one, and of image coordinates,
+    # see `image_key`.
     reading_units: Mapping[str, str] = field(default_factory=dict)
+    # (T,), or None: strain of a specimen without a mesh; None for other experiments.
     strain: Array | None = None
+    # (T, 3), or None: displacement along a line of a test bench whose force is measured; None for
+    # other motions.
     travel_m: Array | None = None
 
     @classmethod

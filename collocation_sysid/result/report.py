@@ -43,31 +43,15 @@ CAPTIONS = {
 
 @dataclass(frozen=True)
 class StudySummary:
-    """Content of ``summary.json`` that the report of a study needs.
-
-    Attributes
-    ----------
-    title : str
-        Title of the study.
-    headline : tuple of str
-        Sentences with the main results.
-    runs : tuple of mapping
-        One record for each finished run.
-    notes : tuple of str
-        Sentences that explain the tables.
-    tables : tuple of Table
-        Tables of the results.
-    failures : tuple of str
-        One sentence for each run that ended without a result.
-    """
+    """Content of ``summary.json`` that the report of a study needs."""
 
     title: str
     problem: str
-    headline: tuple[str, ...]
-    runs: tuple[Mapping[str, Any], ...]
-    notes: tuple[str, ...]
-    tables: tuple[Table, ...]
-    failures: tuple[str, ...]
+    headline: tuple[str, ...]  # sentences with the main results
+    runs: tuple[Mapping[str, Any], ...]  # one record for each finished run
+    notes: tuple[str, ...]  # sentences that explain the tables
+    tables: tuple[Table, ...]  # tables of the results
+    failures: tuple[str, ...]  # one sentence for each run that ended without a result
 
 
 def comparison_report(folder: str | Path) -> TitledParts:

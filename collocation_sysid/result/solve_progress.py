@@ -256,15 +256,9 @@ class SolveProgress(Watched):
 
 @dataclass(frozen=True)
 class _RefreshedText:
-    """Text of a live display that is computed whenever the display is refreshed.
+    """Text of a live display that is computed whenever the display is refreshed."""
 
-    Attributes
-    ----------
-    text : callable
-        Returns the text.
-    """
-
-    text: Callable[[], str]
+    text: Callable[[], str]  # returns the text
 
     def __rich__(self) -> Text:
         return Text(self.text(), style="dim")

@@ -51,18 +51,12 @@ class NoCoarseStartError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class CoarseStart:
-    """Problem on coarser meshes.
+    """Problem on coarser meshes."""
 
-    Attributes
-    ----------
-    problem : Problem
-        Fitted experiments on coarse bodies, with the parameters of the given problem.
-    relations : mapping of str to CoarseBody
-        Relation of coarse and given body, by experiment name; experiments whose body is small are
-        left out.
-    """
-
+    # Fitted experiments on coarse bodies, with the parameters of the given problem.
     problem: Problem
+    # mapping of str to CoarseBody: relation of coarse and given body, by experiment name;
+    # experiments whose body is small are left out.
     relations: Mapping[str, CoarseBody]
 
     def describe_size(self) -> str:

@@ -55,24 +55,15 @@ NARROW = 1.25
 
 @dataclass(frozen=True, eq=False)
 class ExpectedPrecision:
-    """Covariance that is expected of estimates.
+    """Covariance that is expected of estimates."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The k estimated scalar parameters that are not at a bound.
-    values : (k,) array
-        Their values.
-    statistical, covariance : (k, k) arrays
-        Finite covariance of their relative deviations, due to noise alone, and with the budget.
-    moduli : mapping of str to (k,) array
-        Relative derivatives of derived moduli by their logarithms.
-    """
-
-    names: tuple[str, ...]
-    values: Array
+    names: tuple[str, ...]  # the k estimated scalar parameters that are not at a bound
+    values: Array  # (k,): their values
+    # (k, k): finite covariance of their relative deviations, due to noise alone, and with the
+    # budget.
     statistical: Array
     covariance: Array
+    # mapping of str to (k,): relative derivatives of derived moduli by their logarithms.
     moduli: Mapping[str, Array]
 
     def combinations(self) -> tuple[Combination, ...]:

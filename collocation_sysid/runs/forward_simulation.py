@@ -40,24 +40,16 @@ LEAST_STEP_RATIO = 1.99
 
 @dataclass(frozen=True, eq=False)
 class OwnFit:
-    """Simulation of a recording for validation with nuisance parameters that are fitted to it.
+    """Simulation of a recording for validation with nuisance parameters that are fitted to it."""
 
-    Attributes
-    ----------
-    error : PredictionErrors
-        Its errors, which the nuisance parameters decrease whatever their cause.
-    misfits : tuple of InstrumentMisfit
-        Differences of each instrument over its stated σ.
-    deviations : mapping of name to float
-        Nuisance parameters less those of the prediction, in standard deviations of their priors.
-    onsets : mapping of name to float
-        Times that the description declares as unknown, and the prediction has from this fit, in
-        standard deviations of their priors.
-    """
-
+    # Its errors, which the nuisance parameters decrease whatever their cause.
     error: PredictionErrors
-    misfits: tuple[InstrumentMisfit, ...]
+    misfits: tuple[InstrumentMisfit, ...]  # differences of each instrument over its stated σ
+    # mapping of name to float: nuisance parameters less those of the prediction, in standard
+    # deviations of their priors.
     deviations: Mapping[str, float]
+    # mapping of name to float: times that the description declares as unknown, and the prediction
+    # has from this fit, in standard deviations of their priors.
     onsets: Mapping[str, float]
 
     @property
@@ -69,43 +61,29 @@ class OwnFit:
 
 @dataclass(frozen=True, eq=False)
 class ForwardSimulation:
-    """A forward simulation with the estimated parameters, compared with the measurements.
+    """A forward simulation with the estimated parameters, compared with the measurements."""
 
-    Attributes
-    ----------
-    rms_m, max_m : float
-        RMS and largest distance of the markers from the measurements [m]; zero without markers.
-    trajectory : Trajectory
-        Its markers are predicted with the experiment's nuisance parameters.
-    nuisance : mapping of name to value
-        Nuisance parameters with which an experiment for validation is predicted: those of the
-        fitted recordings, and its own onsets where the description says that they are unknown;
-        those of places are displacements from their start. Empty for fitted experiments.
-    places_m : mapping of marker to place [x, y, z]
-        Marker places on the undeformed body, likewise; empty for fitted experiments.
-    predicted : sequence of (S, m) array or SurfaceComparison
-        Prediction of each of `Experiment.measurements`.
-    error : PredictionErrors
-        Their RMS and largest differences from the measurements.
-    misfits : tuple of InstrumentMisfit
-        Differences of each instrument over its stated σ.
-    own : OwnFit or None
-        Of an experiment for validation: the errors that remain if all its nuisance parameters are
-        fitted to it; None without any, or where that fails.
-    copy_error : CopyError or str
-        Of an experiment for validation: the error of a fitted recording's measurements, or why
-        there is none. Empty for fitted experiments.
-    """
-
+    # RMS and largest distance of the markers from the measurements [m]; zero without markers.
     rms_m: float
     max_m: float
-    trajectory: Trajectory
+    trajectory: Trajectory  # its markers are predicted with the experiment's nuisance parameters
+    # mapping of name to value: nuisance parameters with which an experiment for validation is
+    # predicted: those of the fitted recordings, and its own onsets where the description says that
+    # they are unknown; those of places are displacements from their start. Empty for fitted
+    # experiments.
     nuisance: Mapping[str, float]
+    # mapping of marker to place [x, y, z]: marker places on the undeformed body, likewise; empty
+    # for fitted experiments.
     places_m: Mapping[str, list[float]]
+    # sequence of (S, m) or SurfaceComparison: prediction of each of `Experiment.measurements`.
     predicted: Predictions
-    error: PredictionErrors
-    misfits: tuple[InstrumentMisfit, ...] = ()
+    error: PredictionErrors  # their RMS and largest differences from the measurements
+    misfits: tuple[InstrumentMisfit, ...] = ()  # differences of each instrument over its stated σ
+    # Of an experiment for validation: the errors that remain if all its nuisance parameters are
+    # fitted to it; None without any, or where that fails.
     own: OwnFit | None = None
+    # Of an experiment for validation: the error of a fitted recording's measurements, or why there
+    # is none. Empty for fitted experiments.
     copy_error: CopyError | str = ""
 
 

@@ -48,16 +48,10 @@ FEWEST_SIMULATED = 4
 
 @dataclass(frozen=True)
 class ContrastPrior:
-    """Normal prior of the logarithm s of the contrast.
-
-    Attributes
-    ----------
-    deviation : float
-        Standard deviation; tiny for a given contrast.
-    """
+    """Normal prior of the logarithm s of the contrast."""
 
     mean: float
-    deviation: float
+    deviation: float  # standard deviation; tiny for a given contrast
 
     def limit(self, logarithms: Array) -> Array:
         """Return logarithms clipped to `LARGEST_DEVIATIONS` from the mean."""
@@ -67,18 +61,10 @@ class ContrastPrior:
 
 @dataclass(frozen=True, eq=False)
 class ApproximationError:
-    """Normal error of linearised residuals: r_true ≈ r_linear + mean + roots ε, ε ~ N(0, I).
+    """Normal error of linearised residuals: r_true ≈ r_linear + mean + roots ε, ε ~ N(0, I)."""
 
-    Attributes
-    ----------
-    mean : (n,) array
-        Mean error of the n residuals, in units of σ.
-    roots : (n, K) array
-        Square root of the covariance, of rank K.
-    """
-
-    mean: Array
-    roots: Array
+    mean: Array  # (n,): mean error of the n residuals, in units of σ
+    roots: Array  # (n, K): square root of the covariance, of rank K
 
     @classmethod
     def from_errors(cls, errors: Array) -> ApproximationError:
@@ -94,40 +80,18 @@ class ApproximationError:
 
 @dataclass(frozen=True, eq=False)
 class ElementSurrogate:
-    """Residuals linearised in a power of the constant in every element and in all other parameters.
+    """Residuals linearised in a power of the constant in every element and in all other parameters."""
 
-    Attributes
-    ----------
-    collocation : Collocation
-        Program with the logarithm of each element as a parameter.
-    p : (np,) array
-        Parameters of the expansion point; those of the elements are zero.
-    positions : sequence of (N, 3n) arrays
-        Trajectories there [m].
-    fit : LinearisedFit
-        Fit linearised there.
-    columns : (E,) int array
-        Columns of the elements' logarithms in the fit.
-    base : (E,) array
-        Logarithms z₀ relative to the mean at the expansion point.
-    faces : InternalFaces
-        Faces between elements of the part.
-    prior : ContrastPrior
-        Prior of the logarithm of the contrast.
-    errors : ApproximationError
-        Errors of the linearised residuals.
-    """
-
-    collocation: Collocation
-    p: Array
-    positions: Sequence[Array]
-    fit: LinearisedFit
-    columns: Index
-    base: Array
-    faces: InternalFaces
-    prior: ContrastPrior
+    collocation: Collocation  # program with the logarithm of each element as a parameter
+    p: Array  # (np,): parameters of the expansion point; those of the elements are zero
+    positions: Sequence[Array]  # sequence of (N, 3n): trajectories there [m]
+    fit: LinearisedFit  # fit linearised there
+    columns: Index  # (E,) int: columns of the elements' logarithms in the fit
+    base: Array  # (E,): logarithms z₀ relative to the mean at the expansion point
+    faces: InternalFaces  # faces between elements of the part
+    prior: ContrastPrior  # prior of the logarithm of the contrast
     exponent: float
-    errors: ApproximationError
+    errors: ApproximationError  # errors of the linearised residuals
 
     @classmethod
     def linearise(
@@ -271,21 +235,11 @@ class ElementSurrogate:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSamples:
-    """Samples of the posterior with their exact residuals.
+    """Samples of the posterior with their exact residuals."""
 
-    Attributes
-    ----------
-    surrogate : ElementSurrogate
-        Linearised residuals with which they were drawn.
-    p : (K, np) array
-        Parameters of the samples, in the coordinates of the surrogate's program.
-    residuals : (K, n) array
-        Residuals of the simulations, in units of σ.
-    """
-
-    surrogate: ElementSurrogate
-    p: Array
-    residuals: Array
+    surrogate: ElementSurrogate  # linearised residuals with which they were drawn
+    p: Array  # (K, np): parameters of the samples, in the coordinates of the surrogate's program
+    residuals: Array  # (K, n): residuals of the simulations, in units of σ
 
     def find_least_chi_squared(self) -> float:
         """Return the least χ² of the samples; infinite without samples."""
@@ -331,21 +285,11 @@ class SimulatedSamples:
 
 @dataclass(frozen=True, eq=False)
 class PhasePosterior:
-    """Samples of phases and of all parameters of a two-phase problem.
+    """Samples of phases and of all parameters of a two-phase problem."""
 
-    Attributes
-    ----------
-    surrogate : ElementSurrogate
-        Linearised residuals from which they were drawn.
-    draws : PosteriorDraws
-        Phases and, as `contrasts`, powers u = (r^γ − 1)/γ of the contrast r.
-    information : ElementInformation
-        Normal equations of the samples.
-    """
-
-    surrogate: ElementSurrogate
-    draws: PosteriorDraws
-    information: ElementInformation
+    surrogate: ElementSurrogate  # linearised residuals from which they were drawn
+    draws: PosteriorDraws  # phases and, as `contrasts`, powers u = (r^γ − 1)/γ of the contrast r
+    information: ElementInformation  # normal equations of the samples
 
     @classmethod
     def sample(

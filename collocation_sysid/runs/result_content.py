@@ -36,40 +36,26 @@ class ReportedEstimate(Estimate):
 
     `value` is corrected for the known discretisation error and for known effects, and
     `statistical95` is centred on it.
-
-    Attributes
-    ----------
-    combined_std_error : float or None
-        Standard uncertainty due to noise, discretisation and systematic effects; None if the
-        quantity was not estimated or is at a bound, or if systematic effects were not evaluated.
-    combined95 : (lower, upper) or None
-        95 % interval due to the same, the one to publish; None as above.
-    optimum : float or None
-        The optimum of the discretised problem, without the correction; None in a study's summary.
-    systematic : float or None
-        Standard deviation of the systematic effects in the coordinate of the estimate, see
-        `statistics.budget.uncertainty_budget`.
-    known_effect : float or None
-        Correction for known effects, such as the compliance of a machine, in the coordinate of the
-        estimate; None if there is none.
-    known_correction : float or None
-        The same correction as part of `value`; None if there is none.
-    numerical_error : DiscretisationError or None
-        Discretisation error as far as it is known.
-    guess : float or None
-        Initial guess.
-    fixed, tied : bool or None
-        Whether the parameter was not estimated, or followed another one.
     """
 
+    # Standard uncertainty due to noise, discretisation and systematic effects; None if the quantity
+    # was not estimated or is at a bound, or if systematic effects were not evaluated.
     combined_std_error: float | None = None
+    # (lower, upper) or None: 95 % interval due to the same, the one to publish; None as above.
     combined95: tuple[float, float] | None = None
+    # The optimum of the discretised problem, without the correction; None in a study's summary.
     optimum: float | None = None
+    # Standard deviation of the systematic effects in the coordinate of the estimate, see
+    # `statistics.budget.uncertainty_budget`.
     systematic: float | None = None
+    # Correction for known effects, such as the compliance of a machine, in the coordinate of the
+    # estimate; None if there is none.
     known_effect: float | None = optional()
+    # The same correction as part of `value`; None if there is none.
     known_correction: float | None = optional()
-    numerical_error: DiscretisationError | None = None
-    guess: float | None = optional()
+    numerical_error: DiscretisationError | None = None  # discretisation error as far as it is known
+    guess: float | None = optional()  # initial guess
+    # Whether the parameter was not estimated, or followed another one.
     fixed: bool | None = optional()
     tied: bool | None = optional()
 
@@ -158,49 +144,28 @@ class Limit:
 
 @dataclass(frozen=True)
 class NuisanceResult:
-    """A nuisance parameter.
+    """A nuisance parameter."""
 
-    Attributes
-    ----------
-    value : float
-        Estimate, in the unit that its label states.
-    prior : float
-        Standard deviation of its prior, in the same unit.
-    std_error : float or None
-        Statistical standard error; None without error bars.
-    """
-
-    value: float
-    prior: float
-    std_error: float | None
+    value: float  # estimate, in the unit that its label states
+    prior: float  # standard deviation of its prior, in the same unit
+    std_error: float | None  # statistical standard error; None without error bars
 
 
 @dataclass(frozen=True)
 class FieldResult:
-    """A constant that varies in space; its arrays are in ``trajectory.npz``.
+    """A constant that varies in space; its arrays are in ``trajectory.npz``."""
 
-    Attributes
-    ----------
-    shapes : FieldResolution
-        Number of shapes, and how much of the prior variance they represent.
-    range : (least, most)
-        Range of its values in the elements.
-    determined_share : float or None
-        Share of the volume where the interval is less than half as wide as the prior's; None
-        without intervals.
-    identified : int or None
-        Number of independent shapes that the data determine; None without intervals.
-    likelier : mapping of length in metres to float
-        Logarithm of the evidence of other correlation lengths, relative to the chosen one.
-    phases : PhaseSummary or None
-        Contrast and volume of the inclusion of a two-phase field; None for a smooth field.
-    """
-
-    shapes: FieldResolution
-    range: tuple[float, float]
+    shapes: FieldResolution  # number of shapes, and how much of the prior variance they represent
+    range: tuple[float, float]  # (least, most): range of its values in the elements
+    # Share of the volume where the interval is less than half as wide as the prior's; None without
+    # intervals.
     determined_share: float | None
+    # Number of independent shapes that the data determine; None without intervals.
     identified: int | None
+    # mapping of length in metres to float: logarithm of the evidence of other correlation lengths,
+    # relative to the chosen one.
     likelier: Mapping[str, float]
+    # Contrast and volume of the inclusion of a two-phase field; None for a smooth field.
     phases: PhaseSummary | None = None
 
     def coefficient_names(self, name: str) -> list[str]:
@@ -248,52 +213,29 @@ class FieldResult:
 
 @dataclass(frozen=True)
 class RecordingsAgreement:
-    """Estimates of a parameter from single recordings, to first order, and their agreement.
+    """Estimates of a parameter from single recordings, to first order, and their agreement."""
 
-    Attributes
-    ----------
-    values : mapping of recording to float
-        Estimates from single recordings; NaN where a recording does not determine the parameter.
-    deviations : mapping of recording to float
-        Their standard deviations, in the coordinate of the estimate.
-    chi_squared : float
-        χ² of their differences.
-    degrees_of_freedom : int
-        Number of recordings that determine the parameter, less one, at least 0.
-    disagree : bool
-        Whether the differences are significant.
-    """
-
+    # mapping of recording to float: estimates from single recordings; NaN where a recording does
+    # not determine the parameter.
     values: Mapping[str, float]
+    # mapping of recording to float: their standard deviations, in the coordinate of the estimate.
     deviations: Mapping[str, float]
-    chi_squared: float
+    chi_squared: float  # χ² of their differences
+    # Number of recordings that determine the parameter, less one, at least 0.
     degrees_of_freedom: int
-    disagree: bool
+    disagree: bool  # whether the differences are significant
 
 
 @dataclass(frozen=True)
 class ProfileResult:
-    """A profile likelihood.
+    """A profile likelihood."""
 
-    Attributes
-    ----------
-    interval : (lower, upper)
-        Interval by the threshold; None for an end that was not reached.
-    values : (k,) array
-        Values of the parameter.
-    rises : (k,) array
-        Loss minus its least value.
-    threshold : float
-        Rise of the loss at the ends of the interval.
-    sentence : str
-        Result in words.
-    """
-
+    # (lower, upper): interval by the threshold; None for an end that was not reached.
     interval: tuple[float | None, float | None]
-    values: Array
-    rises: Array
-    threshold: float
-    sentence: str
+    values: Array  # (k,): values of the parameter
+    rises: Array  # (k,): loss minus its least value
+    threshold: float  # rise of the loss at the ends of the interval
+    sentence: str  # result in words
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,92 +302,54 @@ class UncertaintyResult:
 
 @dataclass(frozen=True)
 class DynamicsResult:
-    """Residuals of the equations of motion.
+    """Residuals of the equations of motion."""
 
-    Attributes
-    ----------
-    max_violation_n : float
-        Largest residual [N].
-    max_violation_relative : float
-        Largest residual relative to the largest other force.
-    largest : tuple of str
-        Sentences on where the residual is largest.
-    """
-
-    max_violation_n: float
-    max_violation_relative: float
-    largest: tuple[str, ...]
+    max_violation_n: float  # largest residual [N]
+    max_violation_relative: float  # largest residual relative to the largest other force
+    largest: tuple[str, ...]  # sentences on where the residual is largest
 
 
 @dataclass(frozen=True)
 class ProgramSize:
-    """Size of the discretised problem and its scheme.
+    """Size of the discretised problem and its scheme."""
 
-    Attributes
-    ----------
-    nodes, elements : int
-        Numbers of nodes and elements of all bodies.
-    substeps : int
-        Time steps per sample.
-    timesteps : int
-        Time steps of all fitted experiments.
-    variables, constraints : int
-        Size of the nonlinear program.
-    scheme : str
-        Name of the time scheme.
-    """
-
+    # Numbers of nodes and elements of all bodies.
     nodes: int
     elements: int
-    substeps: int
-    timesteps: int
+    substeps: int  # time steps per sample
+    timesteps: int  # time steps of all fitted experiments
+    # Size of the nonlinear program.
     variables: int
     constraints: int
-    scheme: str
+    scheme: str  # name of the time scheme
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Software, platform and problem files from which the result was made.
+    """Software, platform and problem files from which the result was made."""
 
-    Attributes
-    ----------
-    version, casadi, numpy, python, platform : str
-        Versions of this package, CasADi, NumPy and Python, and the platform.
-    problem_file, problem_sha256 : str or None
-        Path of the problem file and hash of its text as it was run; None for a problem without a
-        file.
-    mesh_sha256 : tuple of str
-        Hash of the mesh of each body.
-    """
-
+    # Versions of this package, CasADi, NumPy and Python, and the platform.
     version: str
     casadi: str
     numpy: str
     python: str
     platform: str
+    # Path of the problem file and hash of its text as it was run; None for a problem without a
+    # file.
     problem_file: str | None
     problem_sha256: str | None
-    mesh_sha256: tuple[str, ...]
+    mesh_sha256: tuple[str, ...]  # hash of the mesh of each body
 
 
 @dataclass(frozen=True)
 class Elapsed:
-    """Wall-clock time of the parts of a run [s].
+    """Wall-clock time of the parts of a run [s]."""
 
-    Attributes
-    ----------
-    search : float
-        From the problem to the optimum: finding a start, and every search that led to the answer,
-        also with finer steps.
-    checks : float
-        Forward simulations, uncertainties, budget, probes and likely causes.
-    pictures : float or None
-        Drawing and writing the pictures; None if they have not been drawn.
-    """
-
+    # From the problem to the optimum: finding a start, and every search that led to the answer,
+    # also with finer steps.
     search: float = 0.0
-    checks: float = 0.0
+    checks: float = 0.0  # forward simulations, uncertainties, budget, probes and likely causes
+    # Drawing and writing the pictures; None if they have not been drawn.
     pictures: float | None = None
 
 

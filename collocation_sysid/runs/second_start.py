@@ -49,18 +49,10 @@ LITTLE_MEMORY = 1e-3
 
 @dataclass(frozen=True)
 class SecondStart:
-    """Start of a second search.
+    """Start of a second search."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        Parameters with the start as guesses.
-    reason : str
-        Why there is a second search, and its start: a sentence without its predicate.
-    """
-
-    parameters: Parameters
-    reason: str
+    parameters: Parameters  # parameters with the start as guesses
+    reason: str  # why there is a second search, and its start: a sentence without its predicate
 
 
 def second_start(solution: Solution) -> SecondStart | None:

@@ -30,24 +30,13 @@ Solve = Callable[[Method, Collocation], Solution]
 
 @dataclass(frozen=True, eq=False)
 class CompletedStart:
-    """Start of a search after several starts of a scan were followed to convergence.
+    """Start of a search after several starts of a scan were followed to convergence."""
 
-    Attributes
-    ----------
-    collocation : Collocation
-        With the parameters of the best start as guess.
-    scan : Scan
-        The same scan with that start as its best.
-    solution : Solution or None
-        Solution from there; None if it was found by another method than the one asked for.
-    note : str
-        Comparison of the losses, for people; empty if there was one start only.
-    """
-
-    collocation: Collocation
-    scan: Scan
+    collocation: Collocation  # with the parameters of the best start as guess
+    scan: Scan  # the same scan with that start as its best
+    # Solution from there; None if it was found by another method than the one asked for.
     solution: Solution | None
-    note: str
+    note: str  # comparison of the losses, for people; empty if there was one start only
 
 
 def has_local_minima(collocation: Collocation) -> bool:

@@ -63,65 +63,39 @@ from .verdict import expected_rms_m, modes_by_experiment, solution_concerns
 
 @dataclass(frozen=True, eq=False)
 class SolvedProblem:
-    """A solved problem with its checks.
+    """A solved problem with its checks."""
 
-    Attributes
-    ----------
-    problem : Problem
-        The problem that was solved.
-    solution : Solution
-        Its solution, converged or not.
-    rollouts : mapping of experiment name to ForwardSimulation or str
-        Forward simulations, or the reason why there is none.
-    uncertainty : Uncertainty or None
-        None if the solve did not converge.
-    fit : LinearisedFit or None
-        Linearised fit at the solution, without the noise of the poses; None if the solve did not
-        converge or cannot be linearised.
-    diagnoses : tuple of MarkerDiagnosis
-        Findings in the residuals.
-    profiles : tuple of Profile
-        Profile likelihoods that were requested.
-    notes : tuple of str
-        Problems after the solve.
-    causes : tuple of Hypothesis
-        Likely errors in the description of the problem, likeliest first.
-    refinement : Refinement or None
-        Discretisation errors of the estimates: from solves at finer discretisations if requested,
-        else the first-order effect of the step from finer forward simulations; None where these are
-        missing.
-    omitted_checks : str
-        Checks that were left out after Ctrl-C; empty if all were done.
-    systematic_effects : VarianceSources or None
-        Systematic effects on the estimates; None without error bars.
-    probes : tuple of Probe
-        Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and
-        of parts of the data, where these were requested. Empty without error bars.
-    added_measurements : mapping of frozenset of str to Fix
-        The sensor or test that would determine the constants of a combination best, by their names.
-    budgeted : BudgetedResiduals or None
-        Residuals that deviations within the budget leave; None if the residuals gave no concern, or
-        if such deviations do not explain them.
-    elapsed_s : Elapsed
-        Durations of search and checks.
-    """
-
-    problem: Problem
-    solution: Solution
+    problem: Problem  # the problem that was solved
+    solution: Solution  # its solution, converged or not
+    # mapping of experiment name to ForwardSimulation or str: forward simulations, or the reason why
+    # there is none.
     rollouts: Mapping[str, ForwardSimulation | str]
-    uncertainty: Uncertainty | None
+    uncertainty: Uncertainty | None  # none if the solve did not converge
+    # Linearised fit at the solution, without the noise of the poses; None if the solve did not
+    # converge or cannot be linearised.
     fit: LinearisedFit | None = None
-    diagnoses: tuple[MarkerDiagnosis, ...] = ()
-    profiles: tuple[Profile, ...] = ()
-    notes: tuple[str, ...] = ()
+    diagnoses: tuple[MarkerDiagnosis, ...] = ()  # findings in the residuals
+    profiles: tuple[Profile, ...] = ()  # profile likelihoods that were requested
+    notes: tuple[str, ...] = ()  # problems after the solve
+    # Likely errors in the description of the problem, likeliest first.
     causes: tuple[Hypothesis, ...] = ()
+    # Discretisation errors of the estimates: from solves at finer discretisations if requested,
+    # else the first-order effect of the step from finer forward simulations; None where these are
+    # missing.
     refinement: Refinement | None = None
-    omitted_checks: str = ""
+    omitted_checks: str = ""  # checks that were left out after Ctrl-C; empty if all were done
+    # Systematic effects on the estimates; None without error bars.
     systematic_effects: VarianceSources | None = None
+    # Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and of
+    # parts of the data, where these were requested. Empty without error bars.
     probes: tuple[Probe, ...] = ()
+    # mapping of frozenset of str to Fix: the sensor or test that would determine the constants of a
+    # combination best, by their names.
     added_measurements: Mapping[frozenset[str], Fix] = field(default_factory=dict)
+    # Residuals that deviations within the budget leave; None if the residuals gave no concern, or
+    # if such deviations do not explain them.
     budgeted: BudgetedResiduals | None = None
-    elapsed_s: Elapsed = field(default_factory=Elapsed)
+    elapsed_s: Elapsed = field(default_factory=Elapsed)  # durations of search and checks
 
     def __repr__(self) -> str:
         solution = self.solution

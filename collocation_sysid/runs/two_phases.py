@@ -58,25 +58,13 @@ GIVEN_DEVIATION = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _PhaseSearch:
-    """Two-phase field of a problem, and the names of its parameters.
+    """Two-phase field of a problem, and the names of its parameters."""
 
-    Attributes
-    ----------
-    name : str
-        Name of its constant, with the region in front.
-    modes : TwoPhaseModes
-        Shapes of the field.
-    number : int
-        Index of the part in the body.
-    elements : tuple of str
-        Names of the coefficients of `ElementLogarithms`.
-    """
-
-    name: str
+    name: str  # name of its constant, with the region in front
     contrast: str
-    modes: TwoPhaseModes
-    number: int
-    elements: tuple[str, ...]
+    modes: TwoPhaseModes  # shapes of the field
+    number: int  # index of the part in the body
+    elements: tuple[str, ...]  # names of the coefficients of `ElementLogarithms`
 
 
 def solve_two_phases(

@@ -22,28 +22,19 @@ from .result_content import Result
 
 @dataclass(frozen=True)
 class WarmStart:
-    """Estimates of an earlier solution, by name, as the start of another solve.
+    """Estimates of an earlier solution, by name, as the start of another solve."""
 
-    Attributes
-    ----------
-    folder : Path
-        Run folder, for messages; empty for a solution from memory.
-    values : mapping of name to value
-        Physical values of the parameters, and of moduli derived from them, in SI units.
-    nuisance : mapping of name to value
-        Nuisance parameters by "experiment: label", as in `Collocation.parameter_names`,
-        in the unit of the label.
-    places_m : mapping of experiment to mapping of marker to (3,)
-        Places of the markers on the undeformed body [m].
-    substeps : int
-        Time steps per sample.
-    """
-
-    folder: Path
+    folder: Path  # run folder, for messages; empty for a solution from memory
+    # mapping of name to value: physical values of the parameters, and of moduli derived from them,
+    # in SI units.
     values: Mapping[str, float]
+    # mapping of name to value: nuisance parameters by "experiment: label", as in
+    # `Collocation.parameter_names`, in the unit of the label.
     nuisance: Mapping[str, float]
+    # mapping of experiment to mapping of marker to (3,): places of the markers on the undeformed
+    # body [m].
     places_m: Mapping[str, Mapping[str, Array]]
-    substeps: int = 1
+    substeps: int = 1  # time steps per sample
 
     @classmethod
     def read(cls, folder: str | Path) -> WarmStart:

@@ -102,17 +102,12 @@ NUMERICAL = "scheme/step", "mesh/refined"
 class Assessment:
     """Concerns, the gravest first, and the resulting verdict.
 
-    Attributes
-    ----------
-    concerns : tuple of Concern
-        Empty if the verdict is "good".
-
     Notes
     -----
     `from_concerns` establishes the order; the constructor takes the concerns as they are.
     """
 
-    concerns: tuple[Concern, ...] = ()
+    concerns: tuple[Concern, ...] = ()  # empty if the verdict is "good"
     SERIALISED_PROPERTIES: ClassVar = ("verdict", "reasons")
 
     @classmethod

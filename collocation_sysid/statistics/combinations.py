@@ -159,24 +159,13 @@ class Fix:
 
 @dataclass(frozen=True)
 class Combination:
-    """Constants of which only a combination is determined.
+    """Constants of which only a combination is determined."""
 
-    Attributes
-    ----------
-    determined : Direction
-        The combination with the narrowest interval.
-    loosest : Direction
-        The combination of the same constants with the widest interval.
-    modulus : str or None
-        Derived modulus that is known as well as `determined`, which it replaces in sentences.
-    fixes : tuple of Fix
-        Ways to determine the constants, the most effective first.
-    """
-
-    determined: Direction
-    loosest: Direction
+    determined: Direction  # the combination with the narrowest interval
+    loosest: Direction  # the combination of the same constants with the widest interval
+    # Derived modulus that is known as well as `determined`, which it replaces in sentences.
     modulus: str | None = None
-    fixes: tuple[Fix, ...] = ()
+    fixes: tuple[Fix, ...] = ()  # ways to determine the constants, the most effective first
 
     def precision(self) -> str:
         """Return how well the combination is determined, as text; empty if it has no formula."""

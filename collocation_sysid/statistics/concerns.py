@@ -18,23 +18,12 @@ Grade = Literal["check", "doubtful"]
 
 @dataclass(frozen=True)
 class Topic:
-    """Subject of several concerns, and its remedy.
+    """Subject of several concerns, and its remedy."""
 
-    Attributes
-    ----------
-    title : str
-        Title of the topic for headings.
-    page : str
-        Topic of the page with more information, see `pages`.
-    remedy : str
-        Remedy, in a sentence or two.
-    messages : mapping of str to str
-        Message for the rest of the code, with placeholders for the data.
-    """
-
-    title: str
-    page: str
-    remedy: str
+    title: str  # title of the topic for headings
+    page: str  # topic of the page with more information, see `pages`
+    remedy: str  # remedy, in a sentence or two
+    # mapping of str to str: message for the rest of the code, with placeholders for the data.
     messages: Mapping[str, str]
 
 
@@ -617,20 +606,11 @@ def message_of(code: str, data: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Concern:
-    """One reason for concern.
+    """One reason for concern."""
 
-    Attributes
-    ----------
-    code : str
-        Topic and kind, such as "noise/larger"; stable when messages are reworded.
-    grade : {"check", "doubtful"}
-        Severity: "doubtful" is graver.
-    data : mapping of str to value
-        Values of the placeholders in the message.
-    """
-
-    code: str
-    grade: Grade = "check"
+    code: str  # topic and kind, such as "noise/larger"; stable when messages are reworded
+    grade: Grade = "check"  # severity: "doubtful" is graver
+    # mapping of str to value: values of the placeholders in the message.
     data: Mapping[str, Any] = field(default_factory=dict)
 
     @property

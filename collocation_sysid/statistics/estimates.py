@@ -77,18 +77,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class IntervalCoordinate:
-    """Coordinate in which an interval is symmetric.
+    """Coordinate in which an interval is symmetric."""
 
-    Attributes
-    ----------
-    is_odds : bool
-        Whether it is ln ν/(½ − ν), for Poisson's ratio; decides before `is_linear`.
-    is_linear : bool
-        Whether it is the value itself; if neither, it is the logarithm.
-    """
-
-    is_odds: bool
-    is_linear: bool
+    is_odds: bool  # whether it is ln ν/(½ − ν), for Poisson's ratio; decides before `is_linear`
+    is_linear: bool  # whether it is the value itself; if neither, it is the logarithm
 
     @classmethod
     def for_estimate(cls, name: str, values: Iterable[float], linear: bool) -> IntervalCoordinate:

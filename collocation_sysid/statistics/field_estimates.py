@@ -104,49 +104,27 @@ def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
 
 @dataclass(frozen=True, eq=False)
 class FieldEstimate:
-    """Estimate of a spatially varying constant.
+    """Estimate of a spatially varying constant."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the constant, with its region in front.
-    modes : FieldModes
-        Modes of the field.
-    cells : (k,) array
-        Indices of the elements.
-    value : (k,) array
-        Constant in each element.
-    deviation : (k,) array
-        Standard deviation of its logarithm (of a density: over the stated one); NaN without error
-        bars.
-    quantile : float
-        Half width of the 95 % intervals in standard deviations.
-    coefficients : (m,) array
-        Mode coefficients a.
-    covariance : (f, f) array
-        Covariance of those that are estimated; fixed and tied ones are left out.
-    declared_density_kg_m3 : float or None
-        Stated density that the deviation refers to [kg/m³]; None for other constants.
-    sampled_intervals : (lower, upper) or None
-        Ends (k,) of the 95 % intervals from samples; None if they follow from the deviation.
-    phases : PhaseSummary or None
-        Result of a two-phase field; None for a smooth field.
-    smoothing : (k,) array or None
-        Standard deviation of the estimated field under the averaging kernel of each element, in the
-        unit of `deviation`; None where it is zero.
-    """
-
-    name: str
+    name: str  # name of the constant, with its region in front
     modes: FieldModes
-    cells: Index
-    value: Array
+    cells: Index  # (k,): indices of the elements
+    value: Array  # (k,): constant in each element
+    # (k,): standard deviation of its logarithm (of a density: over the stated one); NaN without
+    # error bars.
     deviation: Array
-    quantile: float
-    coefficients: Array
+    quantile: float  # half width of the 95 % intervals in standard deviations
+    coefficients: Array  # (m,): mode coefficients a
+    # (f, f): covariance of those that are estimated; fixed and tied ones are left out.
     covariance: Array
+    # Stated density that the deviation refers to [kg/m³]; None for other constants.
     declared_density_kg_m3: float | None = None
+    # (lower, upper) or None: ends (k,) of the 95 % intervals from samples; None if they follow from
+    # the deviation.
     sampled_intervals: tuple[Array, Array] | None = None
-    phases: PhaseSummary | None = None
+    phases: PhaseSummary | None = None  # result of a two-phase field; None for a smooth field
+    # (k,) or None: standard deviation of the estimated field under the averaging kernel of each
+    # element, in the unit of `deviation`; None where it is zero.
     smoothing: Array | None = None
 
     @property
@@ -408,21 +386,11 @@ def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float)
 
 
 class SampleQuantiles(NamedTuple):
-    """Median and 95 % interval of samples.
+    """Median and 95 % interval of samples."""
 
-    Attributes
-    ----------
-    lower : float
-        Quantile of 2.5 %.
-    median : float
-        Median.
-    upper : float
-        Quantile of 97.5 %.
-    """
-
-    lower: float
+    lower: float  # quantile of 2.5 %
     median: float
-    upper: float
+    upper: float  # quantile of 97.5 %
 
 
 def _quantiles(values: Array) -> SampleQuantiles:

@@ -11,30 +11,15 @@ from ..common.array_types import Array, root_mean
 
 @dataclass(frozen=True)
 class InstrumentMisfit:
-    """Differences between a prediction and the measurements of one kind, in stated σ.
+    """Differences between a prediction and the measurements of one kind, in stated σ."""
 
-    Attributes
-    ----------
-    what : str
-        What is measured, for people.
-    sigma_key : str
-        Key of σ in the problem, for people.
-    sigmas : float
-        Root mean square of the differences over σ.
-    robust_sigmas : float
-        The same without outliers of depth, see `DepthError`; predictions are judged by it.
-    count : int
-        Number of measured values.
-    size : str
-        Root mean square in a unit, for people; empty if units differ.
-    """
-
-    what: str
-    sigma_key: str
-    sigmas: float
+    what: str  # what is measured, for people
+    sigma_key: str  # key of σ in the problem, for people
+    sigmas: float  # root mean square of the differences over σ
+    # The same without outliers of depth, see `DepthError`; predictions are judged by it.
     robust_sigmas: float
-    count: int
-    size: str = ""
+    count: int  # number of measured values
+    size: str = ""  # root mean square in a unit, for people; empty if units differ
 
     @property
     def size_text(self) -> str:

@@ -107,21 +107,11 @@ NO_STEP = 1e-12
 
 
 class Channels(NamedTuple):
-    """Residuals of one measurement, with column 3 m + axis for each axis of marker m.
+    """Residuals of one measurement, with column 3 m + axis for each axis of marker m."""
 
-    Attributes
-    ----------
-    residual : (T, 3M) array
-        Residuals in units of σ, zero where missing.
-    jacobian : (T, 3M, p) array
-        Their derivatives by all p parameters.
-    is_measured : (T, 3M) array of bool
-        Coordinates that exist.
-    """
-
-    residual: Array
-    jacobian: Array
-    is_measured: Mask
+    residual: Array  # (T, 3M): residuals in units of σ, zero where missing
+    jacobian: Array  # (T, 3M, p): their derivatives by all p parameters
+    is_measured: Mask  # (T, 3M) of bool: coordinates that exist
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,60 +120,31 @@ class ResidualBlock:
 
     Markers are the entities of the measurement; a sensor of a grasp has two, force and torque [N, N
     m], and a custom sensor one for each three numbers.
-
-    Attributes
-    ----------
-    name : str
-        Name of the experiment.
-    t_s : (T,) array
-        Times of the samples [s], equally spaced unless static.
-    marker_names : (M,) tuple of str
-        Names of the markers.
-    is_present : (T, M) array of bool
-        Samples that are compared.
-    residual : (T, M, 3) array
-        Residuals (h(x) − ŷ) / σ, zero where missing.
-    jacobian : (T, M, 3, p) array
-        Derivatives of the residuals by all p parameters, zero where missing.
-    sigma_m : (M,) array
-        Stated standard deviations.
-    misfit : (T, M, 3) array or None
-        Original residuals where Huber's loss has shortened those in `residual`; None if they are
-        the same.
-    components : (T, M, 3) array of bool or None
-        Coordinates that exist; None if all three of a present sample do.
-    sigma_key : str
-        Key of σ in the problem: "sigma_m" for positions.
-    is_static : bool
-        Whether samples are equilibria, which have no frequency.
-    is_relaxed_at_start : bool
-        Whether a memory is assumed relaxed at the first sample.
-    places_m : (3M, 3) array or None
-        Places of the channels on the undeformed body [m]; None if they have none.
-    disturbances : (K, T, M, 3) array or None
-        Samples of known errors of the residuals besides their noise, in units of σ.
-    has_noise_floor : bool
-        See `MeasurementResidual`.
-    sigma_ratios : (T, M, 3) array or float
-        σ of each number over `sigma_m`.
     """
 
-    name: str
-    t_s: Array
-    marker_names: tuple[str, ...]
-    is_present: Mask
-    residual: Array
+    name: str  # name of the experiment
+    t_s: Array  # (T,): times of the samples [s], equally spaced unless static
+    marker_names: tuple[str, ...]  # (M,) tuple of str: names of the markers
+    is_present: Mask  # (T, M) of bool: samples that are compared
+    residual: Array  # (T, M, 3): residuals (h(x) − ŷ) / σ, zero where missing
+    # (T, M, 3, p): derivatives of the residuals by all p parameters, zero where missing.
     jacobian: Array
-    sigma_m: Array
+    sigma_m: Array  # (M,): stated standard deviations
+    # (T, M, 3) or None: original residuals where Huber's loss has shortened those in `residual`;
+    # None if they are the same.
     misfit: Array | None = None
+    # (T, M, 3) of bool or None: coordinates that exist; None if all three of a present sample do.
     components: Mask | None = None
-    sigma_key: str = "sigma_m"
-    is_static: bool = False
-    is_relaxed_at_start: bool = False
+    sigma_key: str = "sigma_m"  # key of σ in the problem: "sigma_m" for positions
+    is_static: bool = False  # whether samples are equilibria, which have no frequency
+    is_relaxed_at_start: bool = False  # whether a memory is assumed relaxed at the first sample
+    # (3M, 3) or None: places of the channels on the undeformed body [m]; None if they have none.
     places_m: Array | None = None
+    # (K, T, M, 3) or None: samples of known errors of the residuals besides their noise, in units
+    # of σ.
     disturbances: Array | None = None
-    has_noise_floor: bool = False
-    sigma_ratios: Array | float = 1.0
+    has_noise_floor: bool = False  # see `MeasurementResidual`
+    sigma_ratios: Array | float = 1.0  # (T, M, 3) or float: σ of each number over `sigma_m`
 
     @cached_property
     def is_measured(self) -> Mask:
@@ -229,18 +190,10 @@ class ResidualBlock:
 
 @dataclass(frozen=True, eq=False)
 class DerivedModuli:
-    """Moduli that follow from the estimated parameters.
+    """Moduli that follow from the estimated parameters."""
 
-    Attributes
-    ----------
-    values : mapping of str to float
-        Moduli by name.
-    derivatives : mapping of str to (shared,) array
-        Their derivatives by q.
-    """
-
-    values: Mapping[str, float]
-    derivatives: Mapping[str, Array]
+    values: Mapping[str, float]  # mapping of str to float: moduli by name
+    derivatives: Mapping[str, Array]  # mapping of str to (shared,): their derivatives by q
 
     @classmethod
     def from_bodies(cls, constants: Iterable[ThetaMap], q: Array) -> DerivedModuli:
@@ -428,20 +381,12 @@ class Information:
 
     Parameters at a bound are free here: with other noise they would not have ended there, and their
     correlation with the other parameters is part of those parameters' error.
-
-    Attributes
-    ----------
-    fit : SquareRootInformation
-        Triangle of all rows; its root is L.
-    scaled_jacobians : tuple of (T, 3M, r) arrays
-        D = S L of each block; zero where missing.
-    prior : (r, r) array
-        Lᵀ PᵀP L.
     """
 
-    fit: SquareRootInformation
+    fit: SquareRootInformation  # triangle of all rows; its root is L
+    # tuple of (T, 3M, r) arrays: D = S L of each block; zero where missing.
     scaled_jacobians: tuple[Array, ...]
-    prior: Array
+    prior: Array  # (r, r): Lᵀ PᵀP L
 
     def count_determined(self) -> float:
         """Return the number of parameters that the data determine, Σ tr DᵀD; one that a prior

@@ -38,46 +38,24 @@ from .potts_prior import PottsConstants, PottsHyperprior
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """Constants of the sampler.
+    """Constants of the sampler."""
 
-    Attributes
-    ----------
-    hyperprior : PottsHyperprior
-        Prior of the constants of the Potts prior.
-    steps_per_element : int
-        Proposals per element and chain; the first quarter is discarded.
-    least_steps : int
-        Fewest proposals of a chain.
-    chains : int
-        Chains, at least three, which are computed together.
-    dispersion : float
-        Largest ratio of the volume of the inclusion at the start of a chain to that of the estimate
-        from which chains start, and of this to the smallest. Inclusions of twice the volume and
-        about half the difference of the constants deform the body in nearly the same way.
-    steps_per_draw : int
-        Proposals between draws of the constants of the Potts prior.
-    steps_per_sample : int
-        Proposals between stored samples.
-    total_variation : float
-        Weight of the total variation of z per face at the start, in units of −2 ln π.
-    smallest_jump : float
-        Differences of z across a face that the start does not sharpen.
-    sharpenings : int
-        Reweighted least-squares solves of the start.
-    largest_exponent : float
-        Limit of the exponents of the proposals' weights, against overflow.
-    """
-
+    # Prior of the constants of the Potts prior.
     hyperprior: PottsHyperprior = field(default_factory=PottsHyperprior)
-    steps_per_element: int = 10
-    least_steps: int = 4000
-    chains: int = 8
+    steps_per_element: int = 10  # proposals per element and chain; the first quarter is discarded
+    least_steps: int = 4000  # fewest proposals of a chain
+    chains: int = 8  # chains, at least three, which are computed together
+    # Largest ratio of the volume of the inclusion at the start of a chain to that of the estimate
+    # from which chains start, and of this to the smallest. Inclusions of twice the volume and about
+    # half the difference of the constants deform the body in nearly the same way.
     dispersion: float = 2.0
-    steps_per_draw: int = 400
-    steps_per_sample: int = 20
+    steps_per_draw: int = 400  # proposals between draws of the constants of the Potts prior
+    steps_per_sample: int = 20  # proposals between stored samples
+    # Weight of the total variation of z per face at the start, in units of −2 ln π.
     total_variation: float = 1.0
-    smallest_jump: float = 0.02
-    sharpenings: int = 8
+    smallest_jump: float = 0.02  # differences of z across a face that the start does not sharpen
+    sharpenings: int = 8  # reweighted least-squares solves of the start
+    # Limit of the exponents of the proposals' weights, against overflow.
     largest_exponent: float = 30.0
 
 
@@ -86,21 +64,11 @@ USUAL = SamplerSettings()
 
 @dataclass(frozen=True, eq=False)
 class InternalFaces:
-    """Faces between two elements.
+    """Faces between two elements."""
 
-    Attributes
-    ----------
-    pairs : (F, 2) array
-        Indices of the elements on both sides.
-    weights : (F,) array
-        Area over the mean area.
-    element_count : int
-        Number E of elements.
-    """
-
-    pairs: Index
-    weights: Array
-    element_count: int
+    pairs: Index  # (F, 2): indices of the elements on both sides
+    weights: Array  # (F,): area over the mean area
+    element_count: int  # number E of elements
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, cells: Index) -> InternalFaces:
@@ -149,36 +117,16 @@ class InternalFaces:
 
 @dataclass(frozen=True, eq=False)
 class ElementInformation:
-    """Normal equations of the linearised measurements, by changes of p and of z.
+    """Normal equations of the linearised measurements, by changes of p and of z."""
 
-    Attributes
-    ----------
-    of_p : (p, p) array
-        S_pᵀS_p / T and the information of the priors.
-    mixed : (E, p) array
-        S_zᵀS_p / T.
-    of_z : (E, E) array
-        S_zᵀS_z / T.
-    score_p : (p,) array
-        S_pᵀr / T and the score of the priors.
-    score_z : (E,) array
-        S_zᵀr / T.
-    base : (E,) array
-        Expansion point z₀.
-    deviation : float
-        Prior standard deviation A of s.
-    mean : float
-        Prior mean m of s.
-    """
-
-    of_p: Array
-    mixed: Array
-    of_z: Array
-    score_p: Array
-    score_z: Array
-    base: Array
-    deviation: float
-    mean: float = 0.0
+    of_p: Array  # (p, p): S_pᵀS_p / T and the information of the priors
+    mixed: Array  # (E, p): S_zᵀS_p / T
+    of_z: Array  # (E, E): S_zᵀS_z / T
+    score_p: Array  # (p,): S_pᵀr / T and the score of the priors
+    score_z: Array  # (E,): S_zᵀr / T
+    base: Array  # (E,): expansion point z₀
+    deviation: float  # prior standard deviation A of s
+    mean: float = 0.0  # prior mean m of s
 
     @cached_property
     def covariance_p(self) -> Array:
@@ -200,27 +148,13 @@ class ElementInformation:
 
 @dataclass(frozen=True, eq=False)
 class PosteriorDraws:
-    """Samples of C chains, k of each.
+    """Samples of C chains, k of each."""
 
-    Attributes
-    ----------
-    phases : (k, C, E) array
-        Phases, 0 or 1.
-    contrasts : (k, C) array
-        Logarithms s of the contrast.
-    means : (k, C) array
-        Means of s given the phases.
-    constants : PottsConstants
-        Constants of the Potts prior, (k, C) each.
-    accepted : float
-        Share of accepted proposals.
-    """
-
-    phases: NDArray[np.int8]
-    contrasts: Array
-    means: Array
-    constants: PottsConstants
-    accepted: float
+    phases: NDArray[np.int8]  # (k, C, E): phases, 0 or 1
+    contrasts: Array  # (k, C): logarithms s of the contrast
+    means: Array  # (k, C): means of s given the phases
+    constants: PottsConstants  # constants of the Potts prior, (k, C) each
+    accepted: float  # share of accepted proposals
 
     def compute_probability(self) -> Array:
         """Return the probability (E,) of phase 1 in each element."""

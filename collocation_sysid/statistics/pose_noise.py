@@ -43,24 +43,12 @@ NEGLIGIBLE = 0.02
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Noise of the poses of one grasp.
-
-    Attributes
-    ----------
-    experiment : str
-        Name of the experiment.
-    sigma_m : float
-        Standard deviation of the translations [m].
-    sigma_rad : float
-        Standard deviation of the rotations [rad].
-    is_estimated : bool
-        Whether it was estimated from the roughness of the poses instead of stated.
-    """
+    """Noise of the poses of one grasp."""
 
     experiment: str
-    sigma_m: float
-    sigma_rad: float
-    is_estimated: bool
+    sigma_m: float  # standard deviation of the translations [m]
+    sigma_rad: float  # standard deviation of the rotations [rad]
+    is_estimated: bool  # whether it was estimated from the roughness of the poses instead of stated
 
     def describe(self) -> str:
         """Return the message for the user: the size of the noise in mm and degrees, and whether it

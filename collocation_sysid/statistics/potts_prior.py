@@ -22,45 +22,26 @@ from ..common.array_types import Array
 
 
 class PottsConstants(NamedTuple):
-    """Constants of the Potts prior of one or several chains.
+    """Constants of the Potts prior of one or several chains."""
 
-    Attributes
-    ----------
-    face_nats : (C,) array
-        Strength J for each of C chains [nats per face of mean area].
-    element_nats : (C,) array
-        Field B [nats per element].
-    """
-
-    face_nats: Array
-    element_nats: Array
+    face_nats: Array  # (C,): strength J for each of C chains [nats per face of mean area]
+    element_nats: Array  # (C,): field B [nats per element]
 
 
 @dataclass(frozen=True)
 class PottsHyperprior:
-    """Normal prior of the constants J and B, and limits of their estimation.
+    """Normal prior of the constants J and B, and limits of their estimation."""
 
-    Attributes
-    ----------
-    face_nats : float
-        Mean of J. Tetrahedra have four neighbours like the sites of the diamond lattice, whose
-        phases are disordered below 0.74; from 3 on, single elements never differ.
-    face_deviation : float
-        Standard deviation of J: the mean is between both limits, which are about one deviation
-        away.
-    element_deviation : float
-        Standard deviation of B, whose mean is zero: about half of what four faces weigh.
-    newton_steps : int
-        Newton steps of the mode; each changes J by at most 0.5 and B by at most 1.
-    largest_logit : float
-        Limit of the logits, against overflow.
-    """
-
+    # Mean of J. Tetrahedra have four neighbours like the sites of the diamond lattice, whose phases
+    # are disordered below 0.74; from 3 on, single elements never differ.
     face_nats: float = 1.5
+    # Standard deviation of J: the mean is between both limits, which are about one deviation away.
     face_deviation: float = 1.0
+    # Standard deviation of B, whose mean is zero: about half of what four faces weigh.
     element_deviation: float = 2.0
+    # Newton steps of the mode; each changes J by at most 0.5 and B by at most 1.
     newton_steps: int = 8
-    largest_logit: float = 30.0
+    largest_logit: float = 30.0  # limit of the logits, against overflow
 
     def draw(
         self,

@@ -68,26 +68,16 @@ def scale_concerns(
 
 @dataclass(frozen=True)
 class ScaleReference:
-    """The stated mass, to which the moduli of a motion without measured forces are relative.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Parameters of which only the ratio to the density is determined.
-    density_kg_m3 : float
-        Mass of all fitted bodies over their volume, as stated.
-    deviation : float or None
-        Relative standard deviation of the mass, which the intervals contain; None if the mass
-        counts as exact.
-    is_compared : bool
-        Whether the density of the material is stated as well, with which the mass is compared.
-    """
+    """The stated mass, to which the moduli of a motion without measured forces are relative."""
 
     SERIALISED_PROPERTIES: ClassVar = ("sentence",)
 
-    names: tuple[str, ...]
-    density_kg_m3: float
+    names: tuple[str, ...]  # parameters of which only the ratio to the density is determined
+    density_kg_m3: float  # mass of all fitted bodies over their volume, as stated
+    # Relative standard deviation of the mass, which the intervals contain; None if the mass counts
+    # as exact.
     deviation: float | None
+    # Whether the density of the material is stated as well, with which the mass is compared.
     is_compared: bool = False
 
     @property

@@ -109,27 +109,15 @@ AUTO = ErrorModel()
 
 @dataclass(frozen=True, eq=False)
 class ErrorBasis:
-    """Error model that error bars are based on.
+    """Error model that error bars are based on."""
 
-    Attributes
-    ----------
-    noise : {"given", "estimated", "by-marker"}
-        Source of the variance: stated σ, one common factor, or one factor for each marker.
-    errors : {"independent", "autocorrelated"}
-        Correlation of the errors.
-    level : NoiseLevel
-        Size of the residuals of each marker.
-    dependence : Dependence
-        Tests of the residuals for correlation.
-    outliers : tuple of Outlier
-        Single samples that dominate the residuals of their marker; `analyse_dependence` leaves them
-        out.
-    """
-
+    # Source of the variance: stated σ, one common factor, or one factor for each marker.
     noise: Noise
-    errors: Errors
-    level: NoiseLevel
-    dependence: Dependence
+    errors: Errors  # correlation of the errors
+    level: NoiseLevel  # size of the residuals of each marker
+    dependence: Dependence  # tests of the residuals for correlation
+    # Single samples that dominate the residuals of their marker; `analyse_dependence` leaves them
+    # out.
     outliers: tuple[Outlier, ...]
 
 
@@ -387,20 +375,12 @@ def _reported_covariance(
 
 @dataclass(frozen=True, eq=False)
 class _WidenedBars:
-    """Error bars of the shared parameters that contain the disagreement of recordings.
+    """Error bars of the shared parameters that contain the disagreement of recordings."""
 
-    Attributes
-    ----------
-    covariance : (nq, nq) array
-        Covariance of q.
-    quantiles : (nq,) array
-        Half widths of the 95 % intervals in standard deviations.
-    factors : (nq,) array
-        Half widths of the intervals over those without the disagreement; 1 where recordings agree.
-    """
-
-    covariance: Array
-    quantiles: Array
+    covariance: Array  # (nq, nq): covariance of q
+    quantiles: Array  # (nq,): half widths of the 95 % intervals in standard deviations
+    # (nq,): half widths of the intervals over those without the disagreement; 1 where recordings
+    # agree.
     factors: Array
 
 
@@ -536,24 +516,14 @@ def _correlated_score_covariance(
 
 @dataclass(frozen=True, eq=False)
 class MarkerPlace:
-    """Place of a marker on the undeformed body.
+    """Place of a marker on the undeformed body."""
 
-    Attributes
-    ----------
-    position_m : (3,) array
-        Estimated or exact place [m].
-    std_error_m : (3,) array or None
-        Standard error of each coordinate [m], zero for an exact place; None without error bars.
-    prior_m : float
-        Prior standard deviation of each coordinate [m], zero for an exact place.
-    declared_m : (3,) array or None
-        Stated place [m]; None if there is none.
-    """
-
-    position_m: Array
+    position_m: Array  # (3,): estimated or exact place [m]
+    # (3,) or None: standard error of each coordinate [m], zero for an exact place; None without
+    # error bars.
     std_error_m: Array | None
-    prior_m: float
-    declared_m: Array | None
+    prior_m: float  # prior standard deviation of each coordinate [m], zero for an exact place
+    declared_m: Array | None  # (3,) or None: stated place [m]; None if there is none
     SERIALISED_PROPERTIES: ClassVar = ("is_declared",)
 
     @property

@@ -115,39 +115,22 @@ def check_damping(
 
 @dataclass(frozen=True, eq=False)
 class DampingState:
-    """Stress of a damping law at one F and Ḟ, with derivatives; tensors stacked column by column.
+    """Stress of a damping law at one F and Ḟ, with derivatives; tensors stacked column by column."""
 
-    Attributes
-    ----------
-    stress : (9,) array
-        First Piola–Kirchhoff stress P_v [Pa].
-    stated_by_F : (9, 9) array
-        ∂P_v/∂F as the law states it; the automatic derivative if the law has a potential.
-    by_F : (9, 9) array
-        ∂P_v/∂F by automatic differentiation.
-    by_rate : (9, 9) array
-        ∂P_v/∂Ḟ by automatic differentiation.
-    """
-
-    stress: Array
+    stress: Array  # (9,): first Piola–Kirchhoff stress P_v [Pa]
+    # (9, 9): ∂P_v/∂F as the law states it; the automatic derivative if the law has a potential.
     stated_by_F: Array
-    by_F: Array
-    by_rate: Array
+    by_F: Array  # (9, 9): ∂P_v/∂F by automatic differentiation
+    by_rate: Array  # (9, 9): ∂P_v/∂Ḟ by automatic differentiation
 
 
 @dataclass(frozen=True, eq=False)
 class DampingStress:
-    """Stress of a damping law and its derivatives as numbers.
-
-    Attributes
-    ----------
-    values : (k,) array
-        Values of the constants of the material, then of the law.
-    """
+    """Stress of a damping law and its derivatives as numbers."""
 
     law: DampingLaw
     material: Material
-    values: Array
+    values: Array  # (k,): values of the constants of the material, then of the law
 
     @cached_property
     def _function(self) -> ca.Function:

@@ -150,11 +150,6 @@ class ForceLaw:
     Inputs u are stacked (x, v, constants, internal variables); data are the entries of a
     `ForceContext`.
 
-    Attributes
-    ----------
-    values : (k,) array
-        Values of its constants.
-
     Notes
     -----
     n dofs are 3 for a force on nodes and 9 for one on faces, corner after corner. u is (n
@@ -163,7 +158,7 @@ class ForceLaw:
     """
 
     force: NodeForce
-    values: Array
+    values: Array  # (k,): values of its constants
 
     @property
     def dofs(self) -> int:

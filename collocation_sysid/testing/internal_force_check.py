@@ -67,14 +67,9 @@ def damping_stress(
 
 @dataclass(frozen=True, eq=False)
 class PlainInternalForce:
-    """Internal force of a body by the plain formula, with automatic derivatives.
+    """Internal force of a body by the plain formula, with automatic derivatives."""
 
-    Attributes
-    ----------
-    body : Body
-        Body of one part, without memory or field, whose elements do not average the dilatation.
-    """
-
+    # Body of one part, without memory or field, whose elements do not average the dilatation.
     body: Body
 
     @cached_property

@@ -123,38 +123,21 @@ def check_material(
 
 @dataclass(frozen=True, eq=False)
 class StressState:
-    """Energy density and its derivatives at one F; tensors are stacked column after column.
+    """Energy density and its derivatives at one F; tensors are stacked column after column."""
 
-    Attributes
-    ----------
-    psi : (1,) array
-        Energy density ψ [J/m³].
-    stress : (9,) array
-        First Piola–Kirchhoff stress P = ∂ψ/∂F [Pa].
-    tangent : (9, 9) array
-        ∂P/∂F [Pa].
-    by_constants : (9, k) array or None
-        ∂P/∂θ by the k constants of the material; None if it was not computed.
-    """
-
-    psi: Array
-    stress: Array
-    tangent: Array
+    psi: Array  # (1,): energy density ψ [J/m³]
+    stress: Array  # (9,): first Piola–Kirchhoff stress P = ∂ψ/∂F [Pa]
+    tangent: Array  # (9, 9): ∂P/∂F [Pa]
+    # (9, k) or None: ∂P/∂θ by the k constants of the material; None if it was not computed.
     by_constants: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class EnergyDerivatives:
-    """Energy density, stress and stiffness of a material as numbers.
-
-    Attributes
-    ----------
-    values : (k,) array
-        Values of its constants.
-    """
+    """Energy density, stress and stiffness of a material as numbers."""
 
     material: Material
-    values: Array
+    values: Array  # (k,): values of its constants
 
     @cached_property
     def _function(self) -> ca.Function:

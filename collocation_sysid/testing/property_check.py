@@ -29,17 +29,11 @@ STEPS = (STEP, STEP / 30, STEP / 1000)
 
 @dataclass(frozen=True)
 class PropertyCheck:
-    """Comparisons of one check, with its subject and its random numbers.
+    """Comparisons of one check, with its subject and its random numbers."""
 
-    Attributes
-    ----------
-    subject : str
-        Kind and name of what is checked, as a sentence begins with them: "material 'gel'".
-    rng : numpy.random.Generator
-        Random numbers of the states, the same in every run.
-    """
-
+    # Kind and name of what is checked, as a sentence begins with them: "material 'gel'".
     subject: str
+    # Random numbers of the states, the same in every run.
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def fail(self, statement: str, found: Any, expected: Any) -> NoReturn:

@@ -151,22 +151,13 @@ def _check_stability(check: PropertyCheck, scheme: Scheme) -> None:
 
 @dataclass(frozen=True)
 class PlainRows:
-    """Rows of a scheme for a force f(ξ, ν) and a mass, as the module `model.schemes` states them.
-
-    Attributes
-    ----------
-    force : callable
-        ``force(xi, nu)`` → force at a position ξ and a velocity ν of one evaluation.
-    mass : float or array
-        Mass of each dof.
-    timestep_s : float
-        Step Δt [s].
-    """
+    """Rows of a scheme for a force f(ξ, ν) and a mass, as the module `model.schemes` states them."""
 
     scheme: Scheme
+    # ``force(xi, nu)`` → force at a position ξ and a velocity ν of one evaluation.
     force: Callable[[Any, Any], Any]
-    mass: float | Array
-    timestep_s: float
+    mass: float | Array  # mass of each dof
+    timestep_s: float  # step Δt [s]
     start_velocity: float | Array
 
     def residual(self, x: Array, row: int) -> Any:

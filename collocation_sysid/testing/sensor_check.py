@@ -93,15 +93,9 @@ def check_sensor(
 
 @dataclass(frozen=True, eq=False)
 class SensorExpression:
-    """Expression of a sensor as a function of u: inputs, column after column, then unknowns.
+    """Expression of a sensor as a function of u: inputs, column after column, then unknowns."""
 
-    Attributes
-    ----------
-    t_s : float
-        Time at which the expression is evaluated [s].
-    """
-
-    t_s: ClassVar[float] = 2.5 * TIMESTEP_S
+    t_s: ClassVar[float] = 2.5 * TIMESTEP_S  # time at which the expression is evaluated [s]
 
     sensor: CustomSensor
 

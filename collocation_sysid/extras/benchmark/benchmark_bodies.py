@@ -21,45 +21,22 @@ HYPERELASTICS_LICENCE = "collocation_sysid/datasets/LICENSE_Hyperelastics.md"
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkBody:
-    """One body of the benchmark.
-
-    Attributes
-    ----------
-    name : str
-        Name in the benchmark.
-    entry : str
-        Name of its entry in the catalogue, which has its constants, source and licence.
-    folder : str
-        Name of a dataset that is part of the package, or of a folder of `problems/`.
-    problem_file : str
-        Problem file in the folder.
-    recordings : tuple of str
-        Recordings to be predicted.
-    are_held_out : bool
-        Whether the constants were identified without these recordings.
-    overrides : tuple of str
-        Values that replace those of the problem file, "dotted.key=value".
-    data_files : tuple of str
-        Files in the folder that a script fetches; empty if all data are part of the repository.
-    script : str
-        Name of the script that fetches the data; empty if there is none.
-    licence_path : str
-        Text of the licence in the repository, for recordings of others; empty if there is none.
-    note : str
-        What limits a comparison with these measurements, for the README of the body.
-    """
+    """One body of the benchmark."""
 
     name: str
-    entry: str
-    folder: str
-    problem_file: str = "problem.toml"
-    recordings: tuple[str, ...]
-    are_held_out: bool
+    entry: str  # name of its entry in the catalogue, which has its constants, source and licence
+    folder: str  # name of a dataset that is part of the package, or of a folder of `problems/`
+    problem_file: str = "problem.toml"  # problem file in the folder
+    recordings: tuple[str, ...]  # recordings to be predicted
+    are_held_out: bool  # whether the constants were identified without these recordings
+    # Values that replace those of the problem file, "dotted.key=value".
     overrides: tuple[str, ...] = ()
+    # Files in the folder that a script fetches; empty if all data are part of the repository.
     data_files: tuple[str, ...] = ()
-    script: str = ""
+    script: str = ""  # name of the script that fetches the data; empty if there is none
+    # Text of the licence in the repository, for recordings of others; empty if there is none.
     licence_path: str = ""
-    note: str = ""
+    note: str = ""  # what limits a comparison with these measurements, for the README of the body
 
     def find_data_folder(self) -> Path | None:
         """Return the folder with the problem file and all data of the body on this computer; None

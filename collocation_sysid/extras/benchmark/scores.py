@@ -29,64 +29,34 @@ UNDEFORMED = "undeformed body"
 
 @dataclass(frozen=True, eq=False)
 class StoredRecording:
-    """A recording of a benchmark folder.
+    """A recording of a benchmark folder."""
 
-    Attributes
-    ----------
-    body : str
-        Name of its body, which is that of the folder.
-    name : str
-        Name in the names of files.
-    is_held_out : bool
-        Whether the constants were identified without the recording.
-    """
-
-    body: str
-    name: str
-    is_held_out: bool
+    body: str  # name of its body, which is that of the folder
+    name: str  # name in the names of files
+    is_held_out: bool  # whether the constants were identified without the recording
     signals: RecordingSignals
 
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of one prediction of one recording.
-
-    Attributes
-    ----------
-    source : str
-        "prediction", "collocation_sysid" for the forward simulation of this package, or
-        "undeformed body" for the undeformed body, which its grasp moves rigidly and has no loads.
-    quantity : {"markers", "forces", "stresses"}
-    unit : str
-        Unit of the errors: m, N or Pa.
-    is_held_out : bool
-        Whether the constants were identified without the recording.
-    count : int
-        Number of measured positions of markers, or of loads.
-    rms : float
-        RMS distance of predicted and measured markers, or RMS difference of loads.
-    largest : float
-        Largest distance or difference.
-    deflection_share : float
-        `rms` relative to the largest deflection, which is the largest error of the undeformed body.
-    sigmas : float
-        RMS of the differences over their stated standard deviations.
-    rms_without_offsets : float or None
-        RMS distance of the markers if the mean difference of each is subtracted, which errors of
-        marker positions on the body do not change much; None for loads.
-    """
+    """Errors of one prediction of one recording."""
 
     body: str
     recording: str
+    # "prediction", "collocation_sysid" for the forward simulation of this package, or "undeformed
+    # body" for the undeformed body, which its grasp moves rigidly and has no loads.
     source: str
     quantity: str
-    unit: str
-    is_held_out: bool
-    count: int
-    rms: float
-    largest: float
+    unit: str  # unit of the errors: m, N or Pa
+    is_held_out: bool  # whether the constants were identified without the recording
+    count: int  # number of measured positions of markers, or of loads
+    rms: float  # RMS distance of predicted and measured markers, or RMS difference of loads
+    largest: float  # largest distance or difference
+    # `rms` relative to the largest deflection, which is the largest error of the undeformed body.
     deflection_share: float
-    sigmas: float
+    sigmas: float  # RMS of the differences over their stated standard deviations
+    # RMS distance of the markers if the mean difference of each is subtracted, which errors of
+    # marker positions on the body do not change much; None for loads.
     rms_without_offsets: float | None
 
 

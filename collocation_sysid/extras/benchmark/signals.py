@@ -26,27 +26,15 @@ FORCE_COUNT = 3
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """Table of one quantity of a recording.
+    """Table of one quantity of a recording."""
 
-    Attributes
-    ----------
-    quantity : {"markers", "forces", "stresses"}
-        Positions of markers [m], forces of grasps on the specimen [N], or nominal stresses [Pa].
-    key : str
-        Name of the first column: "t_s", or "sample" where a test has no times.
-    keys : (T,) array
-        Times [s], or numbers of the samples, counted from 1.
-    columns : tuple of str
-        Names of the other columns; x, y and z of each marker follow each other.
-    values : (T, C) array
-        SI units; NaN where nothing was measured.
-    """
-
+    # Positions of markers [m], forces of grasps on the specimen [N], or nominal stresses [Pa].
     quantity: Quantity
-    key: str
-    keys: Array
+    key: str  # name of the first column: "t_s", or "sample" where a test has no times
+    keys: Array  # (T,): times [s], or numbers of the samples, counted from 1
+    # Names of the other columns; x, y and z of each marker follow each other.
     columns: tuple[str, ...]
-    values: Array
+    values: Array  # (T, C): SI units; NaN where nothing was measured
 
     @property
     def table(self) -> dict[str, Array]:
@@ -61,21 +49,12 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class RecordingSignals:
-    """Measured quantity of a recording, with two predictions of it.
-
-    Attributes
-    ----------
-    sigma : (C,) array
-        Stated standard deviation of each column.
-    simulated : Signal
-        Prediction by the forward simulation of this package.
-    undeformed : Signal
-        Prediction by the undeformed body, which its grasp moves rigidly and which has no loads.
-    """
+    """Measured quantity of a recording, with two predictions of it."""
 
     measured: Signal
-    sigma: Array
-    simulated: Signal
+    sigma: Array  # (C,): stated standard deviation of each column
+    simulated: Signal  # prediction by the forward simulation of this package
+    # Prediction by the undeformed body, which its grasp moves rigidly and which has no loads.
     undeformed: Signal
 
     @classmethod

@@ -30,24 +30,13 @@ Watch = Callable[[int, float], None]
 
 @dataclass(eq=False)
 class SearchResult:
-    """Best point of a search, updated while the search runs.
+    """Best point of a search, updated while the search runs."""
 
-    Attributes
-    ----------
-    coefficients : (d,) array or None
-        Best coefficients; None before the first evaluation.
-    value : float
-        Smallest value; infinite before the first evaluation.
-    history : list of float
-        Smallest value after each evaluation.
-    is_interrupted : bool
-        Whether Ctrl-C ended the search.
-    """
-
+    # (d,) or None: best coefficients; None before the first evaluation.
     coefficients: Array | None = None
-    value: float = np.inf
-    history: list[float] = field(default_factory=list)
-    is_interrupted: bool = False
+    value: float = np.inf  # smallest value; infinite before the first evaluation
+    history: list[float] = field(default_factory=list)  # smallest value after each evaluation
+    is_interrupted: bool = False  # whether Ctrl-C ended the search
 
 
 def minimise(

@@ -183,18 +183,11 @@ class CheckedMotion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class HandBounds:
-    """Limits of a hand with a known initial position.
+    """Limits of a hand with a known initial position."""
 
-    Attributes
-    ----------
-    limits : Limits
-        Limits of the robot.
-    low_m, high_m : (3,) array
-        Corners of the workspace relative to the initial position [m]: all below zero and all above
-        zero.
-    """
-
-    limits: Limits
+    limits: Limits  # limits of the robot
+    # (3,): corners of the workspace relative to the initial position [m]: all below zero and all
+    # above zero.
     low_m: Array
     high_m: Array
 

@@ -41,18 +41,12 @@ PER_WAVE = 4
 
 
 class TimeDerivatives(NamedTuple):
-    """A quantity, or a limit of it, with its first two derivatives with respect to time.
+    """A quantity, or a limit of it, with its first two derivatives with respect to time."""
 
-    Attributes
-    ----------
-    value : array
-        The quantity; for the coordinates of a motion (T, 6): translation x, y, z [m] and rotation
-        vector x, y, z [rad].
-    first, second : array
-        Its first and second derivatives, of the same shape [per s, per s²].
-    """
-
+    # The quantity; for the coordinates of a motion (T, 6): translation x, y, z [m] and rotation
+    # vector x, y, z [rad].
     value: Array
+    # Its first and second derivatives, of the same shape [per s, per s²].
     first: Array
     second: Array
 
@@ -65,29 +59,18 @@ class TimeDerivatives(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HandMotion:
-    """Translation and rotation vector of a hand over time, from rest to rest.
-
-    Attributes
-    ----------
-    duration_s : float
-        Duration of the motion [s].
-    active_s, rise_s : float
-        Durations of the window, and of its rise and fall [s].
-    amplitude : (6, k) array
-        Amplitudes of the k waves of x, y, z [m] and of the rotation vector's x, y, z [rad].
-    first_hz, last_hz : (6, k) array
-        Frequencies at the beginning and at the end of the window.
-    phase_rad : (6, k) array
-        Phases.
-    """
+    """Translation and rotation vector of a hand over time, from rest to rest."""
 
     duration_s: float
+    # Durations of the window, and of its rise and fall [s].
     active_s: float
     rise_s: float
+    # (6, k): amplitudes of the k waves of x, y, z [m] and of the rotation vector's x, y, z [rad].
     amplitude: Array
+    # (6, k): frequencies at the beginning and at the end of the window.
     first_hz: Array
     last_hz: Array
-    phase_rad: Array
+    phase_rad: Array  # (6, k): phases
 
     @classmethod
     def from_coefficients(

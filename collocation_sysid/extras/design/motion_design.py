@@ -80,65 +80,38 @@ USUAL = DesignOptions()
 
 @dataclass(frozen=True, eq=False)
 class ErrorBars:
-    """Predicted relative standard errors (error bars), by name of the parameter or modulus.
+    """Predicted relative standard errors (error bars), by name of the parameter or modulus."""
 
-    Attributes
-    ----------
-    values : mapping of str to float
-        Parameters and moduli at the middle of the prior.
-    relative : mapping of str to float
-        Their standard errors, divided by these values.
-    lowest, highest : mapping of str to float
-        Smallest and largest relative errors over the draws of θ.
-    """
-
+    # mapping of str to float: parameters and moduli at the middle of the prior.
     values: Mapping[str, float]
+    # mapping of str to float: their standard errors, divided by these values.
     relative: Mapping[str, float]
+    # mapping of str to float: smallest and largest relative errors over the draws of θ.
     lowest: Mapping[str, float]
     highest: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Designed motion with its predicted uncertainty.
+    """Designed motion with its predicted uncertainty."""
 
-    Attributes
-    ----------
-    recording : FutureRecording
-        Recording to be made.
-    experiment : Experiment
-        Experiment to be recorded, with simulated markers, without noise, instead of measured ones.
-    predicted : Trajectory
-        Simulation at the middle of the prior.
-    criterion : DesignCriterion
-        Criterion that was minimised.
-    before : ErrorBars or None
-        Error bars of the existing recordings, if they are used, else of the problem's own motion;
-        None if that could not be simulated.
-    after : ErrorBars
-        Error bars with the new recording, and with the existing ones if they are used.
-    added : bool
-        Whether the existing recordings are used.
-    limits : Limits
-        Limits of the robot.
-    shares : mapping of str to float
-        Largest value over the limit, by name of the limit.
-    draws : int
-        Number of draws of θ.
-    """
-
-    recording: FutureRecording
+    recording: FutureRecording  # recording to be made
     motion: HandMotion
+    # Experiment to be recorded, with simulated markers, without noise, instead of measured ones.
     experiment: Experiment
-    predicted: Trajectory
-    criterion: DesignCriterion
+    predicted: Trajectory  # simulation at the middle of the prior
+    criterion: DesignCriterion  # criterion that was minimised
+    # Error bars of the existing recordings, if they are used, else of the problem's own motion;
+    # None if that could not be simulated.
     before: ErrorBars | None
+    # Error bars with the new recording, and with the existing ones if they are used.
     after: ErrorBars
-    added: bool
-    limits: Limits
+    added: bool  # whether the existing recordings are used
+    limits: Limits  # limits of the robot
+    # mapping of str to float: largest value over the limit, by name of the limit.
     shares: Mapping[str, float]
     best: SearchResult
-    draws: int
+    draws: int  # number of draws of θ
 
     @property
     def poses(self) -> PoseSequence:
@@ -162,26 +135,13 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class MotionObjective:
-    """Objective of the search: size of the error bars of a motion.
+    """Objective of the search: size of the error bars of a motion."""
 
-    Attributes
-    ----------
-    recording : FutureRecording
-        Recording to be designed.
-    limits : Limits
-        Limits of the robot.
-    criterion : DesignCriterion
-        Criterion to minimise.
-    draws : list of (nq,) array
-        Draws of q, the middle of the prior first.
-    known_information : (nq, nq) array
-        Information of the existing recordings, without priors; zero if they are not used.
-    """
-
-    recording: FutureRecording
-    limits: Limits
-    criterion: DesignCriterion
-    draws: list[Array]
+    recording: FutureRecording  # recording to be designed
+    limits: Limits  # limits of the robot
+    criterion: DesignCriterion  # criterion to minimise
+    draws: list[Array]  # list of (nq,): draws of q, the middle of the prior first
+    # (nq, nq): information of the existing recordings, without priors; zero if they are not used.
     known_information: Array
 
     @cached_property

@@ -56,26 +56,19 @@ Over = Literal["mean", "worst"]
 class DesignCriterion:
     """Criterion that a design minimises.
 
-    Attributes
-    ----------
-    kind : {"worst", "A", "D"}
-        The largest error bar, their root mean square, or the size of their joint ellipsoid: the
-        geometric mean of its half axes.
-    names : tuple of str
-        Parameters and derived moduli that count; every estimated parameter if empty. For one
-        alone all kinds are the same.
-    over : {"mean", "worst"}
-        Over draws of θ: the geometric mean, or the largest.
-
     Raises
     ------
     InputError
         For another kind, or another value of `over`.
     """
 
+    # The largest error bar, their root mean square, or the size of their joint ellipsoid: the
+    # geometric mean of its half axes.
     kind: Kind = "worst"
+    # Parameters and derived moduli that count; every estimated parameter if empty. For one alone
+    # all kinds are the same.
     names: tuple[str, ...] = ()
-    over: Over = "mean"
+    over: Over = "mean"  # over draws of θ: the geometric mean, or the largest
 
     def __post_init__(self) -> None:
         require_among(self.kind, get_args(Kind), where="--criterion")
@@ -132,24 +125,14 @@ class DesignCriterion:
 
 @dataclass(frozen=True, eq=False)
 class PredictedErrors:
-    """Relative error bars at one θ, to first order.
+    """Relative error bars at one θ, to first order."""
 
-    Attributes
-    ----------
-    covariance : (nq, nq) array
-        Covariance of q.
-    values : dict of str to float
-        Estimated parameters, followed by derived moduli, by name.
-    slopes : dict of str to (nq,) array
-        Derivatives of each with respect to q, divided by its value.
-    estimated_count : int
-        Number of estimated parameters, the first of the names.
-    """
-
-    covariance: Array
+    covariance: Array  # (nq, nq): covariance of q
+    # dict of str to float: estimated parameters, followed by derived moduli, by name.
     values: dict[str, float]
+    # dict of str to (nq,): derivatives of each with respect to q, divided by its value.
     slopes: dict[str, Array]
-    estimated_count: int
+    estimated_count: int  # number of estimated parameters, the first of the names
 
     @classmethod
     def from_information(
@@ -298,15 +281,6 @@ def shared_information(fit: LinearisedFit) -> Array:
 class FutureRecording:
     """Recording to be designed: everything except the motion.
 
-    Attributes
-    ----------
-    problem : Problem
-        Problem with scheme and parameters.
-    template : Experiment
-        Experiment with the same body, grasp, markers, loads and nuisance parameters.
-    duration_s : float
-        Stated duration [s]; the recording lasts the nearest whole number of timesteps.
-
     Raises
     ------
     InputError
@@ -314,8 +288,10 @@ class FutureRecording:
         that holds all axes throughout, or would have too few or too many samples.
     """
 
-    problem: Problem
+    problem: Problem  # problem with scheme and parameters
+    # Experiment with the same body, grasp, markers, loads and nuisance parameters.
     template: Experiment
+    # Stated duration [s]; the recording lasts the nearest whole number of timesteps.
     duration_s: float
     _starts: dict[bytes, Array] = field(default_factory=dict, init=False, repr=False)
 
@@ -525,25 +501,14 @@ CENTRE = 2
 
 @dataclass(frozen=True, eq=False)
 class LinearRecording:
-    """Response of a recording to a pulse of each coordinate, at one q.
+    """Response of a recording to a pulse of each coordinate, at one q."""
 
-    Attributes
-    ----------
-    recording : FutureRecording
-        Recording to be designed.
-    rest : LinearisedFit
-        Linearised fit without any motion.
-    responses : (6, frequencies, 3M, p) array
-        Fourier transforms of the change of the slopes, for a pulse of height one: 3M marker
-        coordinates, p parameters (shared and nuisance).
-    length : int
-        Length of the transforms, at least twice the number of samples.
-    """
-
-    recording: FutureRecording
-    rest: LinearisedFit
+    recording: FutureRecording  # recording to be designed
+    rest: LinearisedFit  # linearised fit without any motion
+    # (6, frequencies, 3M, p): fourier transforms of the change of the slopes, for a pulse of height
+    # one: 3M marker coordinates, p parameters (shared and nuisance).
     responses: Array
-    length: int
+    length: int  # length of the transforms, at least twice the number of samples
 
     @staticmethod
     def gigabytes(recording: FutureRecording) -> float:

@@ -22,24 +22,13 @@ from ...result.run_writers import require_no_link
 
 @dataclass(frozen=True)
 class ExportDestination:
-    """Format and place of an export.
+    """Format and place of an export."""
 
-    Attributes
-    ----------
-    format_name : str
-        Name of the format, such as "mujoco".
-    folder : Path
-        Folder of the files.
-    main_file : Path
-        File that the simulator or viewer opens.
-    is_folder : bool
-        Whether the export is the whole folder, which is replaced completely. Otherwise its files
-        are put into the folder beside other files, and their names begin with that of `main_file`.
-    """
-
-    format_name: str
-    folder: Path
-    main_file: Path
+    format_name: str  # name of the format, such as "mujoco"
+    folder: Path  # folder of the files
+    main_file: Path  # file that the simulator or viewer opens
+    # Whether the export is the whole folder, which is replaced completely. Otherwise its files are
+    # put into the folder beside other files, and their names begin with that of `main_file`.
     is_folder: bool
 
     def require_possible(self) -> None:

@@ -41,41 +41,24 @@ MOTION = (
 
 @dataclass(frozen=True)
 class ExportedFiles:
-    """Files of an export.
+    """Files of an export."""
 
-    Attributes
-    ----------
-    files : mapping of file name to text
-        Content of each file; `write_export` adds ``identified.json`` and the poses.
-    limitations : tuple of str
-        What the target cannot express, and what was done instead.
-    """
-
+    # mapping of file name to text: content of each file; `write_export` adds ``identified.json``
+    # and the poses.
     files: Mapping[str, str]
-    limitations: tuple[str, ...]
+    limitations: tuple[str, ...]  # what the target cannot express, and what was done instead
 
 
 @dataclass(frozen=True)
 class PredictionComparison:
-    """One quantity as predicted by the target and by this package.
+    """One quantity as predicted by the target and by this package."""
 
-    Attributes
-    ----------
-    what : str
-        Name of the quantity.
-    theirs, ours : float
-        Prediction of the target, and of this package, in `unit`.
-    unit : str
-        Unit of both.
-    remark : str
-        Further sentence; empty if there is none.
-    """
-
-    what: str
+    what: str  # name of the quantity
+    # Prediction of the target, and of this package, in `unit`.
     theirs: float
     ours: float
-    unit: str
-    remark: str = ""
+    unit: str  # unit of both
+    remark: str = ""  # further sentence; empty if there is none
 
     def compute_relative_difference(self) -> float:
         """Return the relative difference (theirs − ours) / ours; NaN if ours is zero."""
@@ -84,24 +67,13 @@ class PredictionComparison:
 
 @dataclass(frozen=True)
 class ExportTarget:
-    """Simulator to which a body can be exported.
+    """Simulator to which a body can be exported."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the simulator as it writes it itself.
-    main_file : str
-        Name of the file that the simulator opens; its suffix is that of the format.
-    export : callable
-        Returns the files for a body.
-    verify : callable, optional
-        Runs the files of a folder in the simulator, and compares predictions; None if it cannot be
-        run from here.
-    """
-
-    name: str
-    main_file: str
-    export: Callable[[IdentifiedBody], ExportedFiles]
+    name: str  # name of the simulator as it writes it itself
+    main_file: str  # name of the file that the simulator opens; its suffix is that of the format
+    export: Callable[[IdentifiedBody], ExportedFiles]  # returns the files for a body
+    # Runs the files of a folder in the simulator, and compares predictions; None if it cannot be
+    # run from here.
     verify: Callable[[IdentifiedBody, Path], Sequence[PredictionComparison]] | None = None
 
 

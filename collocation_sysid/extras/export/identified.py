@@ -35,39 +35,24 @@ from ...runs.warm_start import WarmStart
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedRegion:
-    """Part of the body with its constants.
+    """Part of the body with its constants."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the region; "body" for elements outside all regions.
-    cells : (k,)
-        Indices of its elements.
-    constants : mapping of name to value
-        Constants of the material.
-    lambda_pa, mu_pa, young_pa, poisson : float
-        Elastic constants at rest and small strain, of the long-term energy.
-    damping : str
-        Name of the damping law.
-    gamma_r_s, gamma_m_1_s : float
-        Stiffness-proportional and mass-proportional damping, see the glossary.
-    branches : tuple of mapping
-        "name", "share" (stiffness over the long-term stiffness) and "tau_s" (relaxation time) of
-        each viscoelastic branch; empty without memory.
-    """
-
-    name: str
-    cells: Index
+    name: str  # name of the region; "body" for elements outside all regions
+    cells: Index  # (k,): indices of its elements
     material: str
-    constants: Mapping[str, float]
+    constants: Mapping[str, float]  # mapping of name to value: constants of the material
+    # Elastic constants at rest and small strain, of the long-term energy.
     lambda_pa: float
     mu_pa: float
     young_pa: float
     poisson: float
     density_kg_m3: float
-    damping: str
+    damping: str  # name of the damping law
+    # Stiffness-proportional and mass-proportional damping, see the glossary.
     gamma_r_s: float
     gamma_m_1_s: float
+    # "name", "share" (stiffness over the long-term stiffness) and "tau_s" (relaxation time) of each
+    # viscoelastic branch; empty without memory.
     branches: tuple[Mapping[str, Any], ...]
 
     @property

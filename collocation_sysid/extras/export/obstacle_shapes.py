@@ -25,24 +25,14 @@ PLANE_SIZE_RATIO = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """Plane, sphere, box, cylinder or capsule in the frame of its obstacle.
+    """Plane, sphere, box, cylinder or capsule in the frame of its obstacle."""
 
-    Attributes
-    ----------
-    kind : str
-        "plane", "sphere", "box", "cylinder" or "capsule".
-    size_m : (k,)
-        Radius, then half the length between the ends; half of each side for a box; empty for a
-        plane.
-    centre_m : (3,)
-        Centre; for a plane a point on it.
-    rotation : Rotation
-        Rotation of the z axis to the axis of the shape, or to the normal of a plane.
-    """
-
-    kind: str
+    kind: str  # "plane", "sphere", "box", "cylinder" or "capsule"
+    # (k,): radius, then half the length between the ends; half of each side for a box; empty for a
+    # plane.
     size_m: Array
-    centre_m: Array
+    centre_m: Array  # (3,): centre; for a plane a point on it
+    # Rotation of the z axis to the axis of the shape, or to the normal of a plane.
     rotation: Rotation
 
     @classmethod
@@ -118,18 +108,10 @@ def offset_solid(solid: Solid, distance_m: float) -> Solid:
 
 @dataclass(frozen=True, eq=False)
 class Facets:
-    """Surface of a solid as flat facets, with a point behind all of them.
+    """Surface of a solid as flat facets, with a point behind all of them."""
 
-    Attributes
-    ----------
-    points_m : (p, 3)
-        Corners, and as the last point the one behind all facets.
-    triangles : (f, 3)
-        Point indices, counter-clockwise as seen from outside.
-    """
-
-    points_m: Array
-    triangles: Index
+    points_m: Array  # (p, 3): corners, and as the last point the one behind all facets
+    triangles: Index  # (f, 3): point indices, counter-clockwise as seen from outside
 
     @classmethod
     def from_solid(cls, solid: Solid, centre_m: Array, size_m: float, tolerance_m: float) -> Facets:
@@ -241,35 +223,19 @@ class FacetedObstacle:
 
     To match the pressure law of this package inside the obstacle, the surface is half of its width
     δ further out, and twice as stiff.
-
-    Attributes
-    ----------
-    obstacle : Obstacle
-        Obstacle whose friction coefficient is a number.
-    facets : Facets
-        Facets in the obstacle's frame.
-    start_points_m : (p, 3)
-        Points of the facets at the place without contact, in the world.
-    first_node, first_cell : int
-        Numbers of nodes and cells of the body and of earlier walls, which precede those of this
-        wall.
-    stiffness_pa_m, node_stiffness_n_m : float
-        Contact stiffness per area, and for each node.
-    width_m : float
-        Width δ of the pressure law.
-    faces : (k,)
-        Indices of the boundary triangles that may touch the obstacle.
     """
 
-    obstacle: Obstacle
-    facets: Facets
-    start_points_m: Array
+    obstacle: Obstacle  # obstacle whose friction coefficient is a number
+    facets: Facets  # facets in the obstacle's frame
+    start_points_m: Array  # (p, 3): points of the facets at the place without contact, in the world
+    # Numbers of nodes and cells of the body and of earlier walls, which precede those of this wall.
     first_node: int
     first_cell: int
+    # Contact stiffness per area, and for each node.
     stiffness_pa_m: float
     node_stiffness_n_m: float
-    width_m: float
-    faces: Index
+    width_m: float  # width δ of the pressure law
+    faces: Index  # (k,): indices of the boundary triangles that may touch the obstacle
 
     def points_at_m(self, t_s: float) -> Array:
         """Return the points of the facets (p, 3) [m] in the world at a time [s], moved with the

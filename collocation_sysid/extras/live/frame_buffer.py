@@ -39,22 +39,14 @@ LARGEST_GAP = 10
 
 @dataclass(frozen=True, eq=False)
 class BufferedFrame:
-    """Result of adding a frame to the buffer.
+    """Result of adding a frame to the buffer."""
 
-    Attributes
-    ----------
-    rows : list of LoggedRow
-        Rows that the frame completes, in order of time, with the samples to evaluate after each.
-    late_samples : list of Sample
-        Samples to evaluate after the last earlier row; empty if the frame completes rows, which
-        then contain them.
-    notes : list of str
-        Irregularities of the frame, as sentences for the user.
-    """
-
+    # Rows that the frame completes, in order of time, with the samples to evaluate after each.
     rows: list[LoggedRow]
+    # Samples to evaluate after the last earlier row; empty if the frame completes rows, which then
+    # contain them.
     late_samples: list[Sample]
-    notes: list[str]
+    notes: list[str]  # irregularities of the frame, as sentences for the user
 
 
 @dataclass(eq=False)
@@ -63,18 +55,6 @@ class FrameBuffer:
 
     Attributes
     ----------
-    interval_s : float
-        Time between samples.
-    substeps : int
-        Time steps between samples.
-    neighbouring_samples : int
-        Number of samples before and after one that its evaluation needs.
-    largest_jump_m : float
-        Largest distance that a grasp can move between two samples.
-    instruments : sequence of StreamStencil
-        Rows that a sample of each instrument needs.
-    counts : Counter
-        Numbers of irregularities of frames, by kind; changed in place.
     start_s : float or None
         Time of the first frame with a pose, at which the grid begins; None before it.
     rows : int
@@ -83,11 +63,12 @@ class FrameBuffer:
         Largest time of a frame; −∞ before the first.
     """
 
-    interval_s: float
-    substeps: int
-    neighbouring_samples: int
-    largest_jump_m: float = np.inf
-    instruments: Sequence[StreamStencil] = ()
+    interval_s: float  # time between samples
+    substeps: int  # time steps between samples
+    neighbouring_samples: int  # number of samples before and after one that its evaluation needs
+    largest_jump_m: float = np.inf  # largest distance that a grasp can move between two samples
+    instruments: Sequence[StreamStencil] = ()  # rows that a sample of each instrument needs
+    # Numbers of irregularities of frames, by kind; changed in place.
     counts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:

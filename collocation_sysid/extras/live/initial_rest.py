@@ -34,19 +34,11 @@ LARGEST_MARKER_DEVIATIONS = 3.0
 
 @dataclass(eq=False)
 class InitialRest:
-    """Frames since the start of a stream while no grasp moves.
-
-    Attributes
-    ----------
-    sigma_m : (M,) array
-        Noise of the markers [m].
-    is_over : bool
-        Whether a grasp has moved.
-    """
+    """Frames since the start of a stream while no grasp moves."""
 
     body_size_m: float
-    sigma_m: Array
-    is_over: bool = False
+    sigma_m: Array  # (M,): noise of the markers [m]
+    is_over: bool = False  # whether a grasp has moved
     _largest_rest_m: float = 0.0
     _first: list[Frame] = field(default_factory=list)
     _recent: deque[Frame] = field(default_factory=lambda: deque(maxlen=REPLAYED_FRAMES))

@@ -32,18 +32,10 @@ FEWEST_SAMPLES = 10
 
 @dataclass(frozen=True)
 class ResidualScatter:
-    """Size and autocorrelation of residuals.
+    """Size and autocorrelation of residuals."""
 
-    Attributes
-    ----------
-    rms : float
-        Root mean square in standard deviations.
-    lag1 : float
-        Autocorrelation between consecutive samples; zero if it is not significant.
-    """
-
-    rms: float = 0.0
-    lag1: float = 0.0
+    rms: float = 0.0  # root mean square in standard deviations
+    lag1: float = 0.0  # autocorrelation between consecutive samples; zero if it is not significant
 
     @classmethod
     def from_residuals(cls, residuals: Sequence[Array]) -> ResidualScatter:

@@ -17,28 +17,16 @@ REMAINDER_DECAY = 0.97
 
 @dataclass
 class TimeBudget:
-    """Computing times of time steps that are computed together [s].
+    """Computing times of time steps that are computed together [s]."""
 
-    Attributes
-    ----------
-    first_s, more_s : float
-        Time of the first one, and of each further one; zero if not known yet.
-    delay : float
-        Largest recent ratio of measured to expected time.
-    turn_s : float
-        Time to change the linearisation point of a pass.
-    frame_s : float
-        Time of the last frame without repeated time steps; set by the user of this class.
-    after_s : float
-        Time of the work that follows the time steps of a frame.
-    """
-
+    # Time of the first one, and of each further one; zero if not known yet.
     first_s: float = 0.0
     more_s: float = 0.0
-    delay: float = 1.0
-    turn_s: float = 0.0
+    delay: float = 1.0  # largest recent ratio of measured to expected time
+    turn_s: float = 0.0  # time to change the linearisation point of a pass
+    # Time of the last frame without repeated time steps; set by the user of this class.
     frame_s: float = 0.0
-    after_s: float = 0.0
+    after_s: float = 0.0  # time of the work that follows the time steps of a frame
 
     @classmethod
     def from_times(cls, one_s: float, many_s: float, many: int) -> TimeBudget:

@@ -37,23 +37,12 @@ LARGEST_LAG = 20
 
 @dataclass(eq=False)
 class WindowBlock:
-    """Some consecutive rows of a window.
+    """Some consecutive rows of a window."""
 
-    Attributes
-    ----------
-    start : SweepState or None
-        State before the first row; None at the start of the recording.
-    linearisation_point : (P,)
-        Linearisation point of that state.
-    stored_rows : list of StoredRow
-        Rows for later passes.
-    residuals : list of LinearisedResidual
-        Linearised residuals of the samples.
-    """
-
-    start: SweepState | None
-    linearisation_point: Array
-    stored_rows: list[StoredRow] = field(default_factory=list)
+    start: SweepState | None  # state before the first row; None at the start of the recording
+    linearisation_point: Array  # (P,): linearisation point of that state
+    stored_rows: list[StoredRow] = field(default_factory=list)  # rows for later passes
+    # Linearised residuals of the samples.
     residuals: list[LinearisedResidual] = field(default_factory=list)
 
 
@@ -322,20 +311,12 @@ class CombinedPasses(NamedTuple):
     """Joint information of two passes over the same frames.
 
     Each sample counts as linearised last.
-
-    Attributes
-    ----------
-    information : SquareRootInformation
-        Information in transformed parameters, including the priors.
-    residuals : list of LinearisedResidual
-        Linearised residuals of all samples.
-    points : list of (P,)
-        Transformed parameters at which they are linearised.
     """
 
+    # Information in transformed parameters, including the priors.
     information: SquareRootInformation
-    residuals: list[LinearisedResidual]
-    points: list[Array]
+    residuals: list[LinearisedResidual]  # linearised residuals of all samples
+    points: list[Array]  # list of (P,): transformed parameters at which they are linearised
 
     @classmethod
     def from_passes(cls, first_pass: WindowPass, second_pass: WindowPass | None) -> CombinedPasses:

@@ -23,26 +23,13 @@ class BodyLimits:
 
     The first values belong to the elements, with the largest principal stretch of the mean
     deformation gradient, the others to the points of the surface that an obstacle may touch.
-
-    Attributes
-    ----------
-    experiment : Experiment
-        Experiment of the plan.
-    theta : (k,) array
-        Constants of the body.
-    sample_rows : (T,) array of int
-        Grid times of the samples.
-    largest_stretch : float or None
-        Largest principal stretch.
-    clearance_m : float or None
-        Smallest distance to obstacles [m].
     """
 
-    experiment: Experiment
-    theta: Array
-    sample_rows: Index
-    largest_stretch: float | None
-    clearance_m: float | None
+    experiment: Experiment  # experiment of the plan
+    theta: Array  # (k,): constants of the body
+    sample_rows: Index  # (T,) of int: grid times of the samples
+    largest_stretch: float | None  # largest principal stretch
+    clearance_m: float | None  # smallest distance to obstacles [m]
 
     @cached_property
     def names(self) -> tuple[str, ...]:

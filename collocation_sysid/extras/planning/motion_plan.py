@@ -50,59 +50,33 @@ FINER = 4
 
 @dataclass(frozen=True)
 class TrackingError:
-    """Deviation of a point from its reference, over the times and coordinates that count.
+    """Deviation of a point from its reference, over the times and coordinates that count."""
 
-    Attributes
-    ----------
-    rms_m, largest_m : float
-        Root mean square and largest distance from the reference [m]; NaN if only velocities count.
-    band_m : float or None
-        Largest half width of the 95 % band of a coordinate [m], see `MotionPlan.half_widths_m`; None
-        if that is not known.
-    expected_rms_m : float or None
-        Root mean square distance that is expected with this uncertainty [m].
-    """
-
+    # Root mean square and largest distance from the reference [m]; NaN if only velocities count.
     rms_m: float
     largest_m: float
+    # Largest half width of the 95 % band of a coordinate [m], see `MotionPlan.half_widths_m`; None
+    # if that is not known.
     band_m: float | None
+    # Root mean square distance that is expected with this uncertainty [m].
     expected_rms_m: float | None
 
 
 class BandContribution(NamedTuple):
-    """Contribution to the band of a plan.
+    """Contribution to the band of a plan."""
 
-    Attributes
-    ----------
-    constant : str or None
-        Name of the constant; None for errors of the description.
-    source : str
-        Source of its uncertainty in the budget of the run.
-    share : float
-        Share of the variance of the tracked coordinates.
-    """
-
-    constant: str | None
-    source: str
-    share: float
+    constant: str | None  # name of the constant; None for errors of the description
+    source: str  # source of its uncertainty in the budget of the run
+    share: float  # share of the variance of the tracked coordinates
 
 
 class BindingLimit(NamedTuple):
-    """Limit of the hand that a plan reaches.
-
-    Attributes
-    ----------
-    name : str
-        Name of the limit.
-    spans_s : tuple of (from, until)
-        Times at which it binds [s].
-    gain_per_percent : float
-        Share of the objective by which the plan would improve, to first order, if the limit were
-        wider by one percent.
-    """
+    """Limit of the hand that a plan reaches."""
 
     name: str
-    spans_s: tuple[tuple[float, float], ...]
+    spans_s: tuple[tuple[float, float], ...]  # tuple of (from, until): times at which it binds [s]
+    # Share of the objective by which the plan would improve, to first order, if the limit were
+    # wider by one percent.
     gain_per_percent: float
 
 

@@ -25,45 +25,26 @@ from .signals import Commands, commanded
 
 @dataclass(frozen=True, eq=False)
 class PlannedBody:
-    """Body with its parameters, and the recording whose grasp, loads and surroundings a plan keeps.
+    """Body with its parameters, and the recording whose grasp, loads and surroundings a plan keeps."""
 
-    Attributes
-    ----------
-    problem : Problem
-        Problem with scheme and parameters, whose guesses are the values of the plan.
-    template : Experiment
-        Recording with grasps and gravity as identified.
-    q : (nq,) array
-        Parameters in the solver's coordinates.
-    covariance : (nq, nq) array or None
-        Combined covariance of q; None if it is not known.
-    statistical_covariance : (nq, nq) array or None
-        Its part due to noise, which further recordings reduce.
-    marker_places_m : dict of name to (3,) array
-        Places of the markers on the undeformed body [m]; NaN where a place is not known.
-    description_std_m : float
-        Standard deviation of a coordinate of a point by errors of the description [m]: by how much
-        the residuals of the markers in the fit exceed their noise.
-    budget : mapping of name to mapping of source to float
-        Shares of the sources in the variance of each constant; empty if they are not known.
-    warnings : tuple of str
-        Reasons not to rely on the constants without care.
-    run : Path or None
-        Run folder; None for a problem or a run in memory.
-    home : Path or None
-        Folder to which names of files in the problem are relative; None for a problem of Python.
-    """
-
-    problem: Problem
-    template: Experiment
-    q: Array
-    covariance: Array | None
+    problem: Problem  # problem with scheme and parameters, whose guesses are the values of the plan
+    template: Experiment  # recording with grasps and gravity as identified
+    q: Array  # (nq,): parameters in the solver's coordinates
+    covariance: Array | None  # (nq, nq) or None: combined covariance of q; None if it is not known
+    # (nq, nq) or None: its part due to noise, which further recordings reduce.
     statistical_covariance: Array | None
+    # dict of name to (3,): places of the markers on the undeformed body [m]; NaN where a place is
+    # not known.
     marker_places_m: dict[str, Array]
+    # Standard deviation of a coordinate of a point by errors of the description [m]: by how much
+    # the residuals of the markers in the fit exceed their noise.
     description_std_m: float = 0.0
+    # mapping of name to mapping of source to float: shares of the sources in the variance of each
+    # constant; empty if they are not known.
     budget: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    run: Path | None = None
+    warnings: tuple[str, ...] = ()  # reasons not to rely on the constants without care
+    run: Path | None = None  # run folder; None for a problem or a run in memory
+    # Folder to which names of files in the problem are relative; None for a problem of Python.
     home: Path | None = None
 
     def __post_init__(self) -> None:

@@ -57,60 +57,30 @@ POSES_PER_SAMPLE = 4
 
 @dataclass(frozen=True, eq=False)
 class ResidualRows:
-    """Residuals S x − b of one kind, in units of their deviations.
+    """Residuals S x − b of one kind, in units of their deviations."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the point, or "rest".
-    matrix : (m, N · 3n) sparse array
-        S, by the flattened positions [1/m].
-    target : (m,) array
-        b.
-    """
-
-    name: str
-    matrix: sp.csr_array
-    target: Array
+    name: str  # name of the point, or "rest"
+    matrix: sp.csr_array  # (m, N · 3n) sparse: S, by the flattened positions [1/m]
+    target: Array  # (m,): b
 
 
 class LinearisedLimits(NamedTuple):
-    """Limits of a hand near some unknowns, to first order; linear limits are exact.
+    """Limits of a hand near some unknowns, to first order; linear limits are exact."""
 
-    Attributes
-    ----------
-    vectors : (k, 3) array
-        Vectors whose norms must not exceed one.
-    vector_slopes : (k, 3, c) array
-        Their derivatives by the unknowns.
-    rows : (m,) array
-        Values that must not be positive.
-    row_slopes : (m, c) array
-        Their derivatives.
-    """
-
-    vectors: Array
-    vector_slopes: Array
-    rows: Array
-    row_slopes: Array
+    vectors: Array  # (k, 3): vectors whose norms must not exceed one
+    vector_slopes: Array  # (k, 3, c): their derivatives by the unknowns
+    rows: Array  # (m,): values that must not be positive
+    row_slopes: Array  # (m, c): their derivatives
 
 
 @dataclass(frozen=True, eq=False)
 class LimitsOverTime:
-    """Limits of a hand and of signals at all times at which they hold, as functions of the unknowns.
+    """Limits of a hand and of signals at all times at which they hold, as functions of the unknowns."""
 
-    Attributes
-    ----------
-    at_time : HandLimits
-        Limits at one time.
-    t_s : (T,) array
-        Times since the start [s].
-    matrix, constant : (T, 3k, c) and (T, 3k) arrays
-        The k coordinates and their two derivatives as an affine function of the unknowns.
-    """
-
-    at_time: HandLimits
-    t_s: Array
+    at_time: HandLimits  # limits at one time
+    t_s: Array  # (T,): times since the start [s]
+    # (T, 3k, c) and (T, 3k): the k coordinates and their two derivatives as an affine function of
+    # the unknowns.
     matrix: Array
     constant: Array
 
@@ -167,41 +137,20 @@ class LimitsOverTime:
 
 @dataclass(frozen=True, eq=False)
 class PlannedProgram:
-    """Optimal-control problem of a task for a body.
-
-    Attributes
-    ----------
-    limits : Limits
-        Limits of the robot.
-    experiment : Experiment
-        Experiment of the plan, with the hand standing at its initial pose.
-    driven : DrivenMotion
-        Motion of the body as a function of the hand's.
-    space : SplineSpace
-        Motions of the hand, and signals.
-    start : (3n,) array
-        Equilibrium before the motion [m].
-    references : list of Reference
-        References at the samples.
-    lowest_hz : float
-        Lowest natural frequency of the body about the equilibrium; NaN if there is none.
-    signals : tuple of Signal
-        Tensions and pressures that the plan chooses.
-    pose_limits : callable or None
-        Limits of the joints, see `HandLimits`.
-    """
+    """Optimal-control problem of a task for a body."""
 
     body: PlannedBody
     task: Task
-    limits: Limits
-    experiment: Experiment
-    driven: DrivenMotion
-    space: SplineSpace
-    start: Array
-    references: list[Reference]
+    limits: Limits  # limits of the robot
+    experiment: Experiment  # experiment of the plan, with the hand standing at its initial pose
+    driven: DrivenMotion  # motion of the body as a function of the hand's
+    space: SplineSpace  # motions of the hand, and signals
+    start: Array  # (3n,): equilibrium before the motion [m]
+    references: list[Reference]  # references at the samples
+    # Lowest natural frequency of the body about the equilibrium; NaN if there is none.
     lowest_hz: float
-    signals: tuple[Signal, ...]
-    pose_limits: PoseLimit | None = None
+    signals: tuple[Signal, ...]  # tensions and pressures that the plan chooses
+    pose_limits: PoseLimit | None = None  # limits of the joints, see `HandLimits`
 
     @classmethod
     def from_task(

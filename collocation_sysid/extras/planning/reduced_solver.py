@@ -39,56 +39,32 @@ Watch = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class ReducedTolerances:
-    """Tolerances of the search.
+    """Tolerances of the search."""
 
-    Attributes
-    ----------
-    step : float
-        Largest change of an unknown (in units of the workspace) at convergence. Two solvers agree
-        to 1e-6 if both steps end far below it.
-    decrease : float
-        Largest predicted decrease of the objective, relative to it, at convergence.
-    progress : float
-        Share of the objective by which three iterations together must improve it; 0 searches until
-        convergence. Motions that differ by redundant coordinates of the hand are nearly as good as
-        one another, and the search among them is slow.
-    iterations : int
-        Largest number of iterations.
-    failures : int
-        Largest number of steps in a row that are not better.
-    """
-
+    # Largest change of an unknown (in units of the workspace) at convergence. Two solvers agree to
+    # 1e-6 if both steps end far below it.
     step: float = 1e-9
+    # Largest predicted decrease of the objective, relative to it, at convergence.
     decrease: float = 1e-12
+    # Share of the objective by which three iterations together must improve it; 0 searches until
+    # convergence. Motions that differ by redundant coordinates of the hand are nearly as good as
+    # one another, and the search among them is slow.
     progress: float = 1e-2
-    iterations: int = 60
-    failures: int = 12
+    iterations: int = 60  # largest number of iterations
+    failures: int = 12  # largest number of steps in a row that are not better
 
 
 @dataclass(eq=False)
 class PlanAnswer:
-    """Result of the search.
+    """Result of the search."""
 
-    Attributes
-    ----------
-    c : (c,) array
-        Unknowns.
-    x : (N, 3n) array
-        Motion [m].
-    multipliers : (k,) array
-        Multipliers of the limits.
-    status : {"converged", "flat", "iteration limit", "interrupted", "stalled"}
-        How the search ended; "flat": three iterations did not improve the plan by
-        `ReducedTolerances.progress`.
-    history : list of float
-        Objective at each iterate.
-    """
-
-    c: Array
-    x: Array
-    multipliers: Array
+    c: Array  # (c,): unknowns
+    x: Array  # (N, 3n): motion [m]
+    multipliers: Array  # (k,): multipliers of the limits
+    # How the search ended; "flat": three iterations did not improve the plan by
+    # `ReducedTolerances.progress`.
     status: str
-    history: list[float] = field(default_factory=list)
+    history: list[float] = field(default_factory=list)  # objective at each iterate
 
 
 class HandLimitsExcludeTask(Exception):

@@ -28,30 +28,16 @@ SLACK = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """Tension or pressure that a plan chooses.
+    """Tension or pressure that a plan chooses."""
 
-    Attributes
-    ----------
-    section : TendonSection or PressureSection
-        What the task states.
-    number : int
-        Index of the actuator among those of the recording: tendons, then pressures.
-    slope, offset : float
-        The amplitude of the actuator's energy is slope · (value − offset).
-    lag_s : float
-        Time constant with which the value follows the command [s].
-    initial : float
-        Value before the motion [N, Pa].
-    lowest, highest : float
-        Limits of the command [N, Pa].
-    """
-
-    section: SignalSection
-    number: int
+    section: SignalSection  # what the task states
+    number: int  # index of the actuator among those of the recording: tendons, then pressures
+    # The amplitude of the actuator's energy is slope · (value − offset).
     slope: float
     offset: float
-    lag_s: float
-    initial: float
+    lag_s: float  # time constant with which the value follows the command [s]
+    initial: float  # value before the motion [N, Pa]
+    # Limits of the command [N, Pa].
     lowest: float
     highest: float
 

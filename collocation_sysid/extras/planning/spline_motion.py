@@ -49,27 +49,15 @@ class SplineSpace:
 
     The unknowns are scaled coefficients, those of the free coordinates, time by time: first the
     inner coefficients, and last the value at the end unless it is given.
-
-    Attributes
-    ----------
-    duration_s : float
-        Duration of the motion [s].
-    intervals : int
-        Number of intervals of the spline.
-    free : array of int
-        Indices of the coordinates that may move.
-    end : (k,) array
-        Given values at the end; NaN where the value is free. Coordinates that are not free have
-        zero.
-    units : (k,) array
-        Units of the coefficients.
     """
 
-    duration_s: float
-    intervals: int
-    free: Index
+    duration_s: float  # duration of the motion [s]
+    intervals: int  # number of intervals of the spline
+    free: Index  # indices of the coordinates that may move
+    # (k,): given values at the end; NaN where the value is free. Coordinates that are not free have
+    # zero.
     end: Array
-    units: Array
+    units: Array  # (k,): units of the coefficients
 
     @cached_property
     def knots_s(self) -> Array:
@@ -147,15 +135,11 @@ class SplineSpace:
 
 @dataclass(frozen=True, eq=False)
 class SplineMotion:
-    """Motion of a hand, or signals, over time.
-
-    Attributes
-    ----------
-    coefficients : (intervals + 3, k) array
-        Coefficients of shift [m] and rotation vector [rad], or of the signals [N, Pa].
-    """
+    """Motion of a hand, or signals, over time."""
 
     space: SplineSpace
+    # (intervals + 3, k): coefficients of shift [m] and rotation vector [rad], or of the signals [N,
+    # Pa].
     coefficients: Array
 
     @property
@@ -180,21 +164,11 @@ class SplineMotion:
 
 @dataclass(frozen=True, eq=False)
 class HandFrame:
-    """Initial pose of a hand, and what it holds.
+    """Initial pose of a hand, and what it holds."""
 
-    Attributes
-    ----------
-    rotation : (3, 3) array
-        Initial orientation R₀ of the grasped body.
-    position_m : (3,) array
-        Initial position p₀ of the hand, the middle of the grasped nodes.
-    arms_m : (n, 3) array
-        Grasped nodes relative to the hand, in the initial orientation.
-    """
-
-    rotation: Array
-    position_m: Array
-    arms_m: Array
+    rotation: Array  # (3, 3): initial orientation R₀ of the grasped body
+    position_m: Array  # (3,): initial position p₀ of the hand, the middle of the grasped nodes
+    arms_m: Array  # (n, 3): grasped nodes relative to the hand, in the initial orientation
 
     def positions(self, coordinates: Array) -> tuple[Array, Array]:
         """Return the positions of the grasped nodes (T, n, 3) [m] at coordinates (T, 6), and their
@@ -302,23 +276,12 @@ def _joint_limits(function: PoseLimit, position_m: ca.SX, rotation: ca.SX) -> ca
 class HandLimits:
     """Limits of a hand and of signals at one time, of the k coordinates and their two derivatives
     (3 k,).
-
-    Attributes
-    ----------
-    vectors : casadi.Function
-        Vectors (3 k,) whose norms must not exceed one.
-    vector_names : tuple of str
-        Name of the limit of each vector.
-    rows : casadi.Function
-        Values (m,) that must not be positive.
-    row_names : tuple of str
-        Name of the limit of each value.
     """
 
-    vectors: ca.Function
+    vectors: ca.Function  # vectors (3 k,) whose norms must not exceed one
     vector_names: tuple[str, ...]
-    rows: ca.Function
-    row_names: tuple[str, ...]
+    rows: ca.Function  # values (m,) that must not be positive
+    row_names: tuple[str, ...]  # name of the limit of each value
 
     @classmethod
     def from_bounds(

@@ -28,27 +28,14 @@ MODULI = ("young_pa", "poisson")
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Parameter in whose value equally good laws disagree.
+    """Parameter in whose value equally good laws disagree."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the parameter.
-    values : mapping of str to float
-        Estimate by law, the chosen one first.
-    chosen_budget : BudgetLine or None
-        Budget with the chosen law alone; None if it is not known.
-    combined95 : tuple of two floats or None
-        Combined interval with the difference between laws; None if the budget is not known.
-    share : float
-        Share of the difference between laws in the variance.
-    """
-
-    name: str
-    values: Mapping[str, float]
-    chosen_budget: BudgetLine | None
+    name: str  # name of the parameter
+    values: Mapping[str, float]  # mapping of str to float: estimate by law, the chosen one first
+    chosen_budget: BudgetLine | None  # budget with the chosen law alone; None if it is not known
+    # Combined interval with the difference between laws; None if the budget is not known.
     combined95: tuple[float, float] | None
-    share: float
+    share: float  # share of the difference between laws in the variance
 
     def describe(self) -> str:
         """Return the one or two sentences for the user: the range of the parameter, and how the

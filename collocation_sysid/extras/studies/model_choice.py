@@ -451,27 +451,14 @@ def model_notes(rows: Sequence[Row]) -> list[str]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Data of a fit for Akaike's criterion.
+    """Data of a fit for Akaike's criterion."""
 
-    Attributes
-    ----------
-    misfit : float
-        Sum of the squared measurement residuals, in units of σ²; not less than rounding.
-    prior : float
-        Sum of the squared residuals of the priors.
-    fitted : float
-        Number of parameters that the data determine, nuisance parameters included.
-    measurements : int
-        Number of measurements.
-    independent : float
-        Equivalent number of independent measurements.
-    """
-
+    # Sum of the squared measurement residuals, in units of σ²; not less than rounding.
     misfit: float
-    prior: float
-    fitted: float
-    measurements: int
-    independent: float
+    prior: float  # sum of the squared residuals of the priors
+    fitted: float  # number of parameters that the data determine, nuisance parameters included
+    measurements: int  # number of measurements
+    independent: float  # equivalent number of independent measurements
 
     def criterion(self, independent: float) -> float:
         """Return Akaike's criterion N ln(misfit) + prior + 2 · fitted; smaller is better.

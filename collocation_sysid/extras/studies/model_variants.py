@@ -40,21 +40,11 @@ LESS = 0.1
 
 @dataclass(frozen=True)
 class ModelVariant:
-    """One model.
+    """One model."""
 
-    Attributes
-    ----------
-    label : str
-        Name of the model for the user.
-    overrides : tuple of str
-        Overrides "key=value" that derive it from the problem file.
-    path : Path
-        Problem file.
-    """
-
-    label: str
-    overrides: tuple[str, ...]
-    path: Path
+    label: str  # name of the model for the user
+    overrides: tuple[str, ...]  # overrides "key=value" that derive it from the problem file
+    path: Path  # problem file
 
 
 def parse_materials(text: str) -> tuple[str, ...]:

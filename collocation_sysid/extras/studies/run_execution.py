@@ -187,15 +187,9 @@ Record = dict[str, Any]
 
 @dataclass(frozen=True)
 class RunStore:
-    """Records in the folder ``runs/`` of a study.
+    """Records in the folder ``runs/`` of a study."""
 
-    Attributes
-    ----------
-    folder : Path
-        Folder of the records.
-    """
-
-    folder: Path
+    folder: Path  # folder of the records
 
     def save(self, record: Record) -> None:
         """Write the record of a run, atomically, to the file of its "key"; an earlier record is

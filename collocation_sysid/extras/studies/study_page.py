@@ -53,22 +53,12 @@ MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with a resul
 
 @dataclass(frozen=True, eq=False)
 class StudyReport:
-    """Results of a study, finished or not.
-
-    Attributes
-    ----------
-    kind : {METHOD_STUDY, MODEL_STUDY, SWEEP_STUDY}
-        Kind of study.
-    planned : tuple of PlannedRun
-        Runs of the study.
-    records : mapping of str to Record
-        Records of finished runs by key.
-    """
+    """Results of a study, finished or not."""
 
     title: str
     kind: str
     planned: tuple[PlannedRun, ...]
-    records: Mapping[str, Record]
+    records: Mapping[str, Record]  # mapping of str to Record: records of finished runs by key
     yardstick: SuccessCriterion
 
     def list_rows(self) -> list[Row]:

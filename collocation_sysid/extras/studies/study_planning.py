@@ -44,38 +44,24 @@ KEY_LENGTH = 20
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run of a study.
+    """One run of a study."""
 
-    Attributes
-    ----------
-    key : str
-        Hash of everything that determines the result: problem, data files, method, start, options,
-        version.
-    problem : str
-        Absolute path of the problem file.
-    start : int
-        Number of the start; 0 is the file's guess.
-    overrides : tuple of str
-        Overrides "key=value".
-    guess : mapping of str to float or None
-        Guesses of the estimated parameters; None where there is none.
-    varied_values : mapping of str to str
-        Values of the swept keys as text; for a comparison of models, "model" and its label.
-    allow_code : bool
-        Whether to run the Python files that the problem names.
-    test_name : str or None
-        For a comparison of models, the recording that is predicted; "" if all are fitted. None for
-        other studies.
-    """
-
+    # Hash of everything that determines the result: problem, data files, method, start, options,
+    # version.
     key: str
-    problem: str
+    problem: str  # absolute path of the problem file
     method: str
-    start: int = 0
-    overrides: tuple[str, ...] = ()
+    start: int = 0  # number of the start; 0 is the file's guess
+    overrides: tuple[str, ...] = ()  # overrides "key=value"
+    # mapping of str to float or None: guesses of the estimated parameters; None where there is
+    # none.
     guess: Mapping[str, float | None] = field(default_factory=dict)
+    # mapping of str to str: values of the swept keys as text; for a comparison of models, "model"
+    # and its label.
     varied_values: Mapping[str, str] = field(default_factory=dict)
-    allow_code: bool = False
+    allow_code: bool = False  # whether to run the Python files that the problem names
+    # For a comparison of models, the recording that is predicted; "" if all are fitted. None for
+    # other studies.
     test_name: str | None = None
 
     def make_label(self) -> str:

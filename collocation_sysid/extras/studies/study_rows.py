@@ -21,30 +21,15 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class NumberColumn:
-    """Number of a run, with its heading and format.
+    """Number of a run, with its heading and format."""
 
-    Attributes
-    ----------
-    head : str
-        Short heading in the terminal; empty if the column is not shown.
-    words : str
-        Heading on pages.
-    factor : float
-        Factor before display, for example 1000 for millimetres.
-    form : str
-        Format specification.
-    from_result : callable, optional
-        Function that returns the number from a result; None if it comes from elsewhere.
-    has_median : bool
-        Whether the summary of a method contains the median over its runs.
-    """
-
-    head: str = ""
-    words: str = ""
-    factor: float = 1.0
-    form: str = ".2g"
+    head: str = ""  # short heading in the terminal; empty if the column is not shown
+    words: str = ""  # heading on pages
+    factor: float = 1.0  # factor before display, for example 1000 for millimetres
+    form: str = ".2g"  # format specification
+    # Function that returns the number from a result; None if it comes from elsewhere.
     from_result: Callable[[Result], float | None] | None = None
-    has_median: bool = True
+    has_median: bool = True  # whether the summary of a method contains the median over its runs
 
     def format(self, value: float | None) -> str:
         """Return `value` times the factor as text in the format of the column; a dash "–" for None.

@@ -82,22 +82,12 @@ SIZE_RATIOS = (2.0, 0.5)
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPixels:
-    """Pixels of one depth image, and the camera that turns them into points.
+    """Pixels of one depth image, and the camera that turns them into points."""
 
-    Attributes
-    ----------
-    pixels : (P, 2) array
-        Columns u and rows v.
-    depth_m : (P,) array
-        Depth along the optical axis [m].
-    camera : DepthCamera
-    columns, rows : int
-        Size of the image.
-    """
-
-    pixels: Array
-    depth_m: Array
+    pixels: Array  # (P, 2): columns u and rows v
+    depth_m: Array  # (P,): depth along the optical axis [m]
     camera: DepthCamera
+    # Size of the image.
     columns: int
     rows: int
 
@@ -211,22 +201,14 @@ def equilibrium_shapes_m(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Best fit of one description of an image.
+    """Best fit of one description of an image."""
 
-    Attributes
-    ----------
-    distance_m : float
-        Root mean square distance of the visible surface from the points, each at most the gate.
-    turn_rad, shift_m : (3,) arrays
-        Estimated error of the camera's pose.
-    misfit : float
-        Root mean square of distance and pose error in standard deviations.
-    """
-
+    # Root mean square distance of the visible surface from the points, each at most the gate.
     distance_m: float
+    # (3,): estimated error of the camera's pose.
     turn_rad: Array
     shift_m: Array
-    misfit: float
+    misfit: float  # root mean square of distance and pose error in standard deviations
 
 
 class _ImageComparison:

@@ -59,21 +59,11 @@ COLLAPSED = 50
 
 @dataclass(frozen=True)
 class CameraDescription:
-    """Pose and units of a camera.
+    """Pose and units of a camera."""
 
-    Attributes
-    ----------
-    carrier : (4, 4) array
-        Motion of what carries the camera, to the world.
-    pose : (4, 4) array
-        Motion of the camera's frame on its carrier.
-    factor : float
-        Factor of the measured points.
-    """
-
-    carrier: Array
-    pose: Array
-    factor: float = 1.0
+    carrier: Array  # (4, 4): motion of what carries the camera, to the world
+    pose: Array  # (4, 4): motion of the camera's frame on its carrier
+    factor: float = 1.0  # factor of the measured points
 
 
 def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:

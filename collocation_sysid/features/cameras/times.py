@@ -56,18 +56,10 @@ MOVING = 0.05
 
 @dataclass(frozen=True, eq=False)
 class ImageTimes:
-    """Assignment of images to times of the motion.
+    """Assignment of images to times of the motion."""
 
-    Attributes
-    ----------
-    images : (k,) array of int
-        Indices of images.
-    times_s : (k,) array
-        Times at which they were taken [s].
-    """
-
-    images: NDArray[np.int64]
-    times_s: Array
+    images: NDArray[np.int64]  # (k,) of int: indices of images
+    times_s: Array  # (k,): times at which they were taken [s]
 
 
 def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
@@ -86,21 +78,12 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
 
 
 class _AlignedPoints(NamedTuple):
-    """Alignment of measured points with a surface.
+    """Alignment of measured points with a surface."""
 
-    Attributes
-    ----------
-    turn_rad : (3,) array
-        Rotation vector of the points about the pivot of the camera [rad].
-    shift_m : (3,) array
-        Shift of the points [m].
-    misfit_m : float
-        Root mean square distance of the surface from the points along its normal [m] before the
-        last step, at most the gate for each point; infinite before the first step.
-    """
-
-    turn_rad: Array
-    shift_m: Array
+    turn_rad: Array  # (3,): rotation vector of the points about the pivot of the camera [rad]
+    shift_m: Array  # (3,): shift of the points [m]
+    # Root mean square distance of the surface from the points along its normal [m] before the last
+    # step, at most the gate for each point; infinite before the first step.
     misfit_m: float
 
 

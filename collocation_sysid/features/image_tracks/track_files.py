@@ -63,27 +63,14 @@ EXPECTED = "a table with NAME_u and NAME_v, or a file of DeepLabCut, SLEAP, CoTr
 
 @dataclass(frozen=True, eq=False)
 class TrackFile:
-    """Content of a file of tracks.
+    """Content of a file of tracks."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Names (N,) of the points.
-    pixels : (S, N, 2) array
-        Pixels u and v; NaN where missing.
-    likelihood : (S, N) array or None
-        Confidence of the tracker, from 0 to 1; None if the file has none.
-    t_s : (S,) array or None
-        Times [s]; None if the file states none.
-    frames : (S,) array
-        Numbers of the images.
-    """
-
-    names: tuple[str, ...]
-    pixels: Array
+    names: tuple[str, ...]  # names (N,) of the points
+    pixels: Array  # (S, N, 2): pixels u and v; NaN where missing
+    # (S, N) or None: confidence of the tracker, from 0 to 1; None if the file has none.
     likelihood: Array | None
-    t_s: Array | None
-    frames: Array
+    t_s: Array | None  # (S,) or None: times [s]; None if the file states none
+    frames: Array  # (S,): numbers of the images
 
     def confident(self, least: float) -> Array:
         """Return the pixels (S, N, 2), NaN where the likelihood is below `least`."""

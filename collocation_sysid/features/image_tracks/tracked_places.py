@@ -189,42 +189,24 @@ def _add_places(
 
 @dataclass(frozen=True, eq=False)
 class TrackedPlaces(Correspondences):
-    """Places of the points of one camera, its pose, and which points are compared.
-
-    Attributes
-    ----------
-    tracks : ImageTracks
-    association : MarkerAssociation
-        Places of the points, which move on the surface.
-    rotations, translations : (S, 3, 3) and (S, 3) arrays
-        Pose of the camera at each image, from its frame to the world.
-    is_placed : (N,) array of bool
-        Points that are on the body.
-    is_visible : (S, N) array of bool
-        Points that are not hidden.
-    coordinate_parameters : (N, 2) array
-        Indices in φ of the coordinates of the places; −1 for exact ones.
-    pose_parameters : (p,) array
-        Indices in φ of the errors of the pose that are estimated, rotation first.
-    start_pose : (p,) array
-        Their values with which the first image fits best, in prior standard deviations.
-    mirror_ratio : float
-        Of a pose that was found: the error of the second best pose over that of the best one.
-    obstacles : sequence of Obstacle
-        Obstacles, which may hide points.
-    """
+    """Places of the points of one camera, its pose, and which points are compared."""
 
     tracks: ImageTracks
-    association: MarkerAssociation
+    association: MarkerAssociation  # places of the points, which move on the surface
+    # (S, 3, 3) and (S, 3): pose of the camera at each image, from its frame to the world.
     rotations: Array
     translations: Array
-    is_placed: NDArray[np.bool_]
-    is_visible: NDArray[np.bool_]
+    is_placed: NDArray[np.bool_]  # (N,) of bool: points that are on the body
+    is_visible: NDArray[np.bool_]  # (S, N) of bool: points that are not hidden
+    # (N, 2): indices in φ of the coordinates of the places; −1 for exact ones.
     coordinate_parameters: Index
+    # (p,): indices in φ of the errors of the pose that are estimated, rotation first.
     pose_parameters: Index
+    # Of a pose that was found: the error of the second best pose over that of the best one.
     mirror_ratio: float = np.inf
+    # (p,): their values with which the first image fits best, in prior standard deviations.
     start_pose: Array = field(default_factory=lambda: np.zeros(0))
-    obstacles: Sequence[Obstacle] = ()
+    obstacles: Sequence[Obstacle] = ()  # obstacles, which may hide points
 
     @classmethod
     def from_shapes(

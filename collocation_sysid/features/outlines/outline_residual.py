@@ -56,36 +56,23 @@ OCCLUSION_EDGES = 0.3
 
 @dataclass(frozen=True, eq=False)
 class OutlinePairs(Correspondences):
-    """Points of the body's outline in S images, E each at most, and edges of the masks.
-
-    Attributes
-    ----------
-    outlines : Outlines
-    experiment : Experiment
-    surface : VisibleSurface
-    rotations, translations : (S, 3, 3) and (S, 3) arrays
-        Stated pose of the camera at each image, from its frame to the world.
-    nodes, weights : (S, E, v) arrays
-        Nodes of the body at the face of each point, and their shape functions.
-    edges, outwards : (S, E, 2) arrays
-        Points on the edges of the masks, and normals of the outline, away from the body [pixels].
-    is_compared : (S, E) array of bool
-        Points that have an edge.
-    seen_px : (S, n, 2) array
-        Pixels of the nodes of the surface for which the points were found.
-    """
+    """Points of the body's outline in S images, E each at most, and edges of the masks."""
 
     outlines: Outlines
     experiment: Experiment
     surface: VisibleSurface
+    # (S, 3, 3) and (S, 3): stated pose of the camera at each image, from its frame to the world.
     rotations: Array
     translations: Array
+    # (S, E, v): nodes of the body at the face of each point, and their shape functions.
     nodes: Index
     weights: Array
+    # (S, E, 2): points on the edges of the masks, and normals of the outline, away from the body
+    # [pixels].
     edges: Array
     outwards: Array
-    is_compared: NDArray[np.bool_]
-    seen_px: Array
+    is_compared: NDArray[np.bool_]  # (S, E) of bool: points that have an edge
+    seen_px: Array  # (S, n, 2): pixels of the nodes of the surface for which the points were found
 
     @classmethod
     def from_shapes(

@@ -49,27 +49,15 @@ LARGEST_TARE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class WrenchDeviation:
-    """Deviation of one measured wrench from the simulation at the guess.
-
-    Attributes
-    ----------
-    experiment : str
-        Name of the experiment.
-    measured, simulated : (S, 6) array
-        Wrenches over the standard deviations of the noise; NaN in the same places.
-    sigmas : (6,) array
-        Standard deviations of the components [N, N m].
-    tare : float
-        Standard deviation of each tare, in standard deviations of the noise.
-    is_inertial : bool
-        Whether the wrench is the weight and inertia of the body, see `has_inertial_wrenches`.
-    """
+    """Deviation of one measured wrench from the simulation at the guess."""
 
     experiment: str
+    # (S, 6): wrenches over the standard deviations of the noise; NaN in the same places.
     measured: Array
     simulated: Array
-    sigmas: Array
-    tare: float
+    sigmas: Array  # (6,): standard deviations of the components [N, N m]
+    tare: float  # standard deviation of each tare, in standard deviations of the noise
+    # Whether the wrench is the weight and inertia of the body, see `has_inertial_wrenches`.
     is_inertial: bool
 
     @property

@@ -120,17 +120,10 @@ ONE_OF_MANY = 1.05
 
 @dataclass(frozen=True, eq=False)
 class DescribedWrench:
-    """Description of a wrench to be tested.
+    """Description of a wrench to be tested."""
 
-    Attributes
-    ----------
-    wrench : Wrench
-        Samples as they would be without the mistake.
-    tare : float
-        Standard deviation of each tare, in standard deviations of the noise; inf for a free tare.
-    """
-
-    wrench: Wrench
+    wrench: Wrench  # samples as they would be without the mistake
+    # Standard deviation of each tare, in standard deviations of the noise; inf for a free tare.
     tare: float
 
 

@@ -18,27 +18,16 @@ from ..pattern import dofs_of
 
 @dataclass(frozen=True, eq=False)
 class KernelBatch:
-    """Kernel on a mesh, and the positions at which its outputs are summed.
-
-    Attributes
-    ----------
-    cells : (E, nodes)
-        Node indices.
-    geometry : (E, q, 3·nodes + 1)
-        Shape gradients and volumes, see `elements.reference_geometry`.
-    destinations : (E, outputs)
-        Position of every output entry in the result row of its time step.
-    width : int
-        Length of that row.
-    data_columns : (E, q, m), optional
-        Columns of the data of each point in the row of data of a time step.
-    """
+    """Kernel on a mesh, and the positions at which its outputs are summed."""
 
     kernel: ElementKernel
-    cells: NDArray[np.int64]
+    cells: NDArray[np.int64]  # (E, nodes): node indices
+    # (E, q, 3·nodes + 1): shape gradients and volumes, see `elements.reference_geometry`.
     geometry: Array
+    # (E, outputs): position of every output entry in the result row of its time step.
     destinations: NDArray[np.int64]
-    width: int
+    width: int  # length of that row
+    # (E, q, m): columns of the data of each point in the row of data of a time step.
     data_columns: NDArray[np.int64] | None = None
 
 

@@ -107,26 +107,17 @@ def vector_lanes() -> int:
 
 @dataclass(frozen=True)
 class NativeCode:
-    """Native function to compile.
+    """Native function to compile."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the function.
-    key : str
-        Identifies the code: as long as the files of this folder are unchanged, equal keys must mean
-        equal code.
-    build : callable
-        Returns the LLVM module that defines `name`; called only if nothing is cached.
-    is_unoptimised : bool
-        Whether to compile without optimisation, in a fifth of the time; the function then takes up
-        to twice as long.
-    """
-
-    name: str
+    name: str  # name of the function
+    # Identifies the code: as long as the files of this folder are unchanged, equal keys must mean
+    # equal code.
     key: str
     signature: tuple[type, ...]
+    # Returns the LLVM module that defines `name`; called only if nothing is cached.
     build: Callable[[], ir.Module] = field(compare=False)
+    # Whether to compile without optimisation, in a fifth of the time; the function then takes up to
+    # twice as long.
     is_unoptimised: bool = False
 
 

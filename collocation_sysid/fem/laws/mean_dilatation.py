@@ -90,22 +90,12 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
 
 @dataclass(frozen=True, eq=False)
 class _VolumeSums:
-    """Volumes that determine the stretch of a point.
-
-    Attributes
-    ----------
-    volume : SX
-        Symbol of the sum V.
-    volumes : SX
-        Symbols of the sums s.
-    own_volumes : SX
-        Contribution σ of the point to s.
-    """
+    """Volumes that determine the stretch of a point."""
 
     point: QuadraturePoint
-    volume: ca.SX
-    volumes: ca.SX
-    own_volumes: ca.SX
+    volume: ca.SX  # symbol of the sum V
+    volumes: ca.SX  # symbols of the sums s
+    own_volumes: ca.SX  # contribution σ of the point to s
 
     @classmethod
     def from_point(cls, point: QuadraturePoint) -> _VolumeSums:
@@ -170,25 +160,13 @@ class _VolumeSums:
 
 @dataclass(frozen=True, eq=False)
 class _ScalarDerivatives:
-    """Scalar g in the symbols of a point, with the chain rule through the stretches.
-
-    Attributes
-    ----------
-    scalar : SX
-        Scalar g.
-    number : int
-        Index of the scalar, for names of sums.
-    slopes : SX
-        Symbols of the sum Γ.
-    fields : tuple of str
-        Fields whose Σ_q ∂²g/∂field∂m are coupled node vectors.
-    """
+    """Scalar g in the symbols of a point, with the chain rule through the stretches."""
 
     shape: _VolumeSums
-    scalar: ca.SX
-    number: int
-    slopes: ca.SX
-    fields: tuple[str, ...]
+    scalar: ca.SX  # scalar g
+    number: int  # index of the scalar, for names of sums
+    slopes: ca.SX  # symbols of the sum Γ
+    fields: tuple[str, ...]  # fields whose Σ_q ∂²g/∂field∂m are coupled node vectors
 
     def sum_name(self, name: str) -> str:
         """Return the name of a sum of this scalar."""

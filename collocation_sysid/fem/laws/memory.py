@@ -34,26 +34,16 @@ from ..regions import BodyPart
 
 @dataclass(frozen=True, eq=False)
 class MemoryInput:
-    """Contribution of the memory to the forces at T states.
+    """Contribution of the memory to the forces at T states."""
 
-    Attributes
-    ----------
-    overstress : (T, width)
-        Sum H of the internal variables [Pa], in the order of `MemoryLayout`.
-    stiffening : (T, parts)
-        Stiffening s of each part; zero for parts without memory.
-    stiffening_derivatives : (T, k)
-        Derivative by each entry of θ of the s of the part to which the entry belongs.
-    stiffening_second_derivatives : (T, k, k)
-        Second derivatives of s; those by constants of different parts are zero.
-    stress_weights : (T, width), optional
-        Weights σ of S in second derivatives; None for zero.
-    """
-
+    # (T, width): sum H of the internal variables [Pa], in the order of `MemoryLayout`.
     overstress: Array
-    stiffening: Array
+    stiffening: Array  # (T, parts): stiffening s of each part; zero for parts without memory
+    # (T, k): derivative by each entry of θ of the s of the part to which the entry belongs.
     stiffening_derivatives: Array
+    # (T, k, k): second derivatives of s; those by constants of different parts are zero.
     stiffening_second_derivatives: Array
+    # (T, width): weights σ of S in second derivatives; None for zero.
     stress_weights: Array | None = None
 
     def equal_stiffening_rows(self, part: int) -> Iterator[tuple[slice, float]]:
@@ -73,45 +63,24 @@ class MemoryInput:
 
 @dataclass(frozen=True)
 class BranchIndices:
-    """Positions of a Prony branch in the arrays of a body.
+    """Positions of a Prony branch in the arrays of a body."""
 
-    Attributes
-    ----------
-    part : int
-        Index of its part.
-    points : slice
-        Columns in the row of the body, (…, width).
-    columns : slice
-        Columns in the row of all branches, (…, all branches).
-    share, tau : int
-        Indices of g and τ in θ.
-    """
-
-    part: int
-    points: slice
-    columns: slice
+    part: int  # index of its part
+    points: slice  # columns in the row of the body, (…, width)
+    columns: slice  # columns in the row of all branches, (…, all branches)
+    # Indices of g and τ in θ.
     share: int
     tau: int
 
 
 @dataclass(frozen=True, eq=False)
 class MemoryLayout:
-    """Layout of the internal variables of a body in one row: the parts with memory in turn.
-
-    Attributes
-    ----------
-    first_constants : (parts,)
-        Index in θ of the first memory constant of each part.
-    points_per_element : int
-        Quadrature points of an element.
-    constant_count : int
-        Length of θ.
-    """
+    """Layout of the internal variables of a body in one row: the parts with memory in turn."""
 
     parts: tuple[BodyPart, ...]
-    first_constants: Sequence[int]
-    points_per_element: int
-    constant_count: int
+    first_constants: Sequence[int]  # (parts,): index in θ of the first memory constant of each part
+    points_per_element: int  # quadrature points of an element
+    constant_count: int  # length of θ
 
     @cached_property
     def starts(self) -> list[int]:

@@ -26,16 +26,11 @@ _VOLUMETRIC_CHOICES = (("kappa_pa",), ("lambda_pa",), ("poisson",))
 
 @dataclass(frozen=True)
 class ConstantSource:
-    """Names of the parameters that determine the constants of a region.
-
-    Attributes
-    ----------
-    names : mapping
-        For each constant, by its name without region, the name of the parameter that gives it. For
-        the elastic constants, the names of the pair that was given.
-    """
+    """Names of the parameters that determine the constants of a region."""
 
     material: Material
+    # mapping: for each constant, by its name without region, the name of the parameter that gives
+    # it. For the elastic constants, the names of the pair that was given.
     names: Mapping[str, str]
 
     def evaluate(self, values: Mapping[str, Any]) -> dict[str, Any]:

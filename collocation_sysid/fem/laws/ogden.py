@@ -37,18 +37,11 @@ INVARIANTS = 3
 
 @dataclass(frozen=True, eq=False)
 class PowerLawEnergy:
-    """Energy density in powers of the principal stretches, with a number of terms.
+    """Energy density in powers of the principal stretches, with a number of terms."""
 
-    Attributes
-    ----------
-    density : callable
-        ``density(J, scaled_excess, constants) -> ψ`` with constants by name.
-    names : tuple of str
-        Names of the constants in the order of θ.
-    """
-
+    # ``density(J, scaled_excess, constants) -> ψ`` with constants by name.
     density: Callable[[ca.SX, ScaledExcess, Mapping[str, ca.SX]], ca.SX]
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # names of the constants in the order of θ
 
     def __call__(self, F: ca.SX, **constants: ca.SX) -> ca.SX:
         """Return the energy density at a deformation gradient F (3, 3) as one expression."""

@@ -114,17 +114,10 @@ def stress_kernel(name: str, element: Element, law: PointLaw) -> ElementKernel:
 class JacobianEntries:
     """Point value and dof of each entry of `stress_jacobian` and `memory_force_jacobian`; entries
     of the same place add up.
-
-    Attributes
-    ----------
-    points : (K,)
-        Column in the row of values at points.
-    dofs : (K,)
-        Degree of freedom.
     """
 
-    points: Index
-    dofs: Index
+    points: Index  # (K,): column in the row of values at points
+    dofs: Index  # (K,): degree of freedom
 
 
 class StressEvaluator:

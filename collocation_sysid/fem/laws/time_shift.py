@@ -17,19 +17,12 @@ from .constants import LOG_SHIFT, WLF_C1, WLF_C2, Constant
 
 @dataclass(frozen=True)
 class TimeShift:
-    """Factor a_T on the relaxation times of a part of a body.
+    """Factor a_T on the relaxation times of a part of a body."""
 
-    Attributes
-    ----------
-    name : str
-        Prefix of the parameter with the logarithm of a free factor, such as ``warm.log10_shift``; ""
-        for the factor of Williams, Landel & Ferry.
-    difference_k : float
-        Temperature, less that of the parameters [K], if there is no name.
-    """
-
+    # Prefix of the parameter with the logarithm of a free factor, such as ``warm.log10_shift``; ""
+    # for the factor of Williams, Landel & Ferry.
     name: str = ""
-    difference_k: float = 0.0
+    difference_k: float = 0.0  # temperature, less that of the parameters [K], if there is no name
 
     @property
     def constants(self) -> dict[str, Constant]:

@@ -41,24 +41,14 @@ LEAST_PROGRESS = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class CoarseMesh:
-    """Coarse mesh and its relation to the given mesh.
+    """Coarse mesh and its relation to the given mesh."""
 
-    Attributes
-    ----------
-    mesh : TetMesh
-        Coarse mesh, without arrays of nodes and cells and without face sets.
-    kept_nodes : (m,) int
-        Node of the given mesh for each node of the coarse mesh.
-    coarse_nodes : (n,) int
-        Node of the coarse mesh onto which each node of the given mesh was moved.
-    source_cells : (E,) int
-        Element of the given mesh from which each coarse element was made by moving its corners;
-        both belong to the same group.
-    """
-
-    mesh: TetMesh
-    kept_nodes: Index
+    mesh: TetMesh  # coarse mesh, without arrays of nodes and cells and without face sets
+    kept_nodes: Index  # (m,) int: node of the given mesh for each node of the coarse mesh
+    # (n,) int: node of the coarse mesh onto which each node of the given mesh was moved.
     coarse_nodes: Index
+    # (E,) int: element of the given mesh from which each coarse element was made by moving its
+    # corners; both belong to the same group.
     source_cells: Index
 
 
@@ -101,18 +91,10 @@ def coarsen_mesh(
 
 @dataclass(frozen=True, eq=False)
 class _Collapses:
-    """Possible collapses.
+    """Possible collapses."""
 
-    Attributes
-    ----------
-    removed : (k,) int
-        Nodes that are removed.
-    kept : (k,) int
-        Neighbours onto which they are moved.
-    """
-
-    removed: Index
-    kept: Index
+    removed: Index  # (k,) int: nodes that are removed
+    kept: Index  # (k,) int: neighbours onto which they are moved
 
     def subset(self, chosen: Index | NDArray[np.bool_]) -> _Collapses:
         """Return the collapses with the given indices or mask."""

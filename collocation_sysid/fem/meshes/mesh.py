@@ -353,23 +353,12 @@ def _read_only(array: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class ElementNodes:
-    """Nodes of the elements of a body.
+    """Nodes of the elements of a body."""
 
-    Attributes
-    ----------
-    mesh : TetMesh
-        Mesh whose nodes are the corners; they come first, with the same indices.
-    points_m : (n, 3)
-        Undeformed positions.
-    cells : (E, nodes per element)
-        Node indices of each element.
-    ends : (k, 2)
-        Corners at the ends of the edge of each mid node: the rows of `mesh.edges`, or none.
-    """
-
-    mesh: TetMesh
-    points_m: Array
-    cells: Index
+    mesh: TetMesh  # mesh whose nodes are the corners; they come first, with the same indices
+    points_m: Array  # (n, 3): undeformed positions
+    cells: Index  # (E, nodes per element): node indices of each element
+    # (k, 2): corners at the ends of the edge of each mid node: the rows of `mesh.edges`, or none.
     ends: Index
 
     @classmethod

@@ -203,19 +203,13 @@ def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MeshQuality:
-    """Edge lengths of a mesh and mean ratios of its elements.
+    """Edge lengths of a mesh and mean ratios of its elements."""
 
-    Attributes
-    ----------
-    edge_min_m, edge_mean_m, edge_max_m : float
-        Shortest, mean and longest edge.
-    quality_min, quality_median : float
-        Smallest and median mean ratio, see `mean_ratios`.
-    """
-
+    # Shortest, mean and longest edge.
     edge_min_m: float
     edge_mean_m: float
     edge_max_m: float
+    # Smallest and median mean ratio, see `mean_ratios`.
     quality_min: float
     quality_median: float
 

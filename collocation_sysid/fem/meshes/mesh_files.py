@@ -48,32 +48,20 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class TetrahedraContent:
-    """Tetrahedra of a mesh file, with the data on them.
+    """Tetrahedra of a mesh file, with the data on them."""
 
-    Attributes
-    ----------
-    points_m : (n, 3) float64
-        All points of the file [m], also those that no tetrahedron has.
-    tetrahedra : (E, 4)
-        Node indices, E > 0, in the order of the file.
-    point_arrays : dict of name to (n, ...) array
-        Point data of the file, and as booleans its point sets and the nodes of its cell sets and
-        physical groups, whatever the dimension of their cells.
-    cell_arrays : dict of name to (E, ...) array
-        Cell data, cell sets and physical groups of the tetrahedra.
-    face_sets : dict of name to (k, 3) array
-        Triangles of the file, by their cell sets and physical groups, and by cell data that are 1
-        on them and 0 on others.
-    notes : tuple of str
-        Sentences about omitted cells and straightened sides, if any.
-    """
-
+    # (n, 3) float64: all points of the file [m], also those that no tetrahedron has.
     points_m: np.ndarray
-    tetrahedra: np.ndarray
+    tetrahedra: np.ndarray  # (E, 4): node indices, E > 0, in the order of the file
+    # dict of name to (n, ...): point data of the file, and as booleans its point sets and the nodes
+    # of its cell sets and physical groups, whatever the dimension of their cells.
     point_arrays: Arrays
+    # dict of name to (E, ...): cell data, cell sets and physical groups of the tetrahedra.
     cell_arrays: Arrays
+    # dict of name to (k, 3): triangles of the file, by their cell sets and physical groups, and by
+    # cell data that are 1 on them and 0 on others.
     face_sets: Arrays
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # sentences about omitted cells and straightened sides, if any
 
 
 def read_tetrahedra(path: str | Path, length_unit: str = "m") -> TetrahedraContent:

@@ -66,33 +66,18 @@ except (Exception, SystemExit) as error:
 
 @dataclass(frozen=True)
 class CellBlock:
-    """Cells of one type.
+    """Cells of one type."""
 
-    Attributes
-    ----------
-    type : str
-        Name of the type in meshio.
-    dim : int
-        Dimension of the cells.
-    data : (n, nodes per cell) array
-        Node indices.
-    """
-
-    type: str
-    dim: int
-    data: NDArray[Any]
+    type: str  # name of the type in meshio
+    dim: int  # dimension of the cells
+    data: NDArray[Any]  # (n, nodes per cell): node indices
 
 
 @dataclass(frozen=True)
 class MeshContent:
-    """Content of a mesh or point file, with the names and forms of meshio.
+    """Content of a mesh or point file, with the names and forms of meshio."""
 
-    Attributes
-    ----------
-    points : (n, k) array
-    """
-
-    points: NDArray[Any]
+    points: NDArray[Any]  # (n, k)
     cells: list[CellBlock]
     point_data: Mapping[str, NDArray[Any]]
     field_data: Mapping[str, NDArray[Any]]

@@ -26,37 +26,19 @@ ValueAndGradient = Callable[[Array], tuple[float, Array]]
 
 @dataclass(frozen=True)
 class CgDescentOptions:
-    """Options, with the letters of the papers in parentheses.
+    """Options, with the letters of the papers in parentheses."""
 
-    Attributes
-    ----------
-    tolerance : float
-        Largest entry of the gradient at the end.
-    max_iterations : int
-        Largest number of iterations.
-    decrease, curvature : float
-        Constants of the Wolfe conditions (δ, σ).
-    rounding : float
-        Relative error of the value (ε): values within it are considered equal.
-    memory : float
-        Decay of the average size of the value (Δ).
-    switch : float
-        Relative change of the value below which only the approximate conditions count (ω).
-    truncation : float
-        Lower bound of β (η).
-    max_trials : int
-        Largest number of evaluations of one line search.
-    """
-
-    tolerance: float = 1e-6
-    max_iterations: int = 10_000
+    tolerance: float = 1e-6  # largest entry of the gradient at the end
+    max_iterations: int = 10_000  # largest number of iterations
+    # Constants of the Wolfe conditions (δ, σ).
     decrease: float = 0.1
     curvature: float = 0.9
-    rounding: float = 1e-6
-    memory: float = 0.7
+    rounding: float = 1e-6  # relative error of the value (ε): values within it are considered equal
+    memory: float = 0.7  # decay of the average size of the value (Δ)
+    # Relative change of the value below which only the approximate conditions count (ω).
     switch: float = 1e-3
-    truncation: float = 0.01
-    max_trials: int = 60
+    truncation: float = 0.01  # lower bound of β (η)
+    max_trials: int = 60  # largest number of evaluations of one line search
 
 
 Ending = Literal["converged", "iteration-limit", "stopped", "line-search", "not-finite"]
@@ -79,60 +61,30 @@ EXPANSION = 5.0
 
 @dataclass(frozen=True, eq=False)
 class CgState:
-    """One iterate, the argument of a callback.
+    """One iterate, the argument of a callback."""
 
-    Attributes
-    ----------
-    iteration : int
-        Number of the iterate; 0 is the start.
-    x : (n,) array
-        Variables.
-    value : float
-        Value of the function.
-    gradient : (n,) array
-        Gradient.
-    direction : (n,) array
-        Direction of the step that led to the iterate.
-    slope : float
-        Derivative along it at step 0.
-    step : float
-        Step size.
-    """
-
-    iteration: int
-    x: Array
-    value: float
-    gradient: Array
-    direction: Array
-    slope: float
-    step: float
+    iteration: int  # number of the iterate; 0 is the start
+    x: Array  # (n,): variables
+    value: float  # value of the function
+    gradient: Array  # (n,): gradient
+    direction: Array  # (n,): direction of the step that led to the iterate
+    slope: float  # derivative along it at step 0
+    step: float  # step size
 
 
 @dataclass(frozen=True, eq=False)
 class CgResult:
-    """Result of a minimisation.
+    """Result of a minimisation."""
 
-    Attributes
-    ----------
-    x : (n,) array
-        Last variables.
-    value : float
-        Value of the function.
-    gradient : (n,) array
-        Gradient.
-    iterations, evaluations : int
-        Numbers of iterations, and of evaluations of the gradient.
-    ending : str
-        Reason for the end: "converged"; "iteration-limit"; "stopped" by the callback;
-        "line-search", if no step satisfied the Wolfe conditions; or "not-finite", if the function
-        is not finite at the start.
-    """
-
-    x: Array
-    value: float
-    gradient: Array
+    x: Array  # (n,): last variables
+    value: float  # value of the function
+    gradient: Array  # (n,): gradient
+    # Numbers of iterations, and of evaluations of the gradient.
     iterations: int
     evaluations: int
+    # Reason for the end: "converged"; "iteration-limit"; "stopped" by the callback; "line-search",
+    # if no step satisfied the Wolfe conditions; or "not-finite", if the function is not finite at
+    # the start.
     ending: Ending
 
 
@@ -306,23 +258,12 @@ class _CountedFunction:
 
 @dataclass
 class _AverageValue:
-    """Average size C of the values so far, from which the effect of rounding is estimated.
-
-    Attributes
-    ----------
-    options : CgDescentOptions
-    weight : float
-        Weight of the values so far.
-    size : float
-        Average size C.
-    approximate : bool
-        Whether only the approximate Wolfe conditions count.
-    """
+    """Average size C of the values so far, from which the effect of rounding is estimated."""
 
     options: CgDescentOptions
-    weight: float = 0.0
-    size: float = 0.0
-    approximate: bool = False
+    weight: float = 0.0  # weight of the values so far
+    size: float = 0.0  # average size C
+    approximate: bool = False  # whether only the approximate Wolfe conditions count
 
     def add(self, value: float) -> None:
         """Update the average size with the size of a value, in place."""

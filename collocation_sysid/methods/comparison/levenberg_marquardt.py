@@ -127,29 +127,15 @@ def minimise_levenberg_marquardt(
 
 @dataclass(frozen=True, eq=False)
 class _MeritPoint:
-    """Merit function with its derivatives at z; the Jacobian is overwritten by the next point's.
+    """Merit function with its derivatives at z; the Jacobian is overwritten by the next point's."""
 
-    Attributes
-    ----------
-    z : (variables,) array
-        Variables.
-    value : float
-        Merit m.
-    rows : (constraints,) array
-        Constraints g.
-    jacobian : sparse array (constraints, variables)
-        ∂g/∂z, in memory that all points share.
-    gradient : (variables,) array
-        ∂m/∂z.
-    projected : (variables,) array
-        The same with zeros for constant variables and at active bounds.
-    """
-
-    z: Array
-    value: float
-    rows: Array
+    z: Array  # (variables,): variables
+    value: float  # merit m
+    rows: Array  # (constraints,): constraints g
+    # sparse (constraints, variables): ∂g/∂z, in memory that all points share.
     jacobian: sp.csc_array
-    gradient: Array
+    gradient: Array  # (variables,): ∂m/∂z
+    # (variables,): the same with zeros for constant variables and at active bounds.
     projected: Array
 
     @classmethod
@@ -207,33 +193,19 @@ class _QuadraticModel:
 
     Its matrix is H + ρ JᵀJ with J = ∂g/∂z, without damping. The parameters and the positions that
     are not constant have blocks of it.
-
-    Attributes
-    ----------
-    problem : PenaltyProblem
-    z : (variables,) array
-    rho : float
-        Penalty parameter ρ.
-    jacobian : sparse array (constraints, variables)
-        ∂g/∂z; it must not be overwritten while the model is used.
-    hessian : sparse array (variables, variables)
-        Hessian H of the loss or of the Lagrangian.
-    gradient : (variables,) array
-        ∂m/∂z.
-    exact : bool
-        Whether H is that of the Lagrangian.
-    order : list of int array
-        Order of the band's columns, shared by all models: empty until the first model computes and
-        appends it.
     """
 
     problem: PenaltyProblem
-    z: Array
-    rho: float
+    z: Array  # (variables,)
+    rho: float  # penalty parameter ρ
+    # sparse (constraints, variables): ∂g/∂z; it must not be overwritten while the model is used.
     jacobian: sp.csc_array
+    # sparse (variables, variables): Hessian H of the loss or of the Lagrangian.
     hessian: sp.csc_array
-    gradient: Array
-    exact: bool
+    gradient: Array  # (variables,): ∂m/∂z
+    exact: bool  # whether H is that of the Lagrangian
+    # Order of the band's columns, shared by all models: empty until the first model computes and
+    # appends it.
     order: list[Index]
 
     def predicted_decrease(self, step: Array) -> float:

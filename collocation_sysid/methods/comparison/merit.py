@@ -158,21 +158,11 @@ class PenaltyProblem:
 
 @dataclass(frozen=True, eq=False)
 class MeritFunction:
-    """Merit function m for one ρ and y.
-
-    Attributes
-    ----------
-    problem : PenaltyProblem
-        Problem.
-    rho : float
-        Penalty parameter ρ.
-    multipliers : (constraints,) array
-        Multipliers y.
-    """
+    """Merit function m for one ρ and y."""
 
     problem: PenaltyProblem
-    rho: float
-    multipliers: Array
+    rho: float  # penalty parameter ρ
+    multipliers: Array  # (constraints,): multipliers y
 
     def value(self, z: Array) -> float:
         """Return m(z); infinite if an element is inverted, or if m is not finite.

@@ -53,21 +53,11 @@ ROUNDING = 1e-14
 
 @dataclass(frozen=True)
 class ConstraintViolation:
-    """Violation of the equations of motion at a point.
+    """Violation of the equations of motion at a point."""
 
-    Attributes
-    ----------
-    newtons : float
-        Largest residual [N].
-    relative : float
-        Largest residual over the largest force in the equations.
-    scaled : float
-        Largest entry of g, prescribed displacements included.
-    """
-
-    newtons: float = np.inf
-    relative: float = np.inf
-    scaled: float = np.inf
+    newtons: float = np.inf  # largest residual [N]
+    relative: float = np.inf  # largest residual over the largest force in the equations
+    scaled: float = np.inf  # largest entry of g, prescribed displacements included
 
     def __str__(self) -> str:
         """Return the violation in words, for messages."""
@@ -76,27 +66,14 @@ class ConstraintViolation:
 
 @dataclass(frozen=True)
 class Stage:
-    """One minimisation with fixed ρ and y: its merit function, and its result once it has ended.
-
-    Attributes
-    ----------
-    merit : MeritFunction
-        Merit function.
-    tolerance : float
-        Tolerance: largest entry of the merit's projected gradient.
-    gradient : float
-        The same at the end of the stage; infinite before.
-    is_minimum : bool
-        Whether the minimum was reached, as far as rounding allows at large ρ.
-    violation : ConstraintViolation
-        Violation at the end of the stage.
-    """
+    """One minimisation with fixed ρ and y: its merit function, and its result once it has ended."""
 
     merit: MeritFunction
-    tolerance: float
-    gradient: float = np.inf
+    tolerance: float  # tolerance: largest entry of the merit's projected gradient
+    gradient: float = np.inf  # the same at the end of the stage; infinite before
+    # Whether the minimum was reached, as far as rounding allows at large ρ.
     is_minimum: bool = False
-    violation: ConstraintViolation = ConstraintViolation()
+    violation: ConstraintViolation = ConstraintViolation()  # violation at the end of the stage
 
 
 @validated

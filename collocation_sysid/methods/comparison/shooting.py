@@ -152,26 +152,13 @@ def adjoint_gradient(
 
 @dataclass(frozen=True, eq=False)
 class _SimulatedPoint:
-    """Simulation at parameters p: variables z, objective, and derivatives.
+    """Simulation at parameters p: variables z, objective, and derivatives."""
 
-    Attributes
-    ----------
-    p : (np,) array
-        Parameters (q, φ).
-    z : (variables,) array
-        Variables with the simulated positions.
-    objective : float
-        Loss L in the scaling of the NLP.
-    residual : (m,) array
-        Residuals in standard deviations; empty with adjoint gradients.
-    slope : array
-        Derivatives (m, np) of the residuals or, with adjoint gradients, (np,) of the objective.
-    """
-
-    p: Array
-    z: Array
-    objective: float
-    residual: Array
+    p: Array  # (np,): parameters (q, φ)
+    z: Array  # (variables,): variables with the simulated positions
+    objective: float  # loss L in the scaling of the NLP
+    residual: Array  # (m,): residuals in standard deviations; empty with adjoint gradients
+    # Derivatives (m, np) of the residuals or, with adjoint gradients, (np,) of the objective.
     slope: Array
 
 

@@ -40,25 +40,16 @@ UNUSABLE = (Status.NOT_SIMULABLE, Status.NUMERICAL_FAILURE, Status.DIVERGED)
 
 @dataclass(frozen=True, eq=False)
 class InitialPoint:
-    """Initial point of IPOPT.
+    """Initial point of IPOPT."""
 
-    Attributes
-    ----------
-    coarse : Solution
-        Solution by reduced space; its collocation contains the measurements associated at these
-        estimates.
-    is_usable : bool
-        Whether its variables satisfy the equations of motion to the end of the recordings.
-    is_close : bool
-        Whether the optimum is within about `LARGEST_CORRECTION`, so that Newton's method converges.
-    note : str
-        Explanation for the user how the point was computed.
-    """
-
+    # Solution by reduced space; its collocation contains the measurements associated at these
+    # estimates.
     coarse: Solution
+    # Whether its variables satisfy the equations of motion to the end of the recordings.
     is_usable: bool
+    # Whether the optimum is within about `LARGEST_CORRECTION`, so that Newton's method converges.
     is_close: bool
-    note: str
+    note: str  # explanation for the user how the point was computed
 
 
 def compute_initial_point(

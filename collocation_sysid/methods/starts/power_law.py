@@ -57,53 +57,29 @@ LARGEST_LOGARITHM = 300.0
 
 @dataclass(frozen=True, eq=False)
 class _Stress:
-    """Measured nominal stresses of one direction.
+    """Measured nominal stresses of one direction."""
 
-    Attributes
-    ----------
-    axis : int
-        Direction; in simple shear that of the larger principal stretch, of a difference that of
-        the first stress.
-    values : (T,) array
-    sigma : (T,) or (1,) array
-    deviations : (2,) array
-        Prior standard deviations of the relative error of the area and of the zero; 0 if exact.
-    """
-
+    # Direction; in simple shear that of the larger principal stretch, of a difference that of the
+    # first stress.
     axis: int
-    values: Array
-    sigma: Array
+    values: Array  # (T,)
+    sigma: Array  # (T,) or (1,)
+    # (2,): prior standard deviations of the relative error of the area and of the zero; 0 if exact.
     deviations: Array
 
 
 @dataclass(frozen=True, eq=False)
 class _Test:
-    """Measurements of one specimen.
+    """Measurements of one specimen."""
 
-    Attributes
-    ----------
-    gradient : (T, 3, 3) array
-        Prescribed deformation gradients, 1 where the specimen is free.
-    per_strain : (3, 3) array
-        Derivative of the gradient by an offset of all strains.
-    free : int
-        Number of directions in which the specimen is free to contract.
-    test : str
-        Kind of test, see `Specimen`.
-    strain_zero : float
-        Prior standard deviation of a constant offset of the first strain; 0 if exact.
-    stresses : list of _Stress
-    lateral : (values (T,), sigma) or None
-        Measured free stretch.
-    """
-
-    gradient: Array
-    per_strain: Array
-    free: int
-    test: str
+    gradient: Array  # (T, 3, 3): prescribed deformation gradients, 1 where the specimen is free
+    per_strain: Array  # (3, 3): derivative of the gradient by an offset of all strains
+    free: int  # number of directions in which the specimen is free to contract
+    test: str  # kind of test, see `Specimen`
+    # Prior standard deviation of a constant offset of the first strain; 0 if exact.
     strain_zero: float
     stresses: list[_Stress]
-    lateral: tuple[Array, Array] | None
+    lateral: tuple[Array, Array] | None  # (values (T,), sigma) or None: measured free stretch
 
     @property
     def measurements(self) -> int:
@@ -130,51 +106,28 @@ class _Test:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Fit of a law with n terms, whose exponents ascend.
+    """Fit of a law with n terms, whose exponents ascend."""
 
-    Attributes
-    ----------
-    loss : float
-        χ² of the measurements.
-    alpha, shear_pa : (n,) array
-        Exponents, and shares of the shear modulus.
-    beta : (n,) array or None
-        None for an incompressible law.
-    has_one_beta : bool
-        Whether all terms share one estimated β.
-    constants : int
-        Number of fitted constants of the law.
-    """
-
-    loss: float
+    loss: float  # χ² of the measurements
+    # (n,): exponents, and shares of the shear modulus.
     alpha: Array
     shear_pa: Array
-    beta: Array | None
-    has_one_beta: bool
-    constants: int
+    beta: Array | None  # (n,) or None: none for an incompressible law
+    has_one_beta: bool  # whether all terms share one estimated β
+    constants: int  # number of fitted constants of the law
 
 
 @dataclass(frozen=True, eq=False)
 class PowerLawStart:
-    """Start of a law in powers of the stretches.
+    """Start of a law in powers of the stretches."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        With the start as guesses of the factors, exponents and β; those that are not determined are
-        fixed or tied.
-    young_pa : float
-        Young's modulus of an incompressible body with these constants, for the other guesses.
-    note : str
-        What the measurements do not determine; empty if they determine all constants.
-    loss : float
-        χ² of the closed form at the start.
-    """
-
+    # With the start as guesses of the factors, exponents and β; those that are not determined are
+    # fixed or tied.
     parameters: Parameters
+    # Young's modulus of an incompressible body with these constants, for the other guesses.
     young_pa: float
-    note: str
-    loss: float
+    note: str  # what the measurements do not determine; empty if they determine all constants
+    loss: float  # χ² of the closed form at the start
 
 
 def power_law_start(collocation: Collocation) -> PowerLawStart | None:

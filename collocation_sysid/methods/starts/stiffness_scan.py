@@ -69,34 +69,20 @@ NO_GUESS = "no guess"
 
 @dataclass(frozen=True, eq=False)
 class ScanSummary:
-    """Stiffnesses of a scan and their misfits, as in ``result.json``.
-
-    Attributes
-    ----------
-    reason : str
-        Reason for the scan, the beginning of `sentence`.
-    young_pa : (k,) array
-        Young's moduli that were tried, ascending [Pa]. Moduli with a guess, and fixed ones, kept
-        their values.
-    misfit : (k,) array
-        Root mean square of the residuals of all measurements, in standard deviations; NaN where the
-        body could not be simulated.
-    best : int
-        Index of the modulus that was chosen.
-    samples : int
-        Number of first samples that were compared, over all experiments.
-    time_s : float
-        Computing time [s].
-    """
+    """Stiffnesses of a scan and their misfits, as in ``result.json``."""
 
     SERIALISED_PROPERTIES: ClassVar = ("sentence",)
 
-    reason: str
+    reason: str  # reason for the scan, the beginning of `sentence`
+    # (k,): Young's moduli that were tried, ascending [Pa]. Moduli with a guess, and fixed ones,
+    # kept their values.
     young_pa: Array
+    # (k,): root mean square of the residuals of all measurements, in standard deviations; NaN where
+    # the body could not be simulated.
     misfit: Array
-    best: int
-    samples: int
-    time_s: float
+    best: int  # index of the modulus that was chosen
+    samples: int  # number of first samples that were compared, over all experiments
+    time_s: float  # computing time [s]
 
     @property
     def sentence(self) -> str:

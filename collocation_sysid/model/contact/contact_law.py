@@ -76,24 +76,12 @@ LARGEST_SCALED_PRESSURE = 50.0
 
 
 class NormalContact(NamedTuple):
-    """Expressions of the contact of a point without friction.
+    """Expressions of the contact of a point without friction."""
 
-    Attributes
-    ----------
-    point : (3,) SX
-        The point in obstacle axes [m].
-    axes : (3, 3) SX
-        Axes of the obstacle, one per column, in the axes of the world.
-    gap_gradient : (3,) SX
-        Gradient of the gap at the point, in obstacle axes.
-    force_n : SX
-        Normal force N [N].
-    """
-
-    point: ca.SX
-    axes: ca.SX
-    gap_gradient: ca.SX
-    force_n: ca.SX
+    point: ca.SX  # (3,) SX: the point in obstacle axes [m]
+    axes: ca.SX  # (3, 3) SX: axes of the obstacle, one per column, in the axes of the world
+    gap_gradient: ca.SX  # (3,) SX: gradient of the gap at the point, in obstacle axes
+    force_n: ca.SX  # normal force N [N]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,23 +90,14 @@ class ContactLaw:
 
     Below, y (12,) are the contact point and the ends of the three axes of the obstacle's frame,
     relative to the origin of the frame; b is the pressure divided by κ, a length.
-
-    Attributes
-    ----------
-    body : Body
-    obstacle : Obstacle
-    surface : ContactSurface
-        Points and areas of the surface that may touch the obstacle.
-    is_static : bool
-        Whether the experiment is static, so that ν is the displacement since the previous sample.
-    is_averaged : bool
-        Whether the pressure is the mean over a time step instead of that at ξ.
     """
 
     body: Body
     obstacle: Obstacle
-    surface: ContactSurface
+    surface: ContactSurface  # points and areas of the surface that may touch the obstacle
+    # Whether the experiment is static, so that ν is the displacement since the previous sample.
     is_static: bool
+    # Whether the pressure is the mean over a time step instead of that at ξ.
     is_averaged: bool = False
 
     @property

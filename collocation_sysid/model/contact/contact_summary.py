@@ -21,31 +21,19 @@ AT_ONCE = 64
 
 @dataclass(frozen=True)
 class ContactSummary:
-    """Contact of a body with one obstacle in a motion.
+    """Contact of a body with one obstacle in a motion."""
 
-    Attributes
-    ----------
-    experiment, obstacle : str
-        Names.
-    gap_m : float
-        Smallest gap [m]; contact exists where it is less than the width of the contact law.
-    face_count : float
-        Largest number of faces in contact at a time, from their quadrature points; 0 if there never
-        was contact.
-    face_mm : float
-        Mean edge length of the faces in contact [mm].
-    is_initially_in_contact : bool
-        Whether a moving obstacle was in contact at the first time.
-    separation_s : float or None
-        Time of the first loss of contact [s]; None if contact was never lost.
-    """
-
+    # Names.
     experiment: str
     obstacle: str
+    # Smallest gap [m]; contact exists where it is less than the width of the contact law.
     gap_m: float
+    # Largest number of faces in contact at a time, from their quadrature points; 0 if there never
+    # was contact.
     face_count: float
-    face_mm: float
-    is_initially_in_contact: bool
+    face_mm: float  # mean edge length of the faces in contact [mm]
+    is_initially_in_contact: bool  # whether a moving obstacle was in contact at the first time
+    # Time of the first loss of contact [s]; None if contact was never lost.
     separation_s: float | None
 
 
@@ -95,22 +83,13 @@ def surface_gaps_and_pressures(
 
 @dataclass(frozen=True)
 class FrictionSummary:
-    """Friction with an obstacle in a motion.
+    """Friction with an obstacle in a motion."""
 
-    Attributes
-    ----------
-    used : float
-        Largest ratio of the total friction force to its limit, over the times whose limit is above
-        the share `GRAZE` of the largest; 0 without contact.
-    slipping : float
-        Share of slipping points, weighted by their friction limits, over the motion.
-    dissipated_j : float
-        Dissipated energy [J].
-    """
-
+    # Largest ratio of the total friction force to its limit, over the times whose limit is above
+    # the share `GRAZE` of the largest; 0 without contact.
     used: float
-    slipping: float
-    dissipated_j: float
+    slipping: float  # share of slipping points, weighted by their friction limits, over the motion
+    dissipated_j: float  # dissipated energy [J]
 
 
 def friction_summaries(

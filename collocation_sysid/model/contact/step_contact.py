@@ -26,17 +26,9 @@ CHANGE = 1 / 3
 
 @dataclass(frozen=True, eq=False)
 class ContactCandidates:
-    """Contact points that an obstacle may touch in a time step.
+    """Contact points that an obstacle may touch in a time step."""
 
-    Attributes
-    ----------
-    law : ContactLaw
-        Contact law of the obstacle.
-    points : CandidatePoints
-        The points.
-    """
-
-    law: ContactLaw
+    law: ContactLaw  # contact law of the obstacle
     points: CandidatePoints
 
     @cached_property

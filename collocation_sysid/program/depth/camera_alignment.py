@@ -54,21 +54,12 @@ ENOUGH = 2000
 
 
 class AlignedPose(NamedTuple):
-    """Error of a camera's pose after some iterations of the alignment.
+    """Error of a camera's pose after some iterations of the alignment."""
 
-    Attributes
-    ----------
-    rotation : Rotation
-        Rotation about the camera's pivot, in its stated frame.
-    translation_m : (3,) array
-        Translation in its stated frame [m].
-    mismatch : float
-        Mean squared distance of the surface's points from the cloud over that of the gate, at most
-        one per point; one before the first iteration, or if no point faces the camera.
-    """
-
-    rotation: Rotation
-    translation_m: Array
+    rotation: Rotation  # rotation about the camera's pivot, in its stated frame
+    translation_m: Array  # (3,): translation in its stated frame [m]
+    # Mean squared distance of the surface's points from the cloud over that of the gate, at most
+    # one per point; one before the first iteration, or if no point faces the camera.
     mismatch: float = 1.0
 
 
@@ -154,18 +145,10 @@ class GriddedCloud:
 
 
 class AlignmentClouds(NamedTuple):
-    """Points of an image for the two halves of an alignment.
+    """Points of an image for the two halves of an alignment."""
 
-    Attributes
-    ----------
-    wide : NearestPoints
-        With the wider half of the gates.
-    narrow : ExactCloud
-        With the narrower half.
-    """
-
-    wide: NearestPoints
-    narrow: ExactCloud
+    wide: NearestPoints  # with the wider half of the gates
+    narrow: ExactCloud  # with the narrower half
 
     @classmethod
     def from_points(cls, points_m: Array, reach_m: float) -> AlignmentClouds:
@@ -344,20 +327,12 @@ def iterate_alignments(
 
 
 class _MatchedSurface(NamedTuple):
-    """Points of a surface with the nearest points of a cloud, for B camera errors.
+    """Points of a surface with the nearest points of a cloud, for B camera errors."""
 
-    Attributes
-    ----------
-    arms_m : (B, P, 3) array
-        Rotated cloud points relative to the camera's pivot [m].
-    distances_m : (B, P, 3) array
-        From the surface's points to the moved cloud points [m].
-    is_facing : (B, P) array of bool
-        Whether the surface faces the camera, not at a grazing angle; true without a camera.
-    """
-
-    arms_m: Array
-    distances_m: Array
+    arms_m: Array  # (B, P, 3): rotated cloud points relative to the camera's pivot [m]
+    distances_m: Array  # (B, P, 3): from the surface's points to the moved cloud points [m]
+    # (B, P) of bool: whether the surface faces the camera, not at a grazing angle; true without a
+    # camera.
     is_facing: NDArray[np.bool_]
 
 

@@ -34,28 +34,16 @@ EXACT = 1e6
 
 @dataclass(frozen=True, eq=False)
 class DepthCameraModel:
-    """Depth camera with its estimated errors.
+    """Depth camera with its estimated errors."""
 
-    Attributes
-    ----------
-    depth : Depth
-        The camera and its measured points.
-    camera_index : int
-        Index of the camera in the experiment.
-    nuisance : NuisanceMap
-        Nuisance parameters of the experiment, which include the camera's errors.
-    pivot_m : (3,) array
-        Point about which the rotation error acts, the middle of the body, in the camera's frame
-        [m].
-    size_m : float
-        Diagonal of the undeformed body [m].
-    """
-
-    depth: Depth
-    camera_index: int
+    depth: Depth  # the camera and its measured points
+    camera_index: int  # index of the camera in the experiment
+    # Nuisance parameters of the experiment, which include the camera's errors.
     nuisance: NuisanceMap
+    # (3,): point about which the rotation error acts, the middle of the body, in the camera's frame
+    # [m].
     pivot_m: Array
-    size_m: float
+    size_m: float  # diagonal of the undeformed body [m]
 
     @classmethod
     def from_experiment(

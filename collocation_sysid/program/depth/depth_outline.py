@@ -159,67 +159,33 @@ class Outline:
 
 
 class _NearestEdges(NamedTuple):
-    """Edges nearest to P pixels that show nothing.
+    """Edges nearest to P pixels that show nothing."""
 
-    Attributes
-    ----------
-    edges : (P, 2) array
-        Edges u, v, half a pixel from the middle of the nearest other pixel.
-    outwards : (P, 2) array
-        Unit vectors from the edge to the pixel; (1, 0) or (1, 1) where there is no edge.
-    exists : (P,) array of bool
-        Whether there is such an edge.
-    """
-
-    edges: Array
+    edges: Array  # (P, 2): edges u, v, half a pixel from the middle of the nearest other pixel
+    # (P, 2): unit vectors from the edge to the pixel; (1, 0) or (1, 1) where there is no edge.
     outwards: Array
-    exists: NDArray[np.bool_]
+    exists: NDArray[np.bool_]  # (P,) of bool: whether there is such an edge
 
 
 class OutlineView(NamedTuple):
-    """View of a camera at one image.
+    """View of a camera at one image."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Camera with a matrix.
-    eye_m : (3,) array
-        Its position in the world [m].
-    to_camera_m : callable
-        Points (P, 3) of the world in the frame of the camera [m].
-    spacing_m : float
-        Distance of the points of an outline [m].
-    """
-
-    camera: Camera
-    eye_m: Array
+    camera: Camera  # camera with a matrix
+    eye_m: Array  # (3,): its position in the world [m]
+    # Points (P, 3) of the world in the frame of the camera [m].
     to_camera_m: Callable[[Array], Array]
-    spacing_m: float
+    spacing_m: float  # distance of the points of an outline [m]
 
 
 @dataclass(frozen=True, eq=False)
 class OutlinePoints:
-    """Points (P) where the body ends in the view of a camera.
+    """Points (P) where the body ends in the view of a camera."""
 
-    Attributes
-    ----------
-    faces : (P,) array
-        Indices of the surface's faces.
-    weights : (P, v) array
-        Shape functions of the faces' nodes.
-    depth_m : (P,) array
-        Depths along the optical axis [m].
-    pixels : (P, 2) array
-        Pixels u and v.
-    outwards : (P, 2) array
-        Unit normals of the outline in the image, away from the body.
-    """
-
-    faces: Index
-    weights: Array
-    depth_m: Array
-    pixels: Array
-    outwards: Array
+    faces: Index  # (P,): indices of the surface's faces
+    weights: Array  # (P, v): shape functions of the faces' nodes
+    depth_m: Array  # (P,): depths along the optical axis [m]
+    pixels: Array  # (P, 2): pixels u and v
+    outwards: Array  # (P, 2): unit normals of the outline in the image, away from the body
 
 
 def _padded(values: NDArray, count: int) -> NDArray:

@@ -79,20 +79,11 @@ def _surface_positions(correspondences: SurfaceCorrespondences, times: int) -> P
 class DepthResidual(CorrespondenceResidual):
     """Measurement model of the points of a depth camera, with one number each: the distance from
     the surface, whose measured value is zero.
-
-    Attributes
-    ----------
-    observable : PointPositions
-        Surface nodes at all grid times.
-    correspondences : SurfaceCorrespondences
-        Correspondences of the points with the surface.
-    observable_s : (n,) array
-        Times of the observable [s].
     """
 
-    observable: PointPositions
-    correspondences: SurfaceCorrespondences
-    observable_s: Array
+    observable: PointPositions  # surface nodes at all grid times
+    correspondences: SurfaceCorrespondences  # correspondences of the points with the surface
+    observable_s: Array  # (n,): times of the observable [s]
 
     group_size = 1
     has_offsets = True

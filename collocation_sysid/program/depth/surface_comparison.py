@@ -24,39 +24,22 @@ class DepthError:
 
     Compared are the points that lie within `reach_m` of a part of the surface that the camera can
     see (not grazing, not hidden, among the stated faces), see `SurfaceComparison`.
-
-    Attributes
-    ----------
-    points : int
-        Number of points that are compared.
-    compared_points : int
-        Number of all points in the images, including those that are not compared because they
-        belong to other things.
-    rms_m : float or None
-        Root mean square distance of the compared points [m]; None without any.
-    reach_m : float
-        Points farther from the surface are taken to belong to something else [m].
-    gate_m : float
-        Gate stated in the problem [m], at most `reach_m`.
-    share_beyond_gate : float
-        Share of the compared points that are farther from the surface than `gate_m`; 0 without any.
-    rms_within_gate_m : float or None
-        Root mean square distance of the points within `gate_m` [m]; None without any.
-    sigmas : float
-        Root mean square distance over the stated σ; 0 without any.
-    tame_sigmas : float
-        Root mean square distance over the stated σ, with distances beyond Huber's threshold
-        shortened as in a fit, so that a few outliers do not make a prediction wrong; 0 without any.
     """
 
-    points: int
+    points: int  # number of points that are compared
+    # Number of all points in the images, including those that are not compared because they belong
+    # to other things.
     compared_points: int
-    rms_m: float | None
-    reach_m: float
-    gate_m: float
+    rms_m: float | None  # root mean square distance of the compared points [m]; None without any
+    reach_m: float  # points farther from the surface are taken to belong to something else [m]
+    gate_m: float  # gate stated in the problem [m], at most `reach_m`
+    # Share of the compared points that are farther from the surface than `gate_m`; 0 without any.
     share_beyond_gate: float
+    # Root mean square distance of the points within `gate_m` [m]; None without any.
     rms_within_gate_m: float | None
-    sigmas: float
+    sigmas: float  # root mean square distance over the stated σ; 0 without any
+    # Root mean square distance over the stated σ, with distances beyond Huber's threshold shortened
+    # as in a fit, so that a few outliers do not make a prediction wrong; 0 without any.
     tame_sigmas: float
 
     @property
@@ -81,23 +64,13 @@ class SurfaceComparison:
     A first association takes every point within a quarter of the body's size of the surface. The
     reach is then six times the median distance, at least `gate_m` and at most that quarter; the
     points within it are associated again, without hidden ones, and compared.
-
-    Attributes
-    ----------
-    correspondences : SurfaceCorrespondences
-        Correspondences of the points with the surface.
-    shapes_m : (S, n, 3) array
-        Surface nodes at the images [m].
-    signed_distances_m : (S, E) array
-        Distances of points behind the surface [m]; NaN where they are not compared.
-    phi : (k,) array
-        Nuisance parameters.
     """
 
-    correspondences: SurfaceCorrespondences
-    shapes_m: Array
+    correspondences: SurfaceCorrespondences  # correspondences of the points with the surface
+    shapes_m: Array  # (S, n, 3): surface nodes at the images [m]
+    # (S, E): distances of points behind the surface [m]; NaN where they are not compared.
     signed_distances_m: Array
-    phi: Array
+    phi: Array  # (k,): nuisance parameters
 
     @classmethod
     def from_shapes(

@@ -372,21 +372,11 @@ def _aligned_parameters(camera: DepthCameraModel, body: Body, shapes_m: Array, p
 
 
 class _NearestPoints(NamedTuple):
-    """Points of a cloud, and the points of a surface nearest to them.
+    """Points of a cloud, and the points of a surface nearest to them."""
 
-    Attributes
-    ----------
-    indices : (k,) array
-        Indices of the points in the cloud.
-    faces : (k,) array
-        Face of each nearest point.
-    barycentric : (k, 3) array
-        Its barycentric coordinates on the face.
-    """
-
-    indices: Index
-    faces: Index
-    barycentric: Array
+    indices: Index  # (k,): indices of the points in the cloud
+    faces: Index  # (k,): face of each nearest point
+    barycentric: Array  # (k, 3): its barycentric coordinates on the face
 
 
 def _match_image(

@@ -44,21 +44,13 @@ TRIANGLES_OF_FACE = {
 
 @dataclass(frozen=True, eq=False)
 class VisibleSurface:
-    """Faces of a body's surface, each divided into flat triangles.
+    """Faces of a body's surface, each divided into flat triangles."""
 
-    Attributes
-    ----------
-    nodes : (n,) array
-        Indices of the body's nodes on the surface, ascending.
-    faces : (F, 3) or (F, 6) array
-        Indices into `nodes` of each face: three corners, then for six nodes the middles of its
-        edges.
-    is_selected : (F,) array of bool
-        Faces that the camera may see according to the problem.
-    """
-
-    nodes: Index
+    nodes: Index  # (n,): indices of the body's nodes on the surface, ascending
+    # (F, 3) or (F, 6): indices into `nodes` of each face: three corners, then for six nodes the
+    # middles of its edges.
     faces: Index
+    # (F,) of bool: faces that the camera may see according to the problem.
     is_selected: NDArray[np.bool_]
 
     @classmethod

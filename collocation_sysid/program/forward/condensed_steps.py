@@ -137,21 +137,12 @@ class StepEquations(ABC):
 
 
 class ActiveCompliance(NamedTuple):
-    """Compliance of a body at active dofs.
+    """Compliance of a body at active dofs."""
 
-    Attributes
-    ----------
-    dofs : (s,) array
-        Sorted indices of the dofs among the free ones.
-    columns : (s, k) array
-        Columns of the inverse of the matrix of the body at these dofs, transposed.
-    matrix : (s, s) array
-        C, the entries of these columns at the dofs [m/N].
-    """
-
-    dofs: Index
+    dofs: Index  # (s,): sorted indices of the dofs among the free ones
+    # (s, k): columns of the inverse of the matrix of the body at these dofs, transposed.
     columns: Array
-    matrix: Array
+    matrix: Array  # (s, s): C, the entries of these columns at the dofs [m/N]
 
 
 class Compliance:
@@ -251,26 +242,16 @@ class Compliance:
 
 @dataclass(frozen=True, eq=False)
 class _PointAssembly:
-    """Assembly of the forces on t active points of one local force.
+    """Assembly of the forces on t active points of one local force."""
 
-    Attributes
-    ----------
-    places : (t · 3v,) array
-        Index among the active dofs of each dof of each point, point by point; s for dofs that are
-        prescribed, or along axes without a force.
-    pair_places : (t · 9v²,) array
-        Index among the pairs of active dofs, of which there are (s + 1)², of each pair of dofs of
-        each point.
-    weights : (t, v) array
-        Shape functions of the nodes of each point.
-    pair_weights : (t, v, 1, v, 1) array
-        Products of two of these weights.
-    """
-
+    # (t · 3v,): index among the active dofs of each dof of each point, point by point; s for dofs
+    # that are prescribed, or along axes without a force.
     places: Index
+    # (t · 9v²,): index among the pairs of active dofs, of which there are (s + 1)², of each pair of
+    # dofs of each point.
     pair_places: Index
-    weights: Array
-    pair_weights: Array
+    weights: Array  # (t, v): shape functions of the nodes of each point
+    pair_weights: Array  # (t, v, 1, v, 1): products of two of these weights
 
     @classmethod
     def from_places(cls, places: Index, weights: Array, size: int) -> _PointAssembly:
@@ -298,17 +279,10 @@ class _PointAssembly:
 class ActiveDofs:
     """Free dofs of the nodes of active points along the axes of their forces, and the assembly of
     forces on them.
-
-    Attributes
-    ----------
-    dofs : (s,) array
-        Sorted indices among the free dofs.
-    parts : sequence of _PointAssembly
-        Assembly of the points of each local force.
     """
 
-    dofs: Index
-    parts: Sequence[_PointAssembly]
+    dofs: Index  # (s,): sorted indices among the free dofs
+    parts: Sequence[_PointAssembly]  # assembly of the points of each local force
 
     @classmethod
     def from_points(cls, points: Sequence[ActivePoints], number: Index) -> ActiveDofs:
@@ -373,23 +347,12 @@ class ActiveDofs:
 
 @dataclass(frozen=True, eq=False)
 class ForcesOnActiveDofs:
-    """Local forces of a state on the active dofs.
+    """Local forces of a state on the active dofs."""
 
-    Attributes
-    ----------
-    x : (3n,) array
-        Positions [m].
-    points : sequence of ActivePoints
-        Active points of each local force.
-    active : ActiveDofs
-        Active dofs.
-    force : (s,) array
-        Forces on these dofs, multiplied by the weight of local forces in the equations [N].
-    """
-
-    x: Array
-    points: Sequence[ActivePoints]
+    x: Array  # (3n,): positions [m]
+    points: Sequence[ActivePoints]  # active points of each local force
     active: ActiveDofs
+    # (s,): forces on these dofs, multiplied by the weight of local forces in the equations [N].
     force: Array
 
     @property
@@ -402,20 +365,11 @@ class ForcesOnActiveDofs:
 class CondensedStiffness:
     """Stiffness K of local forces and compliance C of the body at active dofs, with the factor of
     1 + C K.
-
-    Attributes
-    ----------
-    compliance : ActiveCompliance
-        Compliance of the body.
-    stiffness : (s, s) array
-        K, the negative derivative of the local forces [N/m].
-    factor : tuple
-        LU factorisation of 1 + C K.
     """
 
-    compliance: ActiveCompliance
-    stiffness: Array
-    factor: tuple[Array, Index]
+    compliance: ActiveCompliance  # compliance of the body
+    stiffness: Array  # (s, s): K, the negative derivative of the local forces [N/m]
+    factor: tuple[Array, Index]  # LU factorisation of 1 + C K
 
     @classmethod
     def from_matrices(cls, compliance: ActiveCompliance, stiffness: Array) -> CondensedStiffness:

@@ -42,34 +42,19 @@ SHIFT = 0.01
 
 @dataclass(frozen=True, eq=False)
 class StabilityLoss:
-    """Mode in which a body loses its stability, and the stretches where the mode is largest.
+    """Mode in which a body loses its stability, and the stretches where the mode is largest."""
 
-    Attributes
-    ----------
-    positions_m : (n, 3) array
-        Nodes of the body at the end of the stable path [m].
-    mode : (n, 3) array
-        Displacements of the nodes; the longest has length one.
-    faces : (F, 3) array
-        Corners of the surface's triangles.
-    place_m : (3,) array
-        Undeformed place of the decisive face [m].
-    smaller_stretch, larger_stretch : float
-        Principal stretches of the surface there, the smaller first.
-    critical_stretch : float
-        Smaller stretch at which a neo-Hookean surface is unstable, for the same relation of both
-        stretches.
-    wavelength_m : float
-        Wavelength of the mode on the undeformed surface, 2π √(∫|φ|² / ∫|∇φ|²) [m].
-    """
-
-    positions_m: Array
-    mode: Array
-    faces: Index
-    place_m: Array
+    positions_m: Array  # (n, 3): nodes of the body at the end of the stable path [m]
+    mode: Array  # (n, 3): displacements of the nodes; the longest has length one
+    faces: Index  # (F, 3): corners of the surface's triangles
+    place_m: Array  # (3,): undeformed place of the decisive face [m]
+    # Principal stretches of the surface there, the smaller first.
     smaller_stretch: float
     larger_stretch: float
+    # Smaller stretch at which a neo-Hookean surface is unstable, for the same relation of both
+    # stretches.
     critical_stretch: float
+    # Wavelength of the mode on the undeformed surface, 2π √(∫|φ|² / ∫|∇φ|²) [m].
     wavelength_m: float
 
     @property

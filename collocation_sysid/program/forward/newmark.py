@@ -47,26 +47,17 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """State of the integrator at one time.
+    """State of the integrator at one time."""
 
-    Attributes
-    ----------
-    t_s : float
-        Time [s].
-    x, v, a : (3n,) arrays
-        Positions [m], velocities [m/s] and accelerations without local forces
-        [m/s²].
-    previous_histories : tuple
-        History variables after the step; empty if there are none.
-    local_n : (3n,) array or None
-        Mean of the local forces over the step that led here [N]; None if there are none.
-    """
-
-    t_s: float
+    t_s: float  # time [s]
+    # (3n,): positions [m], velocities [m/s] and accelerations without local forces [m/s²].
     x: Array
     v: Array
     a: Array
+    # History variables after the step; empty if there are none.
     previous_histories: tuple[PreviousState, ...] = ()
+    # (3n,) or None: mean of the local forces over the step that led here [N]; None if there are
+    # none.
     local_n: Array | None = None
 
 

@@ -34,44 +34,24 @@ DIFFERENCE = 1e-6
 
 
 class NewtonLinearisation(NamedTuple):
-    """Residual r and its derivative at a state x.
+    """Residual r and its derivative at a state x."""
 
-    Attributes
-    ----------
-    residual : (3n,) array
-        Residual [N].
-    symmetric : (m,) array
-        Lower triangle of the symmetric part of −∂r/∂x [N/m].
-    skew : (m,) or (0,) array
-        Lower triangle of the skew part of −∂r/∂x; empty for a symmetric derivative.
-    """
-
-    residual: Array
-    symmetric: Array
+    residual: Array  # (3n,): residual [N]
+    symmetric: Array  # (m,): lower triangle of the symmetric part of −∂r/∂x [N/m]
+    # (m,) or (0,): lower triangle of the skew part of −∂r/∂x; empty for a symmetric derivative.
     skew: Array
 
 
 @dataclass(frozen=True, eq=False)
 class LaggedStress:
-    """Mean stresses of the elements as functions of the positions of Newton's method.
+    """Mean stresses of the elements as functions of the positions of Newton's method."""
 
-    Attributes
-    ----------
-    forces : Forces
-        Forces in the residual.
-    states : callable
-        Positions ξ [m] and velocities ν [m/s], (1, 3n) each, at which they are evaluated, of the
-        positions x (3n,).
-    weight : float
-        Derivative of ξ by x times the factor of the forces in the residual.
-    velocity_slope : float
-        Derivative of ν by ξ [1/s].
-    """
-
-    forces: Forces
+    forces: Forces  # forces in the residual
+    # Positions ξ [m] and velocities ν [m/s], (1, 3n) each, at which they are evaluated, of the
+    # positions x (3n,).
     states: Callable[[Array], tuple[Array, Array]]
-    weight: float = 1.0
-    velocity_slope: float = 0.0
+    weight: float = 1.0  # derivative of ξ by x times the factor of the forces in the residual
+    velocity_slope: float = 0.0  # derivative of ν by ξ [1/s]
 
     def at(self, x: Array) -> Array:
         """Return the mean stresses (E,) [Pa] at x (3n,) [m]."""

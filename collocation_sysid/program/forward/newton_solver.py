@@ -61,21 +61,12 @@ Linearise = Callable[[Array], NewtonLinearisation]
 
 
 class _Iterate(NamedTuple):
-    """Iterate of Newton's method.
+    """Iterate of Newton's method."""
 
-    Attributes
-    ----------
-    x : (3n,) array
-        State [m].
-    factor : Factor
-        Factor with which the step was computed; that of the previous iterate for a last step.
-    step : (free,) array
-        Newton step from x [m].
-    """
-
-    x: Array
+    x: Array  # (3n,): state [m]
+    # Factor with which the step was computed; that of the previous iterate for a last step.
     factor: Factor
-    step: Array
+    step: Array  # (free,): Newton step from x [m]
 
 
 @dataclass(frozen=True)
@@ -107,18 +98,10 @@ class NewtonOptions:
 
 
 class _Chords(NamedTuple):
-    """Result of chord steps towards an equilibrium.
+    """Result of chord steps towards an equilibrium."""
 
-    Attributes
-    ----------
-    x : (3n,) array
-        Last state [m].
-    converged : bool
-        Whether the expected error of x is negligible.
-    """
-
-    x: Array
-    converged: bool
+    x: Array  # (3n,): last state [m]
+    converged: bool  # whether the expected error of x is negligible
 
 
 class NewtonFailure(Exception):
@@ -617,17 +600,13 @@ class _CompleteIteration:
 
     Attributes
     ----------
-    solver : NewtonSolver
-        Stores the factor.
-    equations : StepEquations
-        Equations of the step.
     has_factor : bool
         Whether there is a factor of an earlier state. Where factors are reused for several
         matrices, that of another time step does not count: a new matrix costs less than steps that
         shrink more slowly.
     """
 
-    solver: NewtonSolver
+    solver: NewtonSolver  # stores the factor
     equations: StepEquations
 
     def __post_init__(self) -> None:

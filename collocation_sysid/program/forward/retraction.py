@@ -40,21 +40,13 @@ LONGEST_STEP = 1e6
 
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """Least-squares problem of one coordinate of the positions.
+    """Least-squares problem of one coordinate of the positions."""
 
-    Attributes
-    ----------
-    free, prescribed : (f,), (p,) arrays
-        Nodes whose coordinate is free or prescribed.
-    factor : SuperLU
-        Factor of the normal equations of the free nodes.
-    coupling : (f, p) sparse array
-        Normal equations of the free nodes by the prescribed ones.
-    """
-
+    # (f,), (p,): nodes whose coordinate is free or prescribed.
     free: Index
     prescribed: Index
-    factor: SuperLU
+    factor: SuperLU  # factor of the normal equations of the free nodes
+    # (f, p) sparse: normal equations of the free nodes by the prescribed ones.
     coupling: sp.csc_array
 
 

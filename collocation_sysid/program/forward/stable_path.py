@@ -49,20 +49,11 @@ Equations = Callable[[float], tuple[Residual, Linearise, Array]]
 
 @dataclass(frozen=True, eq=False)
 class BranchChange:
-    """First sample that is not on the path of stable equilibria from the sample before.
+    """First sample that is not on the path of stable equilibria from the sample before."""
 
-    Attributes
-    ----------
-    time_s : float
-        Time of the sample [s].
-    lost_s : float
-        Time up to which the path is stable, interpolated between the samples [s].
-    loss : StabilityLoss or None
-        Mode in which the body loses its stability there; None if it is not known.
-    """
-
-    time_s: float
-    lost_s: float
+    time_s: float  # time of the sample [s]
+    lost_s: float  # time up to which the path is stable, interpolated between the samples [s]
+    # Mode in which the body loses its stability there; None if it is not known.
     loss: StabilityLoss | None
 
     def describe(self) -> str:

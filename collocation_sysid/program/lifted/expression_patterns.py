@@ -25,40 +25,24 @@ ONE = np.ones(1)
 
 
 class PatternIndices(NamedTuple):
-    """Variables or constraints of instances.
+    """Variables or constraints of instances."""
 
-    Attributes
-    ----------
-    indices : (k, …) array
-        Their indices in z or g.
-    unit : array
-        Physical value of one unit of each; of the same shape as `indices` or one that broadcasts to
-        it.
-    """
-
-    indices: Index
+    indices: Index  # (k, …): their indices in z or g
+    # Physical value of one unit of each; of the same shape as `indices` or one that broadcasts to
+    # it.
     unit: Array = ONE
 
 
 @dataclass(frozen=True, eq=False)
 class ExpressionPattern:
-    """An expression at I instances.
+    """An expression at I instances."""
 
-    Attributes
-    ----------
-    expression : GeneratedFunction
-        Function y(u, data) with derivatives.
-    data : (d, I) array
-        Data of the instances.
-    inputs : PatternIndices, (k, I)
-        Variables that are the inputs u; the expression gets their physical values.
-    rows : PatternIndices, (m, I)
-        Constraints that the values y, divided by their units, are added to.
-    """
-
-    expression: GeneratedFunction
-    data: Array
+    expression: GeneratedFunction  # function y(u, data) with derivatives
+    data: Array  # (d, I): data of the instances
+    # PatternIndices, (k, I): variables that are the inputs u; the expression gets their physical
+    # values.
     inputs: PatternIndices
+    # PatternIndices, (m, I): constraints that the values y, divided by their units, are added to.
     rows: PatternIndices
 
     @classmethod

@@ -33,20 +33,11 @@ class LiftedForceHistory(LiftedVariables):
     """Lifted history variables b of one force of one experiment.
 
     Arrays end with the axes of evaluations and instances, (…, T, I).
-
-    Attributes
-    ----------
-    motion_history : int
-        Index of the history in `ExperimentIterate.histories`.
-    force_index : int
-        Index of the force, see `ForceHistory`.
-    reactions : LiftedReactions or None
-        Lifted reaction forces, whose equations also contain the force; None if the program has
-        none.
     """
 
-    motion_history: int
-    force_index: int
+    motion_history: int  # index of the history in `ExperimentIterate.histories`
+    force_index: int  # index of the force, see `ForceHistory`
+    # Lifted reaction forces, whose equations also contain the force; None if the program has none.
     reactions: LiftedReactions | None = None
     kind = "force"
     # Index of the evaluation that the first variables belong to.

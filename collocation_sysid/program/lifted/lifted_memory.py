@@ -31,22 +31,13 @@ from .lifted_variables import LiftedVariables, concatenated_entries
 
 @dataclass(frozen=True, eq=False)
 class _Lag:
-    """Entries of evaluations `start` … `stop` − 1 at one lag of a stencil.
+    """Entries of evaluations `start` … `stop` − 1 at one lag of a stencil."""
 
-    Attributes
-    ----------
-    lag : int
-        Number of grid times before the evaluation.
-    start, stop : int
-        Range of the evaluations.
-    factors : (N,) array
-        Coefficients of the stencil, by evaluation.
-    """
-
-    lag: int
+    lag: int  # number of grid times before the evaluation
+    # Range of the evaluations.
     start: int
     stop: int
-    factors: Array
+    factors: Array  # (N,): coefficients of the stencil, by evaluation
 
     def select_evaluations(self) -> Index:
         """Return the indices (T, 1) of the evaluations."""
@@ -55,55 +46,28 @@ class _Lag:
 
 @dataclass(frozen=True, eq=False)
 class _MotionEntries:
-    """Entries of one set of equations of motion that contain the memory.
+    """Entries of one set of equations of motion that contain the memory."""
 
-    Attributes
-    ----------
-    derivative_indices : (K,) array
-        Indices of the derivatives.
-    row_indices : (K,) array
-        Index of the row of each within its grid time.
-    rows : MotionEquations
-        The equations.
-    """
-
-    derivative_indices: Index
-    row_indices: Index
+    derivative_indices: Index  # (K,): indices of the derivatives
+    row_indices: Index  # (K,): index of the row of each within its grid time
     rows: MotionEquations
 
 
 class _StressEntries(NamedTuple):
-    """Derivatives of the stresses of all branches by positions, K in total.
+    """Derivatives of the stresses of all branches by positions, K in total."""
 
-    Attributes
-    ----------
-    positions : (K,) array
-        Column of each in `stress_jacobian`.
-    variables : (K,) array
-        History variable to which the stress belongs, among the width of all branches.
-    dofs : (K,) array
-        Dof by which it is differentiated.
-    branches : (K,) array
-        Index of the branch.
-    """
-
-    positions: Index
+    positions: Index  # (K,): column of each in `stress_jacobian`
+    # (K,): history variable to which the stress belongs, among the width of all branches.
     variables: Index
-    dofs: Index
-    branches: Index
+    dofs: Index  # (K,): dof by which it is differentiated
+    branches: Index  # (K,): index of the branch
 
 
 @dataclass(frozen=True, eq=False)
 class LiftedMemory(LiftedVariables):
-    """Lifted history variables m of a viscoelastic body.
+    """Lifted history variables m of a viscoelastic body."""
 
-    Attributes
-    ----------
-    reactions : LiftedReactions or None
-        Lifted reaction forces, whose equations also contain the memory; None if the program has
-        none.
-    """
-
+    # Lifted reaction forces, whose equations also contain the memory; None if the program has none.
     reactions: LiftedReactions | None = None
     kind = "memory"
     # The history of the body is the first in `ExperimentIterate.histories`.

@@ -147,23 +147,12 @@ class LiftedReactions(LiftedVariables):
 
 
 class MotionEquations(NamedTuple):
-    """Constraints that contain forces: equations of motion, or those of reaction forces.
+    """Constraints that contain forces: equations of motion, or those of reaction forces."""
 
-    Attributes
-    ----------
-    row_of_dof : (3n,) array
-        Index of each dof's row within a grid time, −1 where it has none.
-    first_row : int
-        Index in g of the first row.
-    rows_per_time : int
-        Number of rows of a grid time.
-    omits_prescribed : bool
-        Whether forces on dofs that a grasp prescribes at that time are left out.
-    """
-
-    row_of_dof: Index
-    first_row: int
-    rows_per_time: int
+    row_of_dof: Index  # (3n,): index of each dof's row within a grid time, −1 where it has none
+    first_row: int  # index in g of the first row
+    rows_per_time: int  # number of rows of a grid time
+    # Whether forces on dofs that a grasp prescribes at that time are left out.
     omits_prescribed: bool
 
 

@@ -34,21 +34,11 @@ ITSELF = GeneratedFunction(lambda u, _: u, 6, data_size=0)
 
 @dataclass(frozen=True, eq=False)
 class LiftedResultant(LiftedVariables):
-    """Lifted resultants W and low-pass filtered resultants Y of one sensor.
+    """Lifted resultants W and low-pass filtered resultants Y of one sensor."""
 
-    Attributes
-    ----------
-    residual_index : int
-        Index of the measurement among those of the transcription.
-    residual : MeasurementResidual
-        The measurement.
-    reactions : LiftedReactions
-        Lifted reaction forces of the experiment.
-    """
-
-    residual_index: int
+    residual_index: int  # index of the measurement among those of the transcription
     residual: MeasurementResidual
-    reactions: LiftedReactions
+    reactions: LiftedReactions  # lifted reaction forces of the experiment
     kind = "reaction"
 
     @property

@@ -25,43 +25,21 @@ from .expression_patterns import ExpressionPattern
 
 @dataclass(frozen=True)
 class LiftedOffsets:
-    """Offsets of a group of lifted variables in the program.
+    """Offsets of a group of lifted variables in the program."""
 
-    Attributes
-    ----------
-    variable : int
-        Index in z of its first variable.
-    row : int
-        Index in g of its first equation.
-    """
-
-    variable: int
-    row: int
+    variable: int  # index in z of its first variable
+    row: int  # index in g of its first equation
 
 
 @dataclass(frozen=True, eq=False)
 class LiftedVariables(ABC):
-    """A group of lifted variables of one experiment, and as many equations.
+    """A group of lifted variables of one experiment, and as many equations."""
 
-    Attributes
-    ----------
-    transcription : Transcription
-        Transcription of the experiment.
-    segment_index : int
-        Index of the transcription.
-    first_phi : int
-        Index in z where the nuisance parameters of all experiments begin.
-    offsets : LiftedOffsets
-        Offsets of the variables and equations.
-    kind : {"memory", "force", "pressure", "reaction"}
-        Kind of quantity.
-    """
-
-    transcription: Transcription
-    segment_index: int
-    first_phi: int
-    offsets: LiftedOffsets
-    kind: ClassVar[str]
+    transcription: Transcription  # transcription of the experiment
+    segment_index: int  # index of the transcription
+    first_phi: int  # index in z where the nuisance parameters of all experiments begin
+    offsets: LiftedOffsets  # offsets of the variables and equations
+    kind: ClassVar[str]  # kind of quantity
 
     @property
     @abstractmethod

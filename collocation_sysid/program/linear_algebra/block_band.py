@@ -28,45 +28,26 @@ from ...fem.pattern import SymmetricPattern
 
 @dataclass(frozen=True, eq=False)
 class BlockTerm:
-    """Term a[t] A[t + shift] + b[t] B[t + shift] of a block.
+    """Term a[t] A[t + shift] + b[t] B[t + shift] of a block."""
 
-    Attributes
-    ----------
-    shift : int
-        Offset of the index into A and B.
-    a, b : (N,) arrays
-        Coefficients, by column time t.
-    """
-
-    shift: int
+    shift: int  # offset of the index into A and B
+    # (N,): coefficients, by column time t.
     a: Array
     b: Array
 
 
 @dataclass(frozen=True, eq=False)
 class BandBlock:
-    """Blocks at one row offset: their entries, and the terms that fill them.
+    """Blocks at one row offset: their entries, and the terms that fill them."""
 
-    Attributes
-    ----------
-    offset : int
-        Row block minus column block.
-    rows, columns : (e,) arrays
-        Entries within the block.
-    lower_positions : (e,) array
-        Position of each entry in the lower triangle; −1 where only constants are stored.
-    terms : sequence of BlockTerm
-        Terms whose sum is the block.
-    full_positions : (e,) array
-        Position of each entry in both triangles, see `pattern.full`.
-    """
-
-    offset: int
+    offset: int  # row block minus column block
+    # (e,): entries within the block.
     rows: Index
     columns: Index
+    # (e,): position of each entry in the lower triangle; −1 where only constants are stored.
     lower_positions: Index
-    terms: Sequence[BlockTerm]
-    full_positions: Index
+    terms: Sequence[BlockTerm]  # terms whose sum is the block
+    full_positions: Index  # (e,): position of each entry in both triangles, see `pattern.full`
 
 
 class BlockBand:
@@ -184,39 +165,18 @@ class BlockBand:
 
 @dataclass(frozen=True, eq=False)
 class _ColumnBlock:
-    """Structure of one column block: entries sorted by column, then row.
-
-    Attributes
-    ----------
-    columns : int
-        Columns of the block.
-    top : int
-        Rows above all blocks.
-    blocks : sequence of BandBlock
-        Blocks that exist in it.
-    entry_count : int
-        Number of entries.
-    column_ends : (columns,) array
-        End of each column.
-    top_positions : (columns, top) array
-        Positions of the top rows' entries.
-    sorted_positions : (entries,) array
-        Sorted position of each entry, blocks stacked after the top rows.
-    block_indices : (entries,) array
-        Index of the block of each stacked entry, −1 for top rows.
-    rows : (entries,) array
-        Row of each stacked entry within its block.
-    """
+    """Structure of one column block: entries sorted by column, then row."""
 
     columns: int
-    top: int
-    blocks: Sequence[BandBlock]
-    entry_count: int
-    column_ends: Index
-    top_positions: Index
+    top: int  # rows above all blocks
+    blocks: Sequence[BandBlock]  # blocks that exist in it
+    entry_count: int  # number of entries
+    column_ends: Index  # (columns,): end of each column
+    top_positions: Index  # (columns, top): positions of the top rows' entries
+    # (entries,): sorted position of each entry, blocks stacked after the top rows.
     sorted_positions: Index
-    block_indices: Index
-    rows: Index
+    block_indices: Index  # (entries,): index of the block of each stacked entry, −1 for top rows
+    rows: Index  # (entries,): row of each stacked entry within its block
 
     @classmethod
     def from_blocks(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _ColumnBlock:
@@ -293,22 +253,13 @@ class CombinePlan:
 
     A task is value[out + target[i]] (+)= a A[row, source[i]] + b B[row, source[i]] for all i of a
     map.
-
-    Attributes
-    ----------
-    first_task : (N + 1,) array
-        Tasks of column block t are first_task[t] … first_task[t + 1] − 1.
-    tasks : (tasks, 5) array
-        out, start of the map, length of the map, row, and 1 to add or 0 to overwrite.
-    coefficients : (tasks, 2) array
-        a and b.
-    targets, sources : int32 arrays
-        Concatenated maps.
     """
 
-    first_task: Index
+    first_task: Index  # (N + 1,): tasks of column block t are first_task[t] … first_task[t + 1] − 1
+    # (tasks, 5): out, start of the map, length of the map, row, and 1 to add or 0 to overwrite.
     tasks: Index
-    coefficients: Array
+    coefficients: Array  # (tasks, 2): a and b
+    # Concatenated maps.
     targets: NDArray[np.int32]
     sources: NDArray[np.int32]
 

@@ -90,21 +90,11 @@ class Factor(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _BandFactor:
-    """Cholesky factor of a symmetric band.
+    """Cholesky factor of a symmetric band."""
 
-    Attributes
-    ----------
-    band : (half-bandwidth + 1, k) array
-        Lower band of the factor, in double or single precision.
-    order : (k,) array
-        Free dof of each row of the band.
-    positive_definite : bool
-        Always true.
-    """
-
-    band: Band
-    order: Index
-    positive_definite: bool = True
+    band: Band  # (half-bandwidth + 1, k): lower band of the factor, in double or single precision
+    order: Index  # (k,): free dof of each row of the band
+    positive_definite: bool = True  # always true
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, in the
@@ -123,28 +113,15 @@ class _BandFactor:
 
 @dataclass(frozen=True, eq=False)
 class _SkylineFactor:
-    """Factors L, D and U within a skyline, see `fem.kernels.skyline`.
+    """Factors L, D and U within a skyline, see `fem.kernels.skyline`."""
 
-    Attributes
-    ----------
-    skyline : SkylineFactorisation
-        Structure and kernels.
-    sides : array
-        L and U; one of them for a symmetric matrix.
-    pivots : array
-        D.
-    order, rank : (k,) arrays
-        Permutation to the skyline and its inverse.
-    positive_definite : bool
-        Always true.
-    """
-
-    skyline: SkylineFactorisation
-    sides: Array
-    pivots: Array
+    skyline: SkylineFactorisation  # structure and kernels
+    sides: Array  # L and U; one of them for a symmetric matrix
+    pivots: Array  # D
+    # (k,): permutation to the skyline and its inverse.
     order: Index
     rank: Index
-    positive_definite: bool = True
+    positive_definite: bool = True  # always true
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
@@ -161,35 +138,21 @@ class _SkylineFactor:
 class _RefinedFactor:
     """Iterative refinement of the solutions of an approximate factor: that of the symmetric part,
     or of rounded numbers, or both.
-
-    Attributes
-    ----------
-    approximate : Factor
-        Factor of a matrix near `matrix`; symmetric.
-    matrix : (k, k) sparse array
-        The matrix.
-    factorise_complete : callable
-        Returns a better factor, which is used if the refinement does not converge.
-    positive_definite : bool
-        Always true.
-    accuracy : float
-        Relative size of the last correction.
-    last_rates : dict of int to float
-        Rate at which the corrections of the last matrix became smaller, with the key 0; updated in
-        place. Above `ACCURACY` it replaces a first correction, whose only purpose would be to
-        measure that rate. It is shared by the symmetric matrices of one analysis, whose rates are
-        those of rounding. The rate of a matrix with a skew part is that of this matrix alone: under
-        friction it is tiny in one time step, and large in the next one.
-    divergence_flags : list of bool
-        Not empty after the refinement has failed once.
     """
 
-    approximate: Factor
-    matrix: sp.csr_array
+    approximate: Factor  # factor of a matrix near `matrix`; symmetric
+    matrix: sp.csr_array  # (k, k) sparse: the matrix
+    # Returns a better factor, which is used if the refinement does not converge.
     factorise_complete: Callable[[], Factor]
-    accuracy: float
+    accuracy: float  # relative size of the last correction
+    # dict of int to float: rate at which the corrections of the last matrix became smaller, with
+    # the key 0; updated in place. Above `ACCURACY` it replaces a first correction, whose only
+    # purpose would be to measure that rate. It is shared by the symmetric matrices of one analysis,
+    # whose rates are those of rounding. The rate of a matrix with a skew part is that of this
+    # matrix alone: under friction it is tiny in one time step, and large in the next one.
     last_rates: dict[int, float]
-    positive_definite: bool = True
+    positive_definite: bool = True  # always true
+    # Not empty after the refinement has failed once.
     divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
@@ -223,49 +186,26 @@ class _RefinedFactor:
 class _OrderedColumns(NamedTuple):
     """Structure of both triangles of a matrix in compressed columns, in the order in which SuperLU
     fills in little.
-
-    Attributes
-    ----------
-    order : (k,) array
-        Free dof of each row and column.
-    rank : (k,) array
-        Row and column of each free dof.
-    column_starts : (k + 1,) array of int32
-        Index of the first entry of each column, and the number of entries.
-    rows : (e,) array of int32
-        Row of each entry, ascending in each column.
-    entries : (e,) array
-        Position of each entry among those of both triangles.
-    counts : (k,) array
-        Number of entries of each column of L without row exchanges.
     """
 
-    order: Index
-    rank: Index
+    order: Index  # (k,): free dof of each row and column
+    rank: Index  # (k,): row and column of each free dof
+    # (k + 1,) of int32: index of the first entry of each column, and the number of entries.
     column_starts: NDArray[np.int32]
-    rows: NDArray[np.int32]
-    entries: Index
-    counts: Index
+    rows: NDArray[np.int32]  # (e,) of int32: row of each entry, ascending in each column
+    entries: Index  # (e,): position of each entry among those of both triangles
+    counts: Index  # (k,): number of entries of each column of L without row exchanges
 
 
 @dataclass(frozen=True, eq=False)
 class _SparseFactor:
-    """Complete LU factorisation of a sparse matrix by SuperLU.
+    """Complete LU factorisation of a sparse matrix by SuperLU."""
 
-    Attributes
-    ----------
-    lu : SuperLU
-        The factorisation of the matrix in another order.
-    order, rank : (k,) arrays
-        Free dof of each row of that matrix, and row of each free dof.
-    positive_definite : bool
-        See `Factor.positive_definite`.
-    """
-
-    lu: SuperLU
+    lu: SuperLU  # the factorisation of the matrix in another order
+    # (k,): free dof of each row of that matrix, and row of each free dof.
     order: Index
     rank: Index
-    positive_definite: bool
+    positive_definite: bool  # see `Factor.positive_definite`
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the

@@ -53,18 +53,10 @@ def relative_cost(factoriser: Factoriser, columns: int) -> float:
 
 
 class Matrix(NamedTuple):
-    """Matrix of one time step.
+    """Matrix of one time step."""
 
-    Attributes
-    ----------
-    values : (m,) array
-        Lower triangle of the symmetric part, see `Factoriser.factorise`.
-    skew : (m,) or (0,) array
-        Lower triangle of the skew part; empty for a symmetric matrix.
-    """
-
-    values: Array
-    skew: Array
+    values: Array  # (m,): lower triangle of the symmetric part, see `Factoriser.factorise`
+    skew: Array  # (m,) or (0,): lower triangle of the skew part; empty for a symmetric matrix
 
 
 class NodeRotation:
@@ -113,24 +105,12 @@ def best_rotation(before_m: Array, after_m: Array) -> Array:
 
 @dataclass(eq=False)
 class FactorSequence:
-    """Solver of the systems of successive time steps with the latest factor.
+    """Solver of the systems of successive time steps with the latest factor."""
 
-    Attributes
-    ----------
-    factoriser : Factoriser
-        Analysis of the sparsity pattern, with single precision.
-    rotation : NodeRotation
-        Rotation of the free dofs.
-    accuracy : float
-        Relative accuracy of the solutions.
-    factorisation_count : int
-        Number of factorisations so far.
-    """
-
-    factoriser: Factoriser
-    rotation: NodeRotation
-    accuracy: float = ACCURACY
-    factorisation_count: int = 0
+    factoriser: Factoriser  # analysis of the sparsity pattern, with single precision
+    rotation: NodeRotation  # rotation of the free dofs
+    accuracy: float = ACCURACY  # relative accuracy of the solutions
+    factorisation_count: int = 0  # number of factorisations so far
     _factor: Factor | None = None
     _points_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
     # Cost of the factor and of all solutions with it, in solutions for all columns.
@@ -274,20 +254,11 @@ class _Columns:
 class ReusedFactor:
     """System of one time step, solved with the latest factor of a sequence; the matrix is
     factorised only where that is too slow.
-
-    Attributes
-    ----------
-    sequence : FactorSequence
-        Shared by all time steps, which are solved one after the other.
-    matrix : Matrix
-        The matrix.
-    points_m : (n, 3) array
-        Positions of the nodes at the evaluation of the matrix [m].
     """
 
-    sequence: FactorSequence
+    sequence: FactorSequence  # shared by all time steps, which are solved one after the other
     matrix: Matrix
-    points_m: Array
+    points_m: Array  # (n, 3): positions of the nodes at the evaluation of the matrix [m]
     _complete: Factor | None = None
 
     @property

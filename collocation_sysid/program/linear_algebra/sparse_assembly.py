@@ -14,18 +14,10 @@ from ...common.unique_codes import unique_codes
 
 
 class EntryBlock(NamedTuple):
-    """Entries whose rows and columns are sums of arrays that broadcast.
+    """Entries whose rows and columns are sums of arrays that broadcast."""
 
-    Attributes
-    ----------
-    rows : sequence of arrays or int
-        Summands of the row indices.
-    columns : sequence of arrays or int
-        Summands of the column indices.
-    """
-
-    rows: Sequence[Index | int]
-    columns: Sequence[Index | int]
+    rows: Sequence[Index | int]  # summands of the row indices
+    columns: Sequence[Index | int]  # summands of the column indices
 
     def count_entries(self) -> int:
         """Return the number of entries: the size of the broadcast arrays."""
@@ -39,28 +31,14 @@ class EntryBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SparseAssembly:
-    """Structure of a sparse matrix, and positions of the values of its contributions.
+    """Structure of a sparse matrix, and positions of the values of its contributions."""
 
-    Attributes
-    ----------
-    indptr : array
-        Column pointers.
-    indices : array
-        Row indices.
-    initial_positions : array or None
-        Position of each value of the initial structure; None if they all come first, in their
-        order.
-    group_positions : tuple of arrays
-        Positions of the entries of each group.
-    has_duplicates : tuple of bool
-        Whether several entries of a group have the same position.
-    """
-
-    indptr: Index
-    indices: Index
+    indptr: Index  # column pointers
+    indices: Index  # row indices
+    # Position of each value of the initial structure; None if they all come first, in their order.
     initial_positions: Index | None
-    group_positions: tuple[Index, ...]
-    has_duplicates: tuple[bool, ...]
+    group_positions: tuple[Index, ...]  # positions of the entries of each group
+    has_duplicates: tuple[bool, ...]  # whether several entries of a group have the same position
 
     @classmethod
     def from_groups(

@@ -188,21 +188,11 @@ def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
 
 @dataclass(frozen=True, eq=False)
 class SupernodalFactor:
-    """Supernodal factor that returns its memory to a pool when it is deleted.
+    """Supernodal factor that returns its memory to a pool when it is deleted."""
 
-    Attributes
-    ----------
-    pardiso : Pardiso
-        Memory of the factor.
-    pool : list of Pardiso
-        Pool of memory that is not in use.
-    positive_definite : bool
-        Always true.
-    """
-
-    pardiso: Pardiso
-    pool: list[Pardiso]
-    positive_definite: bool = True
+    pardiso: Pardiso  # memory of the factor
+    pool: list[Pardiso]  # pool of memory that is not in use
+    positive_definite: bool = True  # always true
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (n,) or (n, m); the matrix is symmetric, so

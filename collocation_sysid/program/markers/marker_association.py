@@ -32,20 +32,11 @@ SAME_EDGE_DISTANCE = 1e-6
 class ShapeFunctions(NamedTuple):
     """Weights of the npe nodes of an element in the place of each marker, and their derivatives by
     the k coordinates of the place, which are in prior standard deviations.
-
-    Attributes
-    ----------
-    weights : (M, npe) array
-        Shape functions, npe being the nodes per element.
-    gradients : (M, npe, k) array
-        First derivatives; zero for exact places.
-    hessians : (M, npe, k, k) array
-        Second derivatives; zero for exact places.
     """
 
-    weights: Array
-    gradients: Array
-    hessians: Array
+    weights: Array  # (M, npe): shape functions, npe being the nodes per element
+    gradients: Array  # (M, npe, k): first derivatives; zero for exact places
+    hessians: Array  # (M, npe, k, k): second derivatives; zero for exact places
 
 
 @dataclass(frozen=True, eq=False)

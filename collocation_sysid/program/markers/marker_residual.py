@@ -34,31 +34,16 @@ NEIGHBOURS = 5
 
 @dataclass(frozen=True, eq=False)
 class MarkerResidual(MeasurementResidual):
-    """Measurement model of the tracks of all markers of an experiment.
+    """Measurement model of the tracks of all markers of an experiment."""
 
-    Attributes
-    ----------
-    observable : PointPositions
-        Places of the markers on the body at the samples.
-    markers : Markers
-        Measured tracks.
-    is_initially_at_rest : bool
-        Whether the body rests in its first state before the first time; then a marker of an earlier
-        time is predicted there, otherwise such samples are not compared.
-    preceding_times : int
-        Number of the observable's times before the first sample.
-    clock_samples : int
-        Whole samples of the clock's shift.
-    delay_s : float
-        Time by which samples are taken later than `t_s` [s].
-    """
-
-    observable: PointPositions
-    markers: Markers
+    observable: PointPositions  # places of the markers on the body at the samples
+    markers: Markers  # measured tracks
+    # Whether the body rests in its first state before the first time; then a marker of an earlier
+    # time is predicted there, otherwise such samples are not compared.
     is_initially_at_rest: bool
-    preceding_times: int
-    clock_samples: int
-    delay_s: float = 0.0
+    preceding_times: int  # number of the observable's times before the first sample
+    clock_samples: int  # whole samples of the clock's shift
+    delay_s: float = 0.0  # time by which samples are taken later than `t_s` [s]
 
     @classmethod
     def from_markers(

@@ -42,37 +42,18 @@ MOST_SAMPLES = 300
 class DeclaredMotion:
     """Statements of an experiment about poses, markers, mesh size and gravity, each of which may be
     wrong.
-
-    Attributes
-    ----------
-    t_s : (T,) array
-        Times [s].
-    rotations : (T, 3, 3) array
-        Rotations R of the grasp's poses.
-    translations_m : (T, 3) array
-        Translations p of the poses [m].
-    tracks_m : (T, M, 3) array
-        Measured markers [m], NaN where missing.
-    gravity_m_s2 : (3,) array
-        Gravity [m/s²].
-    mesh_scale : float
-        Factor of the size of the mesh and of the markers' places on it.
-    lag_s : float
-        Delay of the markers' clock [s].
-    name : str
-        Name of the experiment in quotation marks.
-    first_motion : (4, 4) array
-        Constant motion that is part of the poses and is applied first, such as `gripper_to_body`.
     """
 
-    t_s: Array
-    rotations: Array
-    translations_m: Array
-    tracks_m: Array
-    gravity_m_s2: Array
-    mesh_scale: float = 1.0
-    lag_s: float = 0.0
-    name: str = ""
+    t_s: Array  # (T,): times [s]
+    rotations: Array  # (T, 3, 3): rotations R of the grasp's poses
+    translations_m: Array  # (T, 3): translations p of the poses [m]
+    tracks_m: Array  # (T, M, 3): measured markers [m], NaN where missing
+    gravity_m_s2: Array  # (3,): gravity [m/s²]
+    mesh_scale: float = 1.0  # factor of the size of the mesh and of the markers' places on it
+    lag_s: float = 0.0  # delay of the markers' clock [s]
+    name: str = ""  # name of the experiment in quotation marks
+    # (4, 4): constant motion that is part of the poses and is applied first, such as
+    # `gripper_to_body`.
     first_motion: Array = field(default_factory=lambda: np.eye(4))
 
     @classmethod
@@ -156,36 +137,17 @@ def carrying_grasp(experiment: Experiment) -> Grasp | None:
 
 @dataclass(frozen=True, eq=False)
 class ModalResponse:
-    """Natural modes of a body in its grasp, evaluated at its M markers.
+    """Natural modes of a body in its grasp, evaluated at its M markers."""
 
-    Attributes
-    ----------
-    places_m : (M, 3) array
-        Markers on the undeformed body [m].
-    relative_frequencies : (K,) array
-        Angular frequencies relative to the lowest.
-    node_shapes : (K, n, 3) array
-        Displacements of the nodes, for modes with φᵀ M φ = 1 kg.
-    shapes : (K, M, 3) array
-        Displacements of the markers in these modes.
-    translation_loads : (K, 3) array
-        Modal loads φᵀM of a uniform acceleration.
-    rotation_loads : (K, 3, 3) array
-        Modal loads φᵀM xᵀ of an acceleration that is linear in the place.
-    size_m : float
-        Diagonal of the body [m].
-    is_initially_at_rest : bool
-        Whether the body starts in equilibrium; otherwise undeformed.
-    """
-
-    places_m: Array
-    relative_frequencies: Array
-    node_shapes: Array
-    shapes: Array
-    translation_loads: Array
+    places_m: Array  # (M, 3): markers on the undeformed body [m]
+    relative_frequencies: Array  # (K,): angular frequencies relative to the lowest
+    node_shapes: Array  # (K, n, 3): displacements of the nodes, for modes with φᵀ M φ = 1 kg
+    shapes: Array  # (K, M, 3): displacements of the markers in these modes
+    translation_loads: Array  # (K, 3): modal loads φᵀM of a uniform acceleration
+    # (K, 3, 3): modal loads φᵀM xᵀ of an acceleration that is linear in the place.
     rotation_loads: Array
-    size_m: float
-    is_initially_at_rest: bool
+    size_m: float  # diagonal of the body [m]
+    is_initially_at_rest: bool  # whether the body starts in equilibrium; otherwise undeformed
 
     @classmethod
     def from_experiment(

@@ -39,24 +39,13 @@ TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class Instability:
-    """Experiment with states in which disturbances grow.
-
-    Attributes
-    ----------
-    experiment : str
-        Name of the experiment.
-    time_s : float
-        Time of the state in which they grow fastest [s].
-    growth_1_s : float
-        Largest Re(s) there [1/s].
-    e_foldings : float
-        Integral of Re(s) > 0 over the recording: a disturbance may grow by e to this power.
-        Infinite for equilibria, to which a disturbed state does not return.
-    """
+    """Experiment with states in which disturbances grow."""
 
     experiment: str
-    time_s: float
-    growth_1_s: float
+    time_s: float  # time of the state in which they grow fastest [s]
+    growth_1_s: float  # largest Re(s) there [1/s]
+    # Integral of Re(s) > 0 over the recording: a disturbance may grow by e to this power. Infinite
+    # for equilibria, to which a disturbed state does not return.
     e_foldings: float
 
 

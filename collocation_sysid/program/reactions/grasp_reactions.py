@@ -30,21 +30,12 @@ Weights = tuple[Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class StreamedResultant(ReactionResultant):
-    """Resultant of the reactions of a grasp at consecutive time steps.
+    """Resultant of the reactions of a grasp at consecutive time steps."""
 
-    Attributes
-    ----------
-    rotations : (n + 2, 3, 3)
-        Rotations of the poses, with one more time step on either side.
-    shifts : (n + 2, 3)
-        Translations of the poses [m].
-    step_s : float
-        Time step [s].
-    """
-
+    # (n + 2, 3, 3): rotations of the poses, with one more time step on either side.
     rotations: Array
-    shifts: Array
-    step_s: float
+    shifts: Array  # (n + 2, 3): translations of the poses [m]
+    step_s: float  # time step [s]
 
     @classmethod
     def from_poses(
@@ -98,23 +89,13 @@ class GraspReactions:
     grasps.
 
     The template is a fixed-size array of the latest time steps.
-
-    Attributes
-    ----------
-    forces : GraspForces
-        Forces at the sensed dofs, with derivatives.
-    position_columns : (rows, g, 1 + m)
-        Columns of the positions of these dofs: Newton correction and sensitivities.
-    rotations : (rows, G, 3, 3)
-        Rotations of the grasps.
-    shifts : (rows, G, 3)
-        Translations of the grasps.
     """
 
-    forces: GraspForces
+    forces: GraspForces  # forces at the sensed dofs, with derivatives
+    # (rows, g, 1 + m): columns of the positions of these dofs: Newton correction and sensitivities.
     position_columns: Array
-    rotations: Array
-    shifts: Array
+    rotations: Array  # (rows, G, 3, 3): rotations of the grasps
+    shifts: Array  # (rows, G, 3): translations of the grasps
 
     @classmethod
     def zeros(cls, rows: int, dofs: int, columns: int, grasps: int) -> GraspReactions:

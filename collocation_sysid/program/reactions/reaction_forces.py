@@ -59,18 +59,10 @@ def centred_rows(dynamics: Dynamics) -> tuple[NDArray[np.bool_], int]:
 
 @dataclass(frozen=True, eq=False)
 class GraspForces:
-    """Forces F on the sensed dofs at every evaluation, and their changes.
+    """Forces F on the sensed dofs at every evaluation, and their changes."""
 
-    Attributes
-    ----------
-    force : (rows, g) array
-        Forces [N].
-    changes : (rows, g, columns) array
-        Changes dF of each column of a forward substitution.
-    """
-
-    force: Array
-    changes: Array
+    force: Array  # (rows, g): forces [N]
+    changes: Array  # (rows, g, columns): changes dF of each column of a forward substitution
 
     @classmethod
     def zeros(cls, rows: int, dofs: int, columns: int) -> GraspForces:

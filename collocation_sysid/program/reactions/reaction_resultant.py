@@ -49,27 +49,14 @@ TIMES_PER_SAMPLE = 4
 
 @dataclass(frozen=True, eq=False)
 class ReactionGrid:
-    """Grid times, and the rows of equations of motion that determine reaction forces.
+    """Grid times, and the rows of equations of motion that determine reaction forces."""
 
-    Attributes
-    ----------
-    t_s : (N,) array
-        Evenly spaced times [s], unless `is_static`.
-    has_reaction : (N,) array of bool
-        Rows that determine a reaction force.
-    delay_steps : int
-        Row t determines the reaction force at grid time t − `delay_steps`.
-    reach : int
-        Row t depends on the grasp from time t − reach on.
-    is_static : bool
-        Whether the rows are equilibria, at times that need not be evenly spaced; the resultant is
-        then linear between them.
-    """
-
-    t_s: Array
-    has_reaction: NDArray[np.bool_]
-    delay_steps: int
-    reach: int
+    t_s: Array  # (N,): evenly spaced times [s], unless `is_static`
+    has_reaction: NDArray[np.bool_]  # (N,) of bool: rows that determine a reaction force
+    delay_steps: int  # row t determines the reaction force at grid time t − `delay_steps`
+    reach: int  # row t depends on the grasp from time t − reach on
+    # Whether the rows are equilibria, at times that need not be evenly spaced; the resultant is
+    # then linear between them.
     is_static: bool = False
 
     @classmethod

@@ -165,25 +165,15 @@ _ALL_QUALIFIERS = frozenset().union(*QUALIFIERS.values())
 
 @dataclass(frozen=True, eq=False)
 class QuantityTable:
-    """Quantities of a table in SI units.
+    """Quantities of a table in SI units."""
 
-    Attributes
-    ----------
-    grid : TextTable
-        Cells of the table.
-    t_s : (T,) array
-    values : dict
-        (T,) array by the key of each quantity that the table has, NaN where missing.
-    unread : tuple of str
-        Columns with a unit that hold none of the quantities; empty if the user named the columns.
-    noises : dict
-        (T,) array of standard deviations by their key of `NOISES`, NaN where missing.
-    """
-
-    grid: TextTable
-    t_s: Array
+    grid: TextTable  # cells of the table
+    t_s: Array  # (T,)
+    # dict: (T,) array by the key of each quantity that the table has, NaN where missing.
     values: Mapping[str, Array]
+    # Columns with a unit that hold none of the quantities; empty if the user named the columns.
     unread: tuple[str, ...] = ()
+    # dict: (T,) array of standard deviations by their key of `NOISES`, NaN where missing.
     noises: Mapping[str, Array] = field(default_factory=dict)
 
 

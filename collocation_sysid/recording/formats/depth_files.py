@@ -53,23 +53,13 @@ NORMALS = ("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")
 
 @dataclass(frozen=True, eq=False)
 class DepthFileContent:
-    """Depth data of a file or a folder: either images or clouds.
+    """Depth data of a file or a folder: either images or clouds."""
 
-    Attributes
-    ----------
-    images_m : sequence of (rows, columns)
-        Depth images; empty for clouds.
-    clouds_m : list of (P, 3) or (P, 6)
-        Clouds of points, with normals where known; empty for images.
-    t_s : (S,) or None
-        Sample times; None if they are not stated.
-    matrix, pose, distortion : array or None
-        Camera model; None where it is not stated.
-    """
-
-    images_m: Sequence[Array]
+    images_m: Sequence[Array]  # sequence of (rows, columns): depth images; empty for clouds
+    # list of (P, 3) or (P, 6): clouds of points, with normals where known; empty for images.
     clouds_m: list[Array]
-    t_s: Array | None = None
+    t_s: Array | None = None  # (S,) or None: sample times; None if they are not stated
+    # Camera model; None where it is not stated.
     matrix: Array | None = None
     pose: Array | None = None
     distortion: Array | None = None
@@ -79,20 +69,11 @@ class DepthFileContent:
 class _LazyImages(Sequence[Array]):
     """Images [m] of messages, decoded when they are accessed, as all of them may not fit into
     memory.
-
-    Attributes
-    ----------
-    messages : sequence
-        Image messages.
-    count_m : float or None
-        Depth of one count of an integer image; None for a millimetre.
-    path : Path
-        File, for messages.
     """
 
     messages: Sequence[Any]
-    count_m: float | None
-    path: Path
+    count_m: float | None  # depth of one count of an integer image; None for a millimetre
+    path: Path  # file, for messages
 
     def __len__(self) -> int:
         return len(self.messages)

@@ -36,34 +36,18 @@ SAME_POSE = 1e-9
 
 @dataclass(frozen=True)
 class TopicFrames:
-    """Frames in which the messages of a topic are stated; empty where a topic does not state one.
+    """Frames in which the messages of a topic are stated; empty where a topic does not state one."""
 
-    Attributes
-    ----------
-    parent : str
-        Frame of the components: of positions, or of forces.
-    child : str
-        Frame whose pose the messages hold.
-    """
-
-    parent: str = ""
-    child: str = ""
+    parent: str = ""  # frame of the components: of positions, or of forces
+    child: str = ""  # frame whose pose the messages hold
 
 
 @dataclass(frozen=True)
 class LogFrames:
-    """Transforms between the frames of a log.
+    """Transforms between the frames of a log."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the log, for messages.
-    edges : mapping
-        Poses of child frames in their parents, by (parent, child) and time [s].
-    """
-
-    name: str
-    edges: Edges
+    name: str  # name of the log, for messages
+    edges: Edges  # mapping: poses of child frames in their parents, by (parent, child) and time [s]
 
     @classmethod
     def read(cls, address: TopicAddress) -> LogFrames:

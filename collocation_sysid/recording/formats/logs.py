@@ -31,29 +31,17 @@ _NEEDS = "reading logs needs {}: pip install 'collocation-sysid[logs]'"
 
 @dataclass(frozen=True)
 class TopicAddress:
-    """A topic of a log, and options for reading it.
+    """A topic of a log, and options for reading it."""
 
-    Attributes
-    ----------
-    log : Path
-        File, or folder of a bag or of a dataset.
-    topic : str
-    frames : tuple of (parent, child) or None
-        Frames of a transform: the pose of the child in the parent is read.
-    robot : Path or None
-        URDF file, relative to the log's folder, that converts joint positions to poses.
-    unit : {"rad", "deg"} or None
-        Unit of joint angles; None for the log's own.
-    episode : int or None
-        Episode of a dataset, counted from 0.
-    """
-
-    log: Path
+    log: Path  # file, or folder of a bag or of a dataset
     topic: str
+    # tuple of (parent, child) or None: frames of a transform: the pose of the child in the parent
+    # is read.
     frames: tuple[str, str] | None = None
+    # URDF file, relative to the log's folder, that converts joint positions to poses.
     robot: Path | None = None
-    unit: str | None = None
-    episode: int | None = None
+    unit: str | None = None  # unit of joint angles; None for the log's own
+    episode: int | None = None  # episode of a dataset, counted from 0
 
     @classmethod
     def from_path(cls, path: str | Path) -> TopicAddress | None:
@@ -278,24 +266,15 @@ class _Json:
 
 @dataclass
 class _Dataset:
-    """A LeRobot dataset: its topics are the features, its messages the frames of an episode.
-
-    Attributes
-    ----------
-    path : Path
-    episode : int or None
-        Episode to read; None for the only one.
-    topics, start_ns, unit
-        See `Log`.
-    names : mapping of topic to list of str
-        Names of the numbers of each feature.
-    """
+    """A LeRobot dataset: its topics are the features, its messages the frames of an episode."""
 
     path: Path
-    episode: int | None = None
+    episode: int | None = None  # episode to read; None for the only one
+    # See `Log`.
     topics: dict[str, tuple[str, int]] = field(default_factory=dict)
     start_ns: int = 0
     unit: str | None = None  # not prescribed by the format
+    # mapping of topic to list of str: names of the numbers of each feature.
     names: dict[str, list[str]] = field(default_factory=dict)
 
     def __enter__(self) -> Log:

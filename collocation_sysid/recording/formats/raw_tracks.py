@@ -109,14 +109,9 @@ def tracks_of_table(
 
 @dataclass(frozen=True)
 class Header:
-    """Statements of a file above its frames.
+    """Statements of a file above its frames."""
 
-    Attributes
-    ----------
-    entries : mapping of a key to its text and line
-    """
-
-    entries: Mapping[str, tuple[str, int]]
+    entries: Mapping[str, tuple[str, int]]  # mapping of a key to its text and line
 
     def number(self, key: str) -> float | None:
         """Return the number that a key states; None if it is blank or missing.

@@ -60,30 +60,17 @@ Edges = dict[tuple[str, str], dict[float, tuple[float, ...]]]
 
 @dataclass(frozen=True)
 class LogTopic:
-    """A topic of a log, and its possible uses.
-
-    Attributes
-    ----------
-    name, type : str
-    messages : int
-        Number of messages.
-    rate_hz : float or None
-        Rate of the first messages; None for fewer than two.
-    serves : str
-        Possible uses in words; empty if the topic cannot be used.
-    write : tuple of str
-        Text to write in a problem file in place of a file, one for each way to read the topic.
-    frame : str
-        Frame in which the first message states its values; empty if it names none, and for
-        transforms.
-    """
+    """A topic of a log, and its possible uses."""
 
     name: str
     type: str
-    messages: int
-    rate_hz: float | None
-    serves: str
+    messages: int  # number of messages
+    rate_hz: float | None  # rate of the first messages; None for fewer than two
+    serves: str  # possible uses in words; empty if the topic cannot be used
+    # Text to write in a problem file in place of a file, one for each way to read the topic.
     write: tuple[str, ...]
+    # Frame in which the first message states its values; empty if it names none, and for
+    # transforms.
     frame: str = ""
 
 

@@ -43,27 +43,13 @@ FACTOR_THRESHOLD = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Confidence:
-    """Estimates and the covariance of their logarithms, for estimates that have an uncertainty.
+    """Estimates and the covariance of their logarithms, for estimates that have an uncertainty."""
 
-    Attributes
-    ----------
-    names : (k,) str
-        Names of the parameters.
-    values : (k,)
-        The estimates.
-    covariance : (k, k)
-        Covariance of their logarithms, finite.
-    quantiles : (k,)
-        Half widths of the 95 % intervals in standard deviations.
-    is_combined : bool
-        Whether the covariance contains systematic effects, not noise alone.
-    """
-
-    names: Sequence[str]
-    values: Array
-    covariance: Array
-    quantiles: Array
-    is_combined: bool = False
+    names: Sequence[str]  # (k,) str: names of the parameters
+    values: Array  # (k,): the estimates
+    covariance: Array  # (k, k): covariance of their logarithms, finite
+    quantiles: Array  # (k,): half widths of the 95 % intervals in standard deviations
+    is_combined: bool = False  # whether the covariance contains systematic effects, not noise alone
 
     @classmethod
     def from_result(cls, result: Result) -> Confidence | None:
@@ -170,22 +156,13 @@ def _draw_pair(axes: Axes, outline: Array, half_width: float, half_height: float
 
 @dataclass(frozen=True)
 class _DeviationAxis:
-    """Axis of a logarithm's deviation from its estimate.
+    """Axis of a logarithm's deviation from its estimate."""
 
-    Attributes
-    ----------
-    reach : float
-        Largest deviation shown, on either side.
-    ticks, labels : tuple of three
-        Deviations with a tick, and their texts.
-    unit : str
-        Text after the name of the parameter.
-    """
-
-    reach: float
+    reach: float  # largest deviation shown, on either side
+    # Deviations with a tick, and their texts.
     ticks: tuple[float, float, float]
     labels: tuple[str, str, str]
-    unit: str
+    unit: str  # text after the name of the parameter
 
     @classmethod
     def from_reach(cls, reach: float) -> _DeviationAxis:

@@ -65,31 +65,18 @@ MAX_SHOWN_MARKERS = 3
 
 @dataclass(frozen=True)
 class TrackLayout:
-    """Measures of the figure of marker tracks, three columns wide.
+    """Measures of the figure of marker tracks, three columns wide."""
 
-    Attributes
-    ----------
-    row_mm : float
-        Height of a marker's row: its tracks above its residuals.
-    row_gap_mm : float
-        Distance of two rows, for the labels of the times.
-    legend_mm, foot_mm : float
-        Height of the legend above the rows, and of the time axis below them.
-    first_margin_mm, last_margin_mm : float
-        Width of the margins at the left, with labels, and at the right.
-    column_gap_mm : float
-        Distance of two columns, with labels.
-    upper_share : float
-        Share of a row's height for the tracks; the others are for the residuals.
-    """
-
-    row_mm: float = 27.0
-    row_gap_mm: float = 6.5
+    row_mm: float = 27.0  # height of a marker's row: its tracks above its residuals
+    row_gap_mm: float = 6.5  # distance of two rows, for the labels of the times
+    # Height of the legend above the rows, and of the time axis below them.
     legend_mm: float = 12.0
     foot_mm: float = 10.0
+    # Width of the margins at the left, with labels, and at the right.
     first_margin_mm: float = 15.0
     last_margin_mm: float = 2.0
-    column_gap_mm: float = 10.0
+    column_gap_mm: float = 10.0  # distance of two columns, with labels
+    # Share of a row's height for the tracks; the others are for the residuals.
     upper_share: float = 0.64
 
 

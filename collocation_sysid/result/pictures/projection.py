@@ -27,14 +27,9 @@ LIGHT_DIRECTION = np.array([-0.4, 0.5, 0.8]) / np.linalg.norm([-0.4, 0.5, 0.8])
 
 @dataclass(frozen=True, eq=False)
 class ParallelCamera:
-    """Parallel projection along a viewing direction.
+    """Parallel projection along a viewing direction."""
 
-    Attributes
-    ----------
-    axes : (3, 3)
-        Orthonormal rows in the world: right and top of the picture, and towards the viewer.
-    """
-
+    # (3, 3): orthonormal rows in the world: right and top of the picture, and towards the viewer.
     axes: Array
 
     @classmethod

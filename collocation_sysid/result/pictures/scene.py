@@ -44,21 +44,11 @@ def sheet(width_mm: float, height_mm: float) -> tuple[Figure, Axes]:
 
 @dataclass(frozen=True, eq=False)
 class SheetView:
-    """Parallel projection of a body onto the sheet, with scale and position.
+    """Parallel projection of a body onto the sheet, with scale and position."""
 
-    Attributes
-    ----------
-    camera : ParallelCamera
-        Viewing direction.
-    mm_per_m : float
-        Scale: millimetres on the sheet per metre in space.
-    origin_mm : (2,)
-        Position on the sheet of the origin of space.
-    """
-
-    camera: ParallelCamera
-    mm_per_m: float
-    origin_mm: Array
+    camera: ParallelCamera  # viewing direction
+    mm_per_m: float  # scale: millimetres on the sheet per metre in space
+    origin_mm: Array  # (2,): position on the sheet of the origin of space
 
     @classmethod
     def fit_points(

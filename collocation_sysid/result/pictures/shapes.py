@@ -57,17 +57,10 @@ FIELD_COLOURS = ListedColormap(colormaps["YlGnBu"](np.linspace(0.0, 0.8, 256))).
 
 @dataclass(frozen=True, eq=False)
 class SurfaceField:
-    """Field that colours the surface of a body.
+    """Field that colours the surface of a body."""
 
-    Attributes
-    ----------
-    title : str
-        Name with unit.
-    values_at : callable
-        Returns the values (k, F) on the boundary triangles at samples with indices (k,).
-    """
-
-    title: str
+    title: str  # name with unit
+    # Returns the values (k, F) on the boundary triangles at samples with indices (k,).
     values_at: Callable[[Index], Array]
 
 

@@ -89,15 +89,9 @@ SUBSTEPS_NOTE = (
 
 @dataclass(frozen=True, kw_only=True)
 class QuickCheck:
-    """Findings of `check` without a simulation.
+    """Findings of `check` without a simulation."""
 
-    Attributes
-    ----------
-    bodies : tuple of BodyCheck
-        One for each body.
-    """
-
-    bodies: tuple[BodyCheck, ...]
+    bodies: tuple[BodyCheck, ...]  # one for each body
     recordings: tuple[RecordingCheck, ...]
     holds: tuple[GraspCheck, ...]
 
@@ -112,66 +106,45 @@ LIFTED_KINDS = (
 
 @dataclass(frozen=True, kw_only=True)
 class CheckResult(QuickCheck):
-    """All findings of `check`.
-
-    Attributes
-    ----------
-    experiments, timesteps : int
-        Numbers of experiments, and of time steps of all fitted experiments.
-    samples, missing : int
-        Marker samples that are present and that are missing, of all experiments.
-    largest_marker_distance_m : float
-        Largest distance of a marker from the body.
-    rms_at_guess_m : float or None
-        RMS distance of the markers in the simulation at the guess; None if only the first samples
-        were simulated.
-    variables, constraints : int
-        Size of the program without lifted variables.
-    overstresses, wrenches : int
-        Numbers of lifted variables: overstresses of bodies with memory, and wrenches of sensors,
-        for interior point and other methods that need the whole program.
-    jacobian_nonzeros, hessian_nonzeros : int
-        With lifted variables.
-    method : str
-        The chosen method.
-    memory_mb : float or None
-        Estimated memory of the chosen method; None if it is not among the `costs`.
-    jacobian_error, hessian_error : float
-        Largest relative deviation from central differences along random directions.
-    causes : tuple of Hypothesis
-        Likely errors in the description; their sentences are the first warnings.
-    combinations : tuple of Combination
-        Combinations of constants that the recordings determine at the guess although a constant
-        alone is not determined; empty unless the complete recordings were simulated.
-    notes : tuple of str
-        Sentences for information, without a remedy.
-    concerns : tuple of Concern
-        Expected problems, with the remedy; `warnings` are their sentences.
-    """
+    """All findings of `check`."""
 
     SERIALISED_PROPERTIES: ClassVar = ("warnings",)
 
+    # Numbers of experiments, and of time steps of all fitted experiments.
     experiments: int
     timesteps: int
+    # Marker samples that are present and that are missing, of all experiments.
     samples: int
     missing: int
-    largest_marker_distance_m: float
+    largest_marker_distance_m: float  # largest distance of a marker from the body
+    # RMS distance of the markers in the simulation at the guess; None if only the first samples
+    # were simulated.
     rms_at_guess_m: float | None
     motions: tuple[ModesCheck, ...]
+    # Size of the program without lifted variables.
     variables: int
     constraints: int
+    # Numbers of lifted variables: overstresses of bodies with memory, and wrenches of sensors, for
+    # interior point and other methods that need the whole program.
     overstresses: int
     wrenches: int
+    # With lifted variables.
     jacobian_nonzeros: int
     hessian_nonzeros: int
-    method: str
+    method: str  # the chosen method
+    # Estimated memory of the chosen method; None if it is not among the `costs`.
     memory_mb: float | None
     costs: tuple[MethodCost, ...]
+    # Largest relative deviation from central differences along random directions.
     jacobian_error: float
     hessian_error: float
+    # Likely errors in the description; their sentences are the first warnings.
     causes: tuple[Hypothesis, ...]
+    # Combinations of constants that the recordings determine at the guess although a constant alone
+    # is not determined; empty unless the complete recordings were simulated.
     combinations: tuple[Combination, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # sentences for information, without a remedy
+    # Expected problems, with the remedy; `warnings` are their sentences.
     concerns: tuple[Concern, ...] = ()
 
     def find_chosen_cost(self) -> MethodCost | None:

@@ -45,21 +45,11 @@ _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 @dataclass(frozen=True)
 class ElementShape:
-    """Shape of an element, compared with the regular tetrahedron.
+    """Shape of an element, compared with the regular tetrahedron."""
 
-    Attributes
-    ----------
-    element : int
-        Its index.
-    quality : float
-        Mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is.
-    aspect_ratio : float
-        Longest edge over smallest height: 1.22 for the regular tetrahedron.
-    """
-
-    element: int
-    quality: float
-    aspect_ratio: float
+    element: int  # its index
+    quality: float  # mean ratio: 1 for the regular tetrahedron, towards 0 the flatter it is
+    aspect_ratio: float  # longest edge over smallest height: 1.22 for the regular tetrahedron
 
 
 def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
@@ -181,62 +171,42 @@ LEAST_FIELD_VARIANCE = 0.5
 
 @dataclass(frozen=True)
 class BodyCheck:
-    """Size, mesh and guess of a body.
-
-    Attributes
-    ----------
-    element : str
-        Name of the element, such as "tet10".
-    nodes, elements : int
-        Numbers of nodes and elements.
-    volume_m3, mass_kg : float
-        Volume of the mesh, and mass at the guess, without point masses.
-    point_masses_kg : mapping of str to float
-        Sum of the point masses of each experiment that has any, by its name.
-    size_m : (x, y, z) extents of the mesh along the axes
-    smallest_element_quality, median_element_quality : float
-        Mean ratio, see `ElementShape`.
-    cells_across : float
-        Number of elements across the body's thickness.
-    guess : mapping of name to float
-        Values of the constants, and of E and ν at small strain, at the guess.
-    concerns : tuple of Concern
-        Concerns about the elements; `warnings` are their sentences.
-    fields : mapping of the name of a constant to FieldResolution
-        Constants that vary in space.
-    rest_shape : str or None
-        "stress_free" or "under_gravity" where that is stated or follows from how the mesh was made.
-    rest_shape_change_m : float
-        Largest distance of the mesh from the stress-free shape at the guess; NaN where there is no
-        such shape.
-    made, mesh_from : str or None
-        How the body was made, and where its mesh comes from, as stated.
-    is_homogeneous : bool
-        Whether it is the cell of specimens without a mesh, whose deformation is homogeneous.
-    """
+    """Size, mesh and guess of a body."""
 
     SERIALISED_PROPERTIES: ClassVar = ("warnings", "open_question")
 
     experiments: tuple[str, ...]
+    # Numbers of nodes and elements.
     nodes: int
     elements: int
-    element: str
+    element: str  # name of the element, such as "tet10"
+    # Volume of the mesh, and mass at the guess, without point masses.
     volume_m3: float
     mass_kg: float
+    # mapping of str to float: sum of the point masses of each experiment that has any, by its name.
     point_masses_kg: Mapping[str, float]
-    size_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]  # (x, y, z) extents of the mesh along the axes
     edges_m: tuple[float, float, float]
+    # Mean ratio, see `ElementShape`.
     smallest_element_quality: float
     median_element_quality: float
     worst_elements: tuple[ElementShape, ...]
-    cells_across: float
+    cells_across: float  # number of elements across the body's thickness
+    # mapping of name to float: values of the constants, and of E and ν at small strain, at the
+    # guess.
     guess: dict[str, float]
-    concerns: tuple[Concern, ...]
+    concerns: tuple[Concern, ...]  # concerns about the elements; `warnings` are their sentences
+    # mapping of the name of a constant to FieldResolution: constants that vary in space.
     fields: dict[str, FieldResolution]
+    # "stress_free" or "under_gravity" where that is stated or follows from how the mesh was made.
     rest_shape: str | None = None
+    # Largest distance of the mesh from the stress-free shape at the guess; NaN where there is no
+    # such shape.
     rest_shape_change_m: float = 0.0
+    # How the body was made, and where its mesh comes from, as stated.
     made: str | None = None
     mesh_from: str | None = None
+    # Whether it is the cell of specimens without a mesh, whose deformation is homogeneous.
     is_homogeneous: bool = False
 
     @property
@@ -371,32 +341,20 @@ NEIGHBOUR_EDGES = 1.5
 
 @dataclass(frozen=True)
 class GraspCheck:
-    """The nodes of one grasp.
-
-    Attributes
-    ----------
-    nodes : int
-        Number of nodes.
-    low_m, high_m : (3,) corners of the box around them, on the undeformed body
-    share : float
-        Share of all nodes.
-    nearly_grasped : int
-        Number of free nodes beside the box, less than a tenth of an edge beyond one of its faces.
-    nearly_free : int
-        Number of held nodes less than a tenth of an edge inside a face beyond which the body
-        continues, and not in that face.
-    axes : str
-        Axes along which the grasp holds.
-    """
+    """The nodes of one grasp."""
 
     experiment: str
-    nodes: int
+    nodes: int  # number of nodes
+    # (3,) corners of the box around them, on the undeformed body: .
     low_m: tuple[float, ...]
     high_m: tuple[float, ...]
-    share: float
+    share: float  # share of all nodes
+    # Number of free nodes beside the box, less than a tenth of an edge beyond one of its faces.
     nearly_grasped: int
+    # Number of held nodes less than a tenth of an edge inside a face beyond which the body
+    # continues, and not in that face.
     nearly_free: int
-    axes: str = "xyz"
+    axes: str = "xyz"  # axes along which the grasp holds
 
 
 def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck, ...]:

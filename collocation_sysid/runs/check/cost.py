@@ -138,19 +138,11 @@ LARGEST_TIME_SHARE = 0.1
 
 @dataclass(frozen=True)
 class MethodCost:
-    """Approximate memory and time of a method.
-
-    Attributes
-    ----------
-    memory_mb : float
-        Estimated memory [MB].
-    time_s : float or None
-        None where it is unknown: the equations at the guess cannot be solved.
-    """
+    """Approximate memory and time of a method."""
 
     method: str
-    memory_mb: float
-    time_s: float | None
+    memory_mb: float  # estimated memory [MB]
+    time_s: float | None  # none where it is unknown: the equations at the guess cannot be solved
 
 
 def method_costs(

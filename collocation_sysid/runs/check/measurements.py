@@ -23,67 +23,40 @@ LARGEST_MISSING_SHARE = 0.5
 
 @dataclass(frozen=True)
 class MarkerCheck:
-    """One marker of a recording.
-
-    Attributes
-    ----------
-    name : str
-        Name of the marker.
-    distance_m : float
-        Distance from the body, or from the node it was attached to.
-    samples, missing : int
-        Numbers of samples that are present, and that are missing.
-    start_miss_m : float or None
-        Distance from its first sample to its position in the simulation at the guess; None without
-        one.
-    """
+    """One marker of a recording."""
 
     name: str
-    distance_m: float
+    distance_m: float  # distance from the body, or from the node it was attached to
+    # Numbers of samples that are present, and that are missing.
     samples: int
     missing: int
+    # Distance from its first sample to its position in the simulation at the guess; None without
+    # one.
     start_miss_m: float | None
 
 
 @dataclass(frozen=True)
 class RecordingCheck:
-    """Measurements of one experiment.
-
-    Attributes
-    ----------
-    validation, static : bool
-        Whether it is for validation, and whether it is a series of equilibria.
-    duration_s, rate_hz : float
-        Duration, and samples per second.
-    frames : int
-        Number of sample times.
-    samples, missing : int
-        Numbers of marker samples that are present, and that are missing.
-    markers : tuple of MarkerCheck
-        One for each marker; empty without markers.
-    unplaced : int
-        Number of markers without a stated place, which are attached at the point of the body that
-        is nearest to their first sample, so that their distance says nothing about the poses.
-    instruments : tuple of str
-        Other instruments, in words.
-    air_density_kg_m3 : float
-        Density of the air around the body in the model; zero in a vacuum.
-    test : str
-        Kind of material test of a specimen without a mesh; "" for other recordings.
-    """
+    """Measurements of one experiment."""
 
     experiment: str
+    # Whether it is for validation, and whether it is a series of equilibria.
     validation: bool
     static: bool
+    # Duration, and samples per second.
     duration_s: float
     rate_hz: float
-    frames: int
+    frames: int  # number of sample times
+    # Numbers of marker samples that are present, and that are missing.
     samples: int
     missing: int
-    markers: tuple[MarkerCheck, ...]
-    instruments: tuple[str, ...]
+    markers: tuple[MarkerCheck, ...]  # one for each marker; empty without markers
+    instruments: tuple[str, ...]  # other instruments, in words
+    # Density of the air around the body in the model; zero in a vacuum.
     air_density_kg_m3: float = 0.0
-    test: str = ""
+    test: str = ""  # kind of material test of a specimen without a mesh; "" for other recordings
+    # Number of markers without a stated place, which are attached at the point of the body that is
+    # nearest to their first sample, so that their distance says nothing about the poses.
     unplaced: int = 0
 
     def find_farthest_marker(self) -> MarkerCheck:

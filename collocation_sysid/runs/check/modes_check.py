@@ -39,58 +39,31 @@ ROUNDING = 12
 
 @dataclass(frozen=True)
 class ModeCheck:
-    """One natural mode.
+    """One natural mode."""
 
-    Attributes
-    ----------
-    frequency_hz : float
-        Undamped natural frequency.
-    samples_per_period, steps_per_period : float
-        Samples of the recording, and steps of the time grid.
-    damping_ratio : float
-        Damping ratio of the mode by the material; 1 or more if it is overdamped.
-    numerical_damping_ratio : float
-        Damping ratio that the scheme adds; negative where it takes some away.
-    period_error : float
-        Relative lengthening of the undamped period by the scheme.
-    """
-
-    frequency_hz: float
+    frequency_hz: float  # undamped natural frequency
+    # Samples of the recording, and steps of the time grid.
     samples_per_period: float
     steps_per_period: float
-    damping_ratio: float
+    damping_ratio: float  # damping ratio of the mode by the material; 1 or more if it is overdamped
+    # Damping ratio that the scheme adds; negative where it takes some away.
     numerical_damping_ratio: float
-    period_error: float
+    period_error: float  # relative lengthening of the undamped period by the scheme
 
 
 @dataclass(frozen=True)
 class ModesCheck:
-    """Natural modes of the body in one experiment, and errors of the time scheme.
-
-    Attributes
-    ----------
-    about : str
-        State about which the body oscillates: "rest state" or "undeformed shape".
-    scheme : str
-        Name of the time scheme.
-    timestep_s : float
-        Step of the time grid.
-    duration_s : float
-        Duration of the recording.
-    substeps_needed : int or None
-        The fewest with which the scheme damps and slows the first mode little; None if too many.
-    not_oscillating : int
-        Number of rigid modes that were left out.
-    """
+    """Natural modes of the body in one experiment, and errors of the time scheme."""
 
     experiment: str
-    about: str
+    about: str  # state about which the body oscillates: "rest state" or "undeformed shape"
     modes: tuple[ModeCheck, ...]
-    scheme: str
-    timestep_s: float
-    duration_s: float
+    scheme: str  # name of the time scheme
+    timestep_s: float  # step of the time grid
+    duration_s: float  # duration of the recording
+    # The fewest with which the scheme damps and slows the first mode little; None if too many.
     substeps_needed: int | None
-    not_oscillating: int
+    not_oscillating: int  # number of rigid modes that were left out
 
     @property
     def first_mode(self) -> ModeCheck | None:

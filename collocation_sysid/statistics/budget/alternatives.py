@@ -50,20 +50,12 @@ class Alternative:
 
 @dataclass(frozen=True)
 class OriginAnswer:
-    """Half widths of the combined intervals for one answer to an open question about the body.
+    """Half widths of the combined intervals for one answer to an open question about the body."""
 
-    Attributes
-    ----------
-    key : {"made", "mesh_from"}
-        Key of the problem file, and argument of `Body`, that is not stated.
-    answer : str
-        Its value, such as "cast".
-    half_widths : mapping of str to float
-        Half width of the 95 % interval of each estimate over its value, by name.
-    """
-
-    key: str
-    answer: str
+    key: str  # key of the problem file, and argument of `Body`, that is not stated
+    answer: str  # its value, such as "cast"
+    # mapping of str to float: half width of the 95 % interval of each estimate over its value, by
+    # name.
     half_widths: Mapping[str, float]
 
 

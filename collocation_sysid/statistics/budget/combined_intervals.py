@@ -25,30 +25,21 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class CombinedEstimate:
-    """A corrected value with its statistical and its combined uncertainty.
+    """A corrected value with its statistical and its combined uncertainty."""
 
-    Attributes
-    ----------
-    value : float
-        The estimate, corrected for the known discretisation error and effects of known size.
-    statistical_std_error : float or None
-        Standard error due to noise and nuisance parameters; None if it has none.
-    statistical95 : (lower, upper) or None
-        95 % interval due to noise and nuisance parameters, about `value`; None if unknown.
-    combined_std_error : float or None
-        Standard uncertainty due to all contributions; None if unknown.
-    combined95 : (lower, upper) or None
-        95 % interval due to all contributions; None if unknown.
-    known_correction : float or None
-        Part of `value` that corrects for effects of known size, before bounds are applied; None if
-        there are none. The correction of the discretisation error is not contained.
-    """
-
+    # The estimate, corrected for the known discretisation error and effects of known size.
     value: float
+    # Standard error due to noise and nuisance parameters; None if it has none.
     statistical_std_error: float | None
+    # (lower, upper) or None: 95 % interval due to noise and nuisance parameters, about `value`;
+    # None if unknown.
     statistical95: Interval | None
+    # Standard uncertainty due to all contributions; None if unknown.
     combined_std_error: float | None = None
+    # (lower, upper) or None: 95 % interval due to all contributions; None if unknown.
     combined95: Interval | None = None
+    # Part of `value` that corrects for effects of known size, before bounds are applied; None if
+    # there are none. The correction of the discretisation error is not contained.
     known_correction: float | None = None
 
 

@@ -36,18 +36,11 @@ UNWEIGHTED = 1e9
 
 @dataclass(frozen=True, eq=False)
 class _EffectColumns(SweepColumns):
-    """Right-hand sides of a forward substitution by changes of forces and of equations.
+    """Right-hand sides of a forward substitution by changes of forces and of equations."""
 
-    Attributes
-    ----------
-    forces_n : (N, 3n, c) array
-        Changes of the forces at the evaluations [N].
-    rows_n : (N, 3n, c) array
-        Changes of the equations of motion [N].
-    """
-
+    # (N, 3n, c): changes of the forces at the evaluations [N].
     forces_n: Array = field(kw_only=True)
-    rows_n: Array = field(kw_only=True)
+    rows_n: Array = field(kw_only=True)  # (N, 3n, c): changes of the equations of motion [N]
 
     def right_hand_sides(
         self,
@@ -67,17 +60,10 @@ class _EffectColumns(SweepColumns):
 
 
 class ResidualChanges(NamedTuple):
-    """Changes of the residuals of a fit if assumptions are off by their standard deviations.
+    """Changes of the residuals of a fit if assumptions are off by their standard deviations."""
 
-    Attributes
-    ----------
-    names : (a,) tuple of str
-        Names of the assumptions with their components.
-    blocks : list of (T, M, 3, a) arrays
-        Changes for each block of `LinearisedFit`, in units of σ.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # (a,) tuple of str: names of the assumptions with their components
+    # list of (T, M, 3, a): changes for each block of `LinearisedFit`, in units of σ.
     blocks: list[Array]
 
     def without(self, assumptions: Iterable[str]) -> ResidualChanges:

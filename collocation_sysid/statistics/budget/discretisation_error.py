@@ -56,29 +56,20 @@ MOST_SUBSTEPS = 8
 
 @dataclass(frozen=True)
 class DiscretisationError:
-    """Discretisation error of one estimate.
+    """Discretisation error of one estimate."""
 
-    Attributes
-    ----------
-    step, mesh : float or None
-        Change of the value with half the step, and with half the edge lengths; None if unknown.
-    step_order, mesh_order : float or None
-        Observed orders; None with two levels, or if the changes did not shrink.
-    extrapolated : float
-        Value without discretisation error, by Richardson's extrapolation.
-    interval95 : (lower, upper) or None
-        95 % interval due to noise and discretisation; None if that due to noise is unknown.
-    estimated_mesh : float or None
-        Change of the value with half the edge lengths to first order, without a solve on a finer
-        mesh. The interval contains it, `extrapolated` does not. None if it was not estimated.
-    """
-
+    # Change of the value with half the step, and with half the edge lengths; None if unknown.
     step: float | None
     mesh: float | None
+    # Observed orders; None with two levels, or if the changes did not shrink.
     step_order: float | None
     mesh_order: float | None
-    extrapolated: float
+    extrapolated: float  # value without discretisation error, by Richardson's extrapolation
+    # (lower, upper) or None: 95 % interval due to noise and discretisation; None if that due to
+    # noise is unknown.
     interval95: tuple[float, float] | None
+    # Change of the value with half the edge lengths to first order, without a solve on a finer
+    # mesh. The interval contains it, `extrapolated` does not. None if it was not estimated.
     estimated_mesh: float | None = None
 
     def with_estimated_mesh(
@@ -132,46 +123,25 @@ def known_kinds(errors: Iterable[DiscretisationError]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RefinementLevel:
-    """One solution on a finer discretisation.
+    """One solution on a finer discretisation."""
 
-    Attributes
-    ----------
-    refined : {"step", "mesh"}
-        What was refined.
-    halvings : int
-        How often it was halved.
-    timesteps, nodes : int
-        Number of grid times, and of nodes of the bodies.
-    iterations : int
-        Iterations of the solve.
-    time_s : float
-        Computing time [s].
-    values : mapping of str to float
-        Parameters and derived moduli by name.
-    """
-
-    refined: str
-    halvings: int
+    refined: str  # what was refined
+    halvings: int  # how often it was halved
+    # Number of grid times, and of nodes of the bodies.
     timesteps: int
     nodes: int
-    iterations: int
-    time_s: float
-    values: Mapping[str, float]
+    iterations: int  # iterations of the solve
+    time_s: float  # computing time [s]
+    values: Mapping[str, float]  # mapping of str to float: parameters and derived moduli by name
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Discretisation errors of all estimates.
+    """Discretisation errors of all estimates."""
 
-    Attributes
-    ----------
-    errors : mapping of str to DiscretisationError
-        Errors by parameter or derived modulus.
-    levels : tuple of RefinementLevel
-        Refined solutions; empty if the errors were estimated without them.
-    """
-
+    # mapping of str to DiscretisationError: errors by parameter or derived modulus.
     errors: Mapping[str, DiscretisationError]
+    # Refined solutions; empty if the errors were estimated without them.
     levels: tuple[RefinementLevel, ...] = ()
 
     @property
@@ -238,21 +208,13 @@ class Refinement:
 class _Extrapolation:
     """Extrapolation from the first of several values to their limit, with its uncertainty on both
     sides.
-
-    Attributes
-    ----------
-    change : float
-        Limit less the first value.
-    below, above : float
-        Uncertainty below and above the limit.
-    order : float or None
-        Observed order; None if it was assumed.
     """
 
-    change: float = 0.0
+    change: float = 0.0  # limit less the first value
+    # Uncertainty below and above the limit.
     below: float = 0.0
     above: float = 0.0
-    order: float | None = None
+    order: float | None = None  # observed order; None if it was assumed
 
     @classmethod
     def from_values(cls, x: Sequence[float], order: float, least: float) -> _Extrapolation:

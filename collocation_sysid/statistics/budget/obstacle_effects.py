@@ -29,23 +29,14 @@ ROWS_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class FirstContact:
-    """First contact of an obstacle with a body, or its nearest approach.
+    """First contact of an obstacle with a body, or its nearest approach."""
 
-    Attributes
-    ----------
-    row : int
-        Index of the row in the grid, from 0.
-    place_m, start_place_m : (3,) arrays
-        Mean of the points in contact, weighted by their pressure, in the row before and at the
-        start [m].
-    normal : (3,) array
-        Normal of the obstacle there, in the world.
-    """
-
-    row: int
+    row: int  # index of the row in the grid, from 0
+    # (3,): mean of the points in contact, weighted by their pressure, in the row before and at the
+    # start [m].
     place_m: Array
     start_place_m: Array
-    normal: Array
+    normal: Array  # (3,): normal of the obstacle there, in the world
 
     @classmethod
     def from_motion(cls, contact: Contact, x: Array) -> FirstContact:

@@ -119,20 +119,11 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class ExperimentAtAnswer:
-    """One experiment at the answer, as the effects of assumptions need it.
-
-    Attributes
-    ----------
-    iterate : ExperimentIterate
-        The experiment at the answer.
-    parameters : Parameters
-        Shared parameters.
-    surface_correlation : float
-        Correlation length of the surface's error over the longest extent of the body.
-    """
+    """One experiment at the answer, as the effects of assumptions need it."""
 
     iterate: ExperimentIterate
-    parameters: Parameters
+    parameters: Parameters  # shared parameters
+    # Correlation length of the surface's error over the longest extent of the body.
     surface_correlation: float = CORRELATION
 
     @property

@@ -49,30 +49,17 @@ def is_definition(row: str, estimate: str) -> bool:
 
 @dataclass(frozen=True)
 class BudgetLine:
-    """Uncertainty budget of one estimate.
+    """Uncertainty budget of one estimate."""
 
-    Attributes
-    ----------
-    value : float
-        The estimate, corrected for the discretisation error and known effects.
-    shares : mapping of str to float
-        Share of each source in the variance, largest first; they sum to one.
-    combined95 : (lower, upper)
-        95 % interval due to all sources.
-    combined_std_error : float
-        Standard uncertainty due to all sources.
-    systematic : float
-        Standard deviation of the systematic effects and of the differences between recordings, in
-        the coordinate of the estimate, see `IntervalCoordinate`.
-    known_effect : float
-        Correction for known effects in the same coordinate, contained in `value`.
-    """
-
-    value: float
+    value: float  # the estimate, corrected for the discretisation error and known effects
+    # mapping of str to float: share of each source in the variance, largest first; they sum to one.
     shares: Mapping[str, float]
-    combined95: Interval
-    combined_std_error: float
+    combined95: Interval  # (lower, upper): 95 % interval due to all sources
+    combined_std_error: float  # standard uncertainty due to all sources
+    # Standard deviation of the systematic effects and of the differences between recordings, in the
+    # coordinate of the estimate, see `IntervalCoordinate`.
     systematic: float
+    # Correction for known effects in the same coordinate, contained in `value`.
     known_effect: float = 0.0
 
     def with_source(
@@ -114,43 +101,26 @@ class BudgetLine:
 
 @dataclass(frozen=True, eq=False)
 class VarianceSources:
-    """Covariances and sensitivities from which budgets are computed.
+    """Covariances and sensitivities from which budgets are computed."""
 
-    Attributes
-    ----------
-    names : (a,) tuple of str
-        Names of the assumptions with their components.
-    sensitivities : (nq, a) array
-        Changes of the shared parameters q if each is off by its standard deviation.
-    covariance_free : (nq, nq) array
-        Covariance of q for the stated noise, with free nuisance parameters.
-    covariance_known : (nq, nq) array
-        Covariance of q for the stated noise, with known nuisance parameters.
-    derivatives : mapping of str to (nq,) array
-        Derivatives of each estimate by q.
-    widening : (nq,) array
-        Factor by which intervals are widened because recordings disagree.
-    recording_sensitivities : (nq, b) array
-        Changes of q with the differences of parameters between recordings, in their standard
-        deviations.
-    freedom : int
-        Degrees of freedom of these deviations: recordings less one.
-    means : mapping of str to float
-        Known effects over their standard deviations, for which estimates are corrected.
-    alternatives : mapping of str to (nq,) array
-        Changes of q if an assumption with an alternative (`Deviation.alternative`) is wrong by one
-        unit, by its name with its component.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # (a,) tuple of str: names of the assumptions with their components
+    # (nq, a): changes of the shared parameters q if each is off by its standard deviation.
     sensitivities: Array
+    # (nq, nq): covariance of q for the stated noise, with free nuisance parameters.
     covariance_free: Array
+    # (nq, nq): covariance of q for the stated noise, with known nuisance parameters.
     covariance_known: Array
-    derivatives: Mapping[str, Array]
-    widening: Array
+    derivatives: Mapping[str, Array]  # mapping of str to (nq,): derivatives of each estimate by q
+    widening: Array  # (nq,): factor by which intervals are widened because recordings disagree
+    # (nq, b): changes of q with the differences of parameters between recordings, in their standard
+    # deviations.
     recording_sensitivities: Array
-    freedom: int = 0
+    freedom: int = 0  # degrees of freedom of these deviations: recordings less one
+    # mapping of str to float: known effects over their standard deviations, for which estimates are
+    # corrected.
     means: Mapping[str, float] = field(default_factory=dict)
+    # mapping of str to (nq,): changes of q if an assumption with an alternative
+    # (`Deviation.alternative`) is wrong by one unit, by its name with its component.
     alternatives: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod

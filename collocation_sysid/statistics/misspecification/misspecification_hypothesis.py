@@ -27,38 +27,23 @@ Correction = tuple[Experiment, dict[str, object]] | None
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One possible mistake in the description of a problem.
+    """One possible mistake in the description of a problem."""
 
-    Attributes
-    ----------
-    code : str
-        Cause and how it shows, such as "marker-slip/alone".
-    subject : str
-        What is described, as the beginning of the message; may be empty.
-    data : mapping of str to value
-        Values of the placeholders in the message.
-    corrected : Any
-        Description with the mistake corrected, of the type that its test expects; None if no test
-        is needed.
-    handicap : float
-        Factor by which a hypothesis with fitted numbers must fit better than one without.
-    strength : float
-        Factor by which the misfit decreases if the hypothesis is true; 0 until it is tested.
-    remaining : float or None
-        Misfit that remains if the hypothesis is true, in the unit of its test; None if it is not
-        known.
-    deviation : Deviation, optional
-        Likely mistake of a table of such, whose name is the code.
-    """
-
-    code: str
-    subject: str = ""
+    code: str  # cause and how it shows, such as "marker-slip/alone"
+    subject: str = ""  # what is described, as the beginning of the message; may be empty
+    # mapping of str to value: values of the placeholders in the message.
     data: Mapping[str, Any] = field(default_factory=dict)
+    # Description with the mistake corrected, of the type that its test expects; None if no test is
+    # needed.
     corrected: Any = None
+    # Factor by which a hypothesis with fitted numbers must fit better than one without.
     handicap: float = 1.0
+    # Factor by which the misfit decreases if the hypothesis is true; 0 until it is tested.
     strength: float = 0.0
+    # Misfit that remains if the hypothesis is true, in the unit of its test; None if it is not
+    # known.
     remaining: float | None = None
-    deviation: Deviation | None = None
+    deviation: Deviation | None = None  # likely mistake of a table of such, whose name is the code
 
     @property
     def cause(self) -> str:
@@ -95,26 +80,14 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class HypothesisTest:
-    """Test of hypotheses by the misfit that remains.
+    """Test of hypotheses by the misfit that remains."""
 
-    Attributes
-    ----------
-    misfit : float
-        Misfit of the description as stated.
-    misfit_of : callable
-        Returns the misfit of a corrected description; None if it is unknown.
-    required_factor : float
-        Factor by which the misfit must decrease.
-    smallest_misfit : float
-        Smallest meaningful misfit; smaller ones count as this.
-    noise_level : float
-        If the misfit decreases from above this level to below it, any factor suffices.
-    """
-
-    misfit: float
+    misfit: float  # misfit of the description as stated
+    # Returns the misfit of a corrected description; None if it is unknown.
     misfit_of: Callable[[Any], float | None]
-    required_factor: float
-    smallest_misfit: float = 0.0
+    required_factor: float  # factor by which the misfit must decrease
+    smallest_misfit: float = 0.0  # smallest meaningful misfit; smaller ones count as this
+    # If the misfit decreases from above this level to below it, any factor suffices.
     noise_level: float = 0.0
 
     def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:

@@ -153,24 +153,12 @@ def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
 
 @dataclass(frozen=True, eq=False)
 class ModalComparison:
-    """Comparison of descriptions of one experiment with its tracks.
+    """Comparison of descriptions of one experiment with its tracks."""
 
-    Attributes
-    ----------
-    experiment : Experiment
-        The recording.
-    declared : DeclaredMotion
-        Description as stated.
-    response : ModalResponse
-        Natural modes at the markers.
-    floor_m : float
-        Smallest misfit that can be expected [m].
-    """
-
-    experiment: Experiment
-    declared: DeclaredMotion
-    response: ModalResponse
-    floor_m: float
+    experiment: Experiment  # the recording
+    declared: DeclaredMotion  # description as stated
+    response: ModalResponse  # natural modes at the markers
+    floor_m: float  # smallest misfit that can be expected [m]
 
     @classmethod
     def from_experiment(

@@ -52,15 +52,9 @@ WHOLE_WEIGHT = (0.4, 2.0)
 
 @dataclass(frozen=True)
 class LinearCorrection:
-    """Correction of the description whose effect is known to first order only.
+    """Correction of the description whose effect is known to first order only."""
 
-    Attributes
-    ----------
-    share : float
-        χ² of the fit with the correction over that without.
-    """
-
-    share: float
+    share: float  # χ² of the fit with the correction over that without
 
 
 def other_materials(body: Body) -> tuple[str, ...]:

@@ -27,21 +27,11 @@ from .routine_probes import prior_widening, significance_limit
 
 @dataclass(frozen=True)
 class BudgetedResiduals:
-    """Tests of the residuals after the step.
+    """Tests of the residuals after the step."""
 
-    Attributes
-    ----------
-    basis : ErrorBasis
-        Size and correlation of the residuals.
-    largest : str
-        Name of the assumption with the largest deviation, with its component.
-    deviations : float
-        This deviation in standard deviations of the budget.
-    """
-
-    basis: ErrorBasis
-    largest: str
-    deviations: float
+    basis: ErrorBasis  # size and correlation of the residuals
+    largest: str  # name of the assumption with the largest deviation, with its component
+    deviations: float  # this deviation in standard deviations of the budget
 
     def describe(self) -> str:
         """Return a note on the residuals as a sentence without full stop."""

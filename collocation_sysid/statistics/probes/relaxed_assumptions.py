@@ -38,66 +38,43 @@ Kind = Literal["window", "recording", "assumption"]
 
 @dataclass(frozen=True)
 class EstimateChange:
-    """Change of an estimate in a refit.
+    """Change of an estimate in a refit."""
 
-    Attributes
-    ----------
-    value, std_error : float
-        Estimate of the refit, and its standard error.
-    change : float
-        Estimate of the refit less that of the fit of all data.
-    of_statistical95, of_combined95 : float or None
-        `change` over the half widths of the statistical and of the combined interval of the fit;
-        None where there is no such interval.
-    """
-
+    # Estimate of the refit, and its standard error.
     value: float
     std_error: float
-    change: float
+    change: float  # estimate of the refit less that of the fit of all data
+    # `change` over the half widths of the statistical and of the combined interval of the fit; None
+    # where there is no such interval.
     of_statistical95: float | None
     of_combined95: float | None
 
 
 @dataclass(frozen=True)
 class Probe:
-    """One refit, of a part of the data or with an assumption relaxed.
+    """One refit, of a part of the data or with an assumption relaxed."""
 
-    Attributes
-    ----------
-    kind : {"window", "recording", "assumption"}
-        What was refitted.
-    name : str
-        Name of the window, of the recording, or of the assumption with its component after a space.
-    chi_squared : float
-        Decrease of χ² of the refitted data, with the stated σ and with priors, from the parameters
-        of the fit of all data to those of the refit.
-    moves : mapping of str to EstimateChange
-        Changes of the estimates that the refit determines.
-    size, size_error : float or None
-        Estimated error of a relaxed assumption in its unit, and its standard error; None for parts
-        of the data.
-    sentences : tuple of str
-        What is significant: for a part of the data the estimates that differ, for an assumption its
-        name.
-    routine : bool
-        Whether this is one of the probes of every solve, with one linear step.
-    relevance : float or None
-        For an assumption the largest change of an estimate, in half widths of the combined
-        interval, see `relevance`; None for parts of the data.
-    suffices : bool
-        For an assumption whether the residuals without it are as noise is, or closer to it by
-        `SUFFICIENT` of the way at least; else it is a substitute for something else.
-    """
-
-    kind: Kind
+    kind: Kind  # what was refitted
+    # Name of the window, of the recording, or of the assumption with its component after a space.
     name: str
+    # Decrease of χ² of the refitted data, with the stated σ and with priors, from the parameters of
+    # the fit of all data to those of the refit.
     chi_squared: float
+    # mapping of str to EstimateChange: changes of the estimates that the refit determines.
     moves: Mapping[str, EstimateChange]
+    # Estimated error of a relaxed assumption in its unit, and its standard error; None for parts of
+    # the data.
     size: float | None = None
     size_error: float | None = None
+    # What is significant: for a part of the data the estimates that differ, for an assumption its
+    # name.
     sentences: tuple[str, ...] = ()
-    routine: bool = False
+    routine: bool = False  # whether this is one of the probes of every solve, with one linear step
+    # For an assumption the largest change of an estimate, in half widths of the combined interval,
+    # see `relevance`; None for parts of the data.
     relevance: float | None = None
+    # For an assumption whether the residuals without it are as noise is, or closer to it by
+    # `SUFFICIENT` of the way at least; else it is a substitute for something else.
     suffices: bool = True
 
     def is_beyond(self, limit: float) -> bool:
@@ -111,36 +88,19 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class SolvedFit:
-    """A fit at its answer, with the data that probes need.
+    """A fit at its answer, with the data that probes need."""
 
-    Attributes
-    ----------
-    collocation : Collocation
-        The program.
-    z : (variables,) array
-        The answer.
-    fit : LinearisedFit
-        The linearised fit.
-    error_model : ErrorModel
-        Assumptions about the errors.
-    statistical : mapping of str to Estimate
-        Estimates with statistical intervals.
-    budget : mapping of str to BudgetLine
-        Uncertainty budgets.
-    deviations : mapping of str to float or None
-        Standard deviations of all assumptions and nuisance parameters; None if exact.
-    changes : ResidualChanges
-        Changes of the residuals by these assumptions, see `probed_changes`.
-    """
-
-    collocation: Collocation
-    z: Array
+    collocation: Collocation  # the program
+    z: Array  # (variables,): the answer
     fit: LinearisedFit
-    error_model: ErrorModel
+    error_model: ErrorModel  # assumptions about the errors
+    # mapping of str to Estimate: estimates with statistical intervals.
     statistical: Mapping[str, Estimate]
-    budget: Mapping[str, BudgetLine]
+    budget: Mapping[str, BudgetLine]  # mapping of str to BudgetLine: uncertainty budgets
+    # mapping of str to float or None: standard deviations of all assumptions and nuisance
+    # parameters; None if exact.
     deviations: Mapping[str, float | None]
-    changes: ResidualChanges
+    changes: ResidualChanges  # changes of the residuals by these assumptions, see `probed_changes`
 
     def uncertainty_of_refit(self, fit: LinearisedFit, p: Array) -> Uncertainty:
         """Return estimates and error bars of another fit at its parameters p (p,), with the error

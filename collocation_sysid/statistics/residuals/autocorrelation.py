@@ -47,24 +47,12 @@ LARGEST_PARTIAL = 0.99
 
 @dataclass(frozen=True, eq=False)
 class LaggedProducts:
-    """Lagged products of the residuals for lags 0 … `lags`, one experiment after another.
+    """Lagged products of the residuals for lags 0 … `lags`, one experiment after another."""
 
-    Attributes
-    ----------
-    lags : (experiments,) tuple of int
-        Last lag of each experiment.
-    products : (K,) array
-        r D_k r.
-    expected : (K, K) array
-        tr(D_k M D_l M).
-    shifted : (K, r, r) array
-        Dᵀ D_k D.
-    """
-
-    lags: tuple[int, ...]
-    products: Array
-    expected: Array
-    shifted: Array
+    lags: tuple[int, ...]  # (experiments,) tuple of int: last lag of each experiment
+    products: Array  # (K,): r D_k r
+    expected: Array  # (K, K): tr(D_k M D_l M)
+    shifted: Array  # (K, r, r): Dᵀ D_k D
 
     def split(self, values: Array) -> list[Array]:
         """Split values (K,) by experiment, into arrays (lag + 1,)."""
@@ -269,25 +257,16 @@ PERSISTENT = 0.2
 
 @dataclass(frozen=True)
 class Dependence:
-    """Tests of the errors of a fit for correlation.
+    """Tests of the errors of a fit for correlation."""
 
-    Attributes
-    ----------
-    lag1 : float
-        Autocorrelation of consecutive samples, pooled over all channels and corrected for the
-        effect of the fit on the residuals.
-    lag1_deviation : float
-        Its standard deviation for independent errors; infinite if it is unknown.
-    shared_p : float
-        p-value of the correlations among channels, for independent errors.
-    space_p : float
-        p-value of the correlations of neighbours on the surface, after Bonferroni, so that it may
-        exceed 1; 1 if nothing is tested.
-    """
-
+    # Autocorrelation of consecutive samples, pooled over all channels and corrected for the effect
+    # of the fit on the residuals.
     lag1: float
+    # Its standard deviation for independent errors; infinite if it is unknown.
     lag1_deviation: float
-    shared_p: float
+    shared_p: float  # p-value of the correlations among channels, for independent errors
+    # p-value of the correlations of neighbours on the surface, after Bonferroni, so that it may
+    # exceed 1; 1 if nothing is tested.
     space_p: float = 1.0
 
     def is_correlated_in_time(self) -> bool:
@@ -320,27 +299,14 @@ class Dependence:
 
 @dataclass(frozen=True, eq=False)
 class ErrorProcess:
-    """Correlation model of the errors of one experiment, in units of σ.
+    """Correlation model of the errors of one experiment, in units of σ."""
 
-    Attributes
-    ----------
-    autocorrelation : (T,) array
-        Autocorrelation by lag; the first is one.
-    channel_covariance : (3M, 3M) array
-        Covariance at one time.
-    order : int
-        Order of the autoregression.
-    samples : float
-        Number of independent samples in time that `channel_covariance` is estimated from.
-    degrees_of_freedom : float
-        Degrees of freedom of the mean variance.
-    """
-
-    autocorrelation: Array
-    channel_covariance: Array
-    order: int
+    autocorrelation: Array  # (T,): autocorrelation by lag; the first is one
+    channel_covariance: Array  # (3M, 3M): covariance at one time
+    order: int  # order of the autoregression
+    # Number of independent samples in time that `channel_covariance` is estimated from.
     samples: float
-    degrees_of_freedom: float
+    degrees_of_freedom: float  # degrees of freedom of the mean variance
 
 
 def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependence:

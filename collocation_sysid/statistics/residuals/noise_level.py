@@ -40,45 +40,22 @@ LEAST_SHARE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevel:
-    """Variances of the errors in units of σ².
+    """Variances of the errors in units of σ²."""
 
-    Attributes
-    ----------
-    names : (G,) tuple of str
-        Markers that were measured, such as "swing/tip".
-    variances : (G,) array
-        Variance s_m² of each.
-    freedoms : (G,) array
-        Degrees of freedom of each.
-    pooled : float
-        Variance s² if all are equal.
-    freedom : float
-        Degrees of freedom of all residuals.
-    larger_p, smaller_p : float
-        p-values of residuals as large, or as small, if σ is right.
-    unequal_p : float
-        p-value of markers as different, if all are equal.
-    shares : (G, r, r) array
-        Matrices G_m.
-    known_score_covariance : (r, r) array
-        Covariance of the score due to other known errors.
-    sigma_key : str
-        Key of σ in the problem.
-    sigma_keys : mapping of str to str
-        Key of σ of each series, by its name.
-    """
-
-    names: tuple[str, ...]
-    variances: Array
-    freedoms: Array
-    pooled: float
-    freedom: float
+    names: tuple[str, ...]  # (G,) tuple of str: markers that were measured, such as "swing/tip"
+    variances: Array  # (G,): variance s_m² of each
+    freedoms: Array  # (G,): degrees of freedom of each
+    pooled: float  # variance s² if all are equal
+    freedom: float  # degrees of freedom of all residuals
+    # p-values of residuals as large, or as small, if σ is right.
     larger_p: float
     smaller_p: float
-    unequal_p: float
-    shares: Array = field(repr=False)
+    unequal_p: float  # p-value of markers as different, if all are equal
+    shares: Array = field(repr=False)  # (G, r, r): matrices G_m
+    # (r, r): covariance of the score due to other known errors.
     known_score_covariance: Array = field(repr=False)
-    sigma_key: str = "sigma_m"
+    sigma_key: str = "sigma_m"  # key of σ in the problem
+    # mapping of str to str: key of σ of each series, by its name.
     sigma_keys: Mapping[str, str] = field(default_factory=dict)
 
     def is_unequal(self) -> bool:

@@ -54,24 +54,14 @@ SILENT = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class RecordingComparison:
-    """Comparison of single recordings, in the solver's coordinates.
+    """Comparison of single recordings, in the solver's coordinates."""
 
-    Attributes
-    ----------
-    recordings : (n,) tuple of str
-        Names.
-    differences : (n, nq) array
-        Estimates from each alone less the joint ones; NaN where it does not determine them.
-    deviations : (n, nq) array
-        Their standard deviations; NaN likewise.
-    sensitivities : (p, nq n) array
-        Changes of the joint estimates if a parameter differs in one recording by its standard
-        deviation between recordings; column n k + e for parameter k and recording e, from 0.
-    """
-
-    recordings: tuple[str, ...]
+    recordings: tuple[str, ...]  # (n,) tuple of str: names
+    # (n, nq): estimates from each alone less the joint ones; NaN where it does not determine them.
     differences: Array
-    deviations: Array
+    deviations: Array  # (n, nq): their standard deviations; NaN likewise
+    # (p, nq n): changes of the joint estimates if a parameter differs in one recording by its
+    # standard deviation between recordings; column n k + e for parameter k and recording e, from 0.
     sensitivities: Array
 
     def compute_chi_squared(self) -> Array:
@@ -171,21 +161,12 @@ def fit_part(
 
 @dataclass(frozen=True, eq=False)
 class RecordingEstimate:
-    """Shared parameters by one recording alone, in the solver's coordinates.
+    """Shared parameters by one recording alone, in the solver's coordinates."""
 
-    Attributes
-    ----------
-    step : (nq,) array
-        Estimates less those of the joint fit.
-    variances : (nq,) array
-        Their variances; NaN or infinite where the recording does not determine them.
-    independent_variances : (nq,) array
-        Variances for independent errors of the stated σ.
-    """
-
-    step: Array
+    step: Array  # (nq,): estimates less those of the joint fit
+    # (nq,): their variances; NaN or infinite where the recording does not determine them.
     variances: Array
-    independent_variances: Array
+    independent_variances: Array  # (nq,): variances for independent errors of the stated σ
 
 
 def compare_recordings(

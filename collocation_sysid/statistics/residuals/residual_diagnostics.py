@@ -53,48 +53,25 @@ class MarkerDiagnosis:
     """Residuals h(x) − ŷ of one marker in one experiment, and their likely cause.
 
     Shares are of the residuals' power, the sum of their squares over axes and present samples.
-
-    Attributes
-    ----------
-    experiment, marker : str
-        Names.
-    samples : int
-        Number of samples.
-    wild : int
-        Number of samples beyond Huber's threshold.
-    rms_m : float
-        Root mean square distance between fitted and measured marker, including those samples [m].
-    noise_factor : float
-        Size of its errors over σ, corrected for the effect of the fit on the residuals.
-    offset_m : (3,) array
-        Mean of h(x) − ŷ [m].
-    constant_share : float
-        Share of the mean in the power.
-    lag1 : float
-        Autocorrelation of consecutive present samples about the mean, pooled over the axes.
-    frequency_hz : float
-        Frequency of the largest peak of the periodogram; 0 without one.
-    oscillating_share : float
-        Share of this peak in the power.
-    early_share : float
-        Share of the first tenth of the time in the power.
-    sentence : str
-        Message with the likely cause.
     """
 
+    # Names.
     experiment: str
     marker: str
-    samples: int
-    wild: int
+    samples: int  # number of samples
+    wild: int  # number of samples beyond Huber's threshold
+    # Root mean square distance between fitted and measured marker, including those samples [m].
     rms_m: float
+    # Size of its errors over σ, corrected for the effect of the fit on the residuals.
     noise_factor: float
-    offset_m: Array
-    constant_share: float
+    offset_m: Array  # (3,): mean of h(x) − ŷ [m]
+    constant_share: float  # share of the mean in the power
+    # Autocorrelation of consecutive present samples about the mean, pooled over the axes.
     lag1: float
-    frequency_hz: float
-    oscillating_share: float
-    early_share: float
-    sentence: str
+    frequency_hz: float  # frequency of the largest peak of the periodogram; 0 without one
+    oscillating_share: float  # share of this peak in the power
+    early_share: float  # share of the first tenth of the time in the power
+    sentence: str  # message with the likely cause
 
 
 def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
@@ -320,29 +297,14 @@ FEWEST_SAMPLES = 4
 
 @dataclass(frozen=True)
 class Outlier:
-    """Single sample that dominates the residuals of its marker.
+    """Single sample that dominates the residuals of its marker."""
 
-    Attributes
-    ----------
-    series : str
-        Experiment and marker, such as "swing/tip", or "press/force".
-    sample : int
-        Index of the sample.
-    t_s : float
-        Its time [s].
-    share : float
-        Its share in the power of its marker's residuals.
-    deviations : float
-        Its residual over σ.
-    is_relaxed_start : bool
-        Whether it is the first sample of a body with memory, which is assumed relaxed there.
-    """
-
-    series: str
-    sample: int
-    t_s: float
-    share: float
-    deviations: float
+    series: str  # experiment and marker, such as "swing/tip", or "press/force"
+    sample: int  # index of the sample
+    t_s: float  # its time [s]
+    share: float  # its share in the power of its marker's residuals
+    deviations: float  # its residual over σ
+    # Whether it is the first sample of a body with memory, which is assumed relaxed there.
     is_relaxed_start: bool
 
     def to_concern(self) -> Concern:

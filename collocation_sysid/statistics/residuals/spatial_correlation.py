@@ -34,24 +34,12 @@ MOST_SAMPLES = 20
 
 @dataclass(frozen=True, eq=False)
 class SpatialCorrelation:
-    """Spatial correlation of the errors of one sample of a block.
+    """Spatial correlation of the errors of one sample of a block."""
 
-    Attributes
-    ----------
-    covariance : (n, n) array
-        Covariance of its channels, in units of σ².
-    length_m : float
-        Correlation length ℓ [m].
-    p_value : float
-        p-value of the likelihood ratio, for independent errors.
-    freedom : float
-        Degrees of freedom of the variance.
-    """
-
-    covariance: Array
-    length_m: float
-    p_value: float
-    freedom: float
+    covariance: Array  # (n, n): covariance of its channels, in units of σ²
+    length_m: float  # correlation length ℓ [m]
+    p_value: float  # p-value of the likelihood ratio, for independent errors
+    freedom: float  # degrees of freedom of the variance
 
 
 def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialCorrelation | None:
