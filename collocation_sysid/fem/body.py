@@ -50,32 +50,22 @@ from .two_phase import PhaseSamples, TwoPhaseModes
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Forces and their first derivatives at T states; m = `pattern.entries`.
+    """Forces and their first derivatives at T states; m = `pattern.entries`."""
 
-    Attributes
-    ----------
-    force : (T, 3n)
-        Forces f(x, v; θ) [N].
-    by_position : (T, m)
-        Lower triangles of the symmetric part of ∂f/∂x [N/m]; with Rayleigh damping −K − γ_r D_vK.
-    by_velocity : (T, m)
-        Lower triangles of the symmetric part of ∂f/∂v [N·s/m]; with Rayleigh damping −γ_r K − γ_m
-        M.
-    by_theta : (T, 3n, k)
-        Derivatives by the k constants θ (result of `Body`), or by all k inputs u (result of the
-        sum of forces in `model.forces`).
-    by_position_skew : (T, m) or (T, 0)
-        Lower triangles of the skew part of ∂f/∂x; empty if it is zero.
-    by_velocity_skew : (T, m) or (T, 0)
-        Lower triangles of the skew part of ∂f/∂v; only external forces have one: custom forces,
-        such as gyroscopic ones, and forces on frames that are averaged over a step.
-    """
-
-    force: Array
+    force: Array  # (T, 3n): forces f(x, v; θ) [N]
+    # (T, m): lower triangles of the symmetric part of ∂f/∂x [N/m]; with Rayleigh damping −K − γ_r
+    # D_vK.
     by_position: Array
+    # (T, m): lower triangles of the symmetric part of ∂f/∂v [N·s/m]; with Rayleigh damping −γ_r K −
+    # γ_m M.
     by_velocity: Array
+    # (T, 3n, k): derivatives by the k constants θ (result of `Body`), or by all k inputs u (result
+    # of the sum of forces in `model.forces`).
     by_theta: Array
+    # (T, m) or (T, 0): lower triangles of the skew part of ∂f/∂x; empty if it is zero.
     by_position_skew: Array
+    # (T, m) or (T, 0): lower triangles of the skew part of ∂f/∂v; only external forces have one:
+    # custom forces, such as gyroscopic ones, and forces on frames that are averaged over a step.
     by_velocity_skew: Array
 
 

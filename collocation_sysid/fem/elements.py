@@ -62,40 +62,22 @@ def shape_gradients(barycentric: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """Tetrahedral element in barycentric coordinates L = (L0, L1, L2, L3), ΣL = 1.
-
-    Attributes
-    ----------
-    nodes : int
-        Nodes per element, the four corners first.
-    shape_functions : callable
-        (k, 4) barycentric points to (k, nodes) values.
-    shape_gradients : callable
-        (k, 4) barycentric points to (k, nodes, 4) derivatives with respect to L.
-    points : (q, 4)
-        Quadrature points in barycentric coordinates.
-    weights : (q,)
-        Quadrature weights as fractions of the volume; their sum is one.
-    mass_shares : (nodes,)
-        Fraction of the element's mass lumped at each node: all positive, sum one.
-    meshio_type : str
-        Cell name for writing files.
-    edges : tuple of pairs
-        For each node after the corners, the two corners between which it lies halfway.
-    mean_dilatation : bool
-        Whether the material is evaluated at the mean dilatation of the element, see
-        `mean_dilatation`.
-    """
+    """Tetrahedral element in barycentric coordinates L = (L0, L1, L2, L3), ΣL = 1."""
 
     name: str
-    nodes: int
-    shape_functions: Callable[[Array], Array]
+    nodes: int  # nodes per element, the four corners first
+    shape_functions: Callable[[Array], Array]  # (k, 4) barycentric points to (k, nodes) values
+    # (k, 4) barycentric points to (k, nodes, 4) derivatives with respect to L.
     shape_gradients: Callable[[Array], Array]
-    points: Array
-    weights: Array
+    points: Array  # (q, 4): quadrature points in barycentric coordinates
+    weights: Array  # (q,): quadrature weights as fractions of the volume; their sum is one
+    # (nodes,): fraction of the element's mass lumped at each node: all positive, sum one.
     mass_shares: Array
-    meshio_type: str
+    meshio_type: str  # cell name for writing files
+    # For each node after the corners, the two corners between which it lies halfway.
     edges: tuple[tuple[int, int], ...] = ()
+    # Whether the material is evaluated at the mean dilatation of the element, see
+    # `mean_dilatation`.
     mean_dilatation: bool = False
 
     def __reduce__(self) -> tuple[Callable[[str], Element], tuple[str]]:

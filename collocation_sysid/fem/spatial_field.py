@@ -98,25 +98,14 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class Laplacian:
-    """Lowest eigenpairs of the mass-weighted Laplacian on some cells.
+    """Lowest eigenpairs of the mass-weighted Laplacian on some cells."""
 
-    Attributes
-    ----------
-    values : (m,)
-        Eigenvalues λ [1/m²], without that of the constant eigenvector.
-    vectors : (m, E)
-        Eigenvectors v at the centre of each cell.
-    matrix : (n, n)
-        Matrix with the eigenvalues λ: Laplacian of the nodes, scaled by the square roots of their
-        masses.
-    basis : (n, m + 1)
-        Eigenvectors of this matrix, including the constant one.
-    """
-
-    values: Array
-    vectors: Array
+    values: Array  # (m,): eigenvalues λ [1/m²], without that of the constant eigenvector
+    vectors: Array  # (m, E): eigenvectors v at the centre of each cell
+    # (n, n): matrix with the eigenvalues λ: Laplacian of the nodes, scaled by the square roots of
+    # their masses.
     matrix: sp.csc_array
-    basis: Array
+    basis: Array  # (n, m + 1): eigenvectors of this matrix, including the constant one
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, cells: Index, count: int) -> Laplacian:

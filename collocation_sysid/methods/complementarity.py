@@ -93,8 +93,6 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
 
     Parameters
     ----------
-    experiment : Experiment
-        Experiment with obstacles.
     x : (T, 3n) array
         Positions [m].
 

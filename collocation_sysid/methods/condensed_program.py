@@ -135,8 +135,6 @@ class EliminatedColumns:
 
         Parameters
         ----------
-        entries : ColumnEntries
-            Entries of the eliminated columns.
         rows : (rows of the matrix,) array of int
             Number of each row of the matrix, −1 for rows that are left out.
         further_rows : array of int

@@ -69,48 +69,26 @@ class Dynamics:
     it is then the equation of statics. All rows of a static experiment are equations of statics,
     and its times need not be evenly spaced. Evaluation k is the state (ξ_k, ν_k) at which row k
     evaluates the forces.
-
-    Attributes
-    ----------
-    body : Body
-    tables : StencilTables
-        Stencil coefficients of every row.
-    t_s : (N,)
-        Times of the grid.
-    first_row : int
-        Index of the first equation: 0 or 1.
-    mass : DofMasses
-        Mass of every dof in each row: the mean over the evaluations of the row.
-    forces : Forces
-        Forces at the N evaluations.
-    prescribed_m : (N, 3n)
-        Prescribed positions; NaN where a dof is free.
-    is_temporarily_prescribed : (N, 3n) bool
-        True where a grasp holds a dof that is free at other times. The forces at such a dof are
-        balanced by the reaction force and omitted from all rows, so that a released dof starts like
-        the first step, from its velocity.
-    evaluated_s : (N,)
-        Times of the evaluations.
-    start_velocity_m_s : (3n,)
-        Start velocity v_0.
-    loaded_since_s : float
-        Time for which the body has been in its start shape; infinite if its memory has relaxed.
-    is_static : bool
-        Whether each row is an equilibrium.
     """
 
     body: Body
-    tables: StencilTables = field(metadata=PARTS_OVER_TIME)
-    t_s: Array = field(metadata=over_time())
-    first_row: int
+    tables: StencilTables = field(metadata=PARTS_OVER_TIME)  # stencil coefficients of every row
+    t_s: Array = field(metadata=over_time())  # (N,): times of the grid
+    first_row: int  # index of the first equation: 0 or 1
+    # Mass of every dof in each row: the mean over the evaluations of the row.
     mass: DofMasses = field(metadata=PARTS_OVER_TIME)
-    forces: Forces = field(metadata=PARTS_OVER_TIME)
+    forces: Forces = field(metadata=PARTS_OVER_TIME)  # forces at the N evaluations
+    # (N, 3n): prescribed positions; NaN where a dof is free.
     prescribed_m: Array = field(metadata=over_time())
+    # (N, 3n) bool: true where a grasp holds a dof that is free at other times. The forces at such a
+    # dof are balanced by the reaction force and omitted from all rows, so that a released dof
+    # starts like the first step, from its velocity.
     is_temporarily_prescribed: NDArray[np.bool_] = field(metadata=over_time())
-    evaluated_s: Array = field(metadata=over_time())
-    start_velocity_m_s: Array
+    evaluated_s: Array = field(metadata=over_time())  # (N,): times of the evaluations
+    start_velocity_m_s: Array  # (3n,): start velocity v_0
+    # Time for which the body has been in its start shape; infinite if its memory has relaxed.
     loaded_since_s: float = np.inf
-    is_static: bool = False
+    is_static: bool = False  # whether each row is an equilibrium
 
     @classmethod
     def from_experiment(
@@ -123,7 +101,6 @@ class Dynamics:
 
         Parameters
         ----------
-        experiment : Experiment
         scheme : str or Scheme
             Scheme or its name; ignored for a static experiment.
         substeps : int

@@ -23,29 +23,14 @@ from .inputs import Inputs
 class EquationsAtParameters:
     """Equations of motion at parameters p = (q, φ of the motion), with the derivatives of the
     inputs.
-
-    Attributes
-    ----------
-    inputs : Inputs
-        Inputs u as a function of p.
-    p : (m,)
-        Shared coordinates q, then the nuisance parameters that affect the motion.
-    nq : int
-        Length of q.
-    input_derivatives : (N, U, m)
-        Derivatives of the inputs by p at the N evaluations.
-    dynamics : Dynamics
-        Equations of motion at these inputs.
-    prescribed : PrescribedDisplacements
-        Prescribed displacements of the grasped dofs.
     """
 
-    inputs: Inputs
-    p: Array
-    nq: int
-    input_derivatives: Array
-    dynamics: Dynamics
-    prescribed: PrescribedDisplacements
+    inputs: Inputs  # inputs u as a function of p
+    p: Array  # (m,): shared coordinates q, then the nuisance parameters that affect the motion
+    nq: int  # length of q
+    input_derivatives: Array  # (N, U, m): derivatives of the inputs by p at the N evaluations
+    dynamics: Dynamics  # equations of motion at these inputs
+    prescribed: PrescribedDisplacements  # prescribed displacements of the grasped dofs
 
     @cached_property
     def theta_p(self) -> Array:

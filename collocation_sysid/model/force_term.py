@@ -127,7 +127,6 @@ class ForceTerm(ABC):
             Shared arrays; modified.
         places : AssemblyIndices
             Columns and entries of this term in the arrays.
-        states : States
         """
 
     @abstractmethod
@@ -143,7 +142,6 @@ class ForceTerm(ABC):
             Shared arrays; modified.
         places : AssemblyIndices
             Columns and entries of this term in the arrays.
-        states : States
         weights : (T, 3n)
         """
 

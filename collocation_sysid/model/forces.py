@@ -79,7 +79,6 @@ class Forces:
 
         Parameters
         ----------
-        experiment : Experiment
         t_s : (T,) or float
             Times of the evaluations.
         theta : (k,), optional

@@ -44,21 +44,11 @@ class Input:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Input vector u of one experiment as a function of its parameters p.
+    """Input vector u of one experiment as a function of its parameters p."""
 
-    Attributes
-    ----------
-    groups : sequence of Input
-        Groups of entries, in the order of u.
-    parameter_count : int
-        Length m of p.
-    time_count : int
-        Number N of evaluations.
-    """
-
-    groups: Sequence[Input]
-    parameter_count: int
-    time_count: int
+    groups: Sequence[Input]  # groups of entries, in the order of u
+    parameter_count: int  # length m of p
+    time_count: int  # number N of evaluations
 
     def evaluate_at(self, p: Array) -> tuple[Array, Array]:
         """Return the inputs u (N, U) and their derivatives ∂u/∂p (N, U, m) at parameters p (m,).
@@ -142,7 +132,6 @@ def inputs_from_experiment(
 
     Parameters
     ----------
-    experiment : Experiment
     parameters : Parameters
         Parameters of the problem; p begins with the free ones, by their coordinates q.
     nuisance : NuisanceMap

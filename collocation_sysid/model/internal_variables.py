@@ -94,8 +94,6 @@ def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[P
 
     Parameters
     ----------
-    forces : Forces
-        Forces at the start.
     x, v : (3n,)
     loaded_s : float
         Time for which the body has been in its start shape; infinite if its memory has relaxed.

@@ -128,7 +128,6 @@ class NuisanceMap(RecordingQuantities):
 
         Parameters
         ----------
-        experiment : Experiment
         pivot_m : (3,), optional
             Pivot c; by default the middle of the body in its first pose. Pass that of another
             recording if the rigid motion is shared with it.
@@ -219,7 +218,6 @@ class NuisanceMap(RecordingQuantities):
 
         Parameters
         ----------
-        *rows : Deviation
         component : int, optional
             Number of the instance, such as the index of a camera; None for all.
         """

@@ -44,7 +44,6 @@ def numerical_mode(
 
     Parameters
     ----------
-    scheme : Scheme
     angular_frequency_rad_s : float
         Angular frequency ω of the undamped oscillation, positive.
     timestep_s : float
@@ -102,7 +101,6 @@ def substeps_needed(
 
     Parameters
     ----------
-    scheme : Scheme
     angular_frequency_rad_s : float
         Angular frequency ω of the undamped mode, positive.
     timestep_s : float

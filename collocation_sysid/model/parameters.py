@@ -1004,7 +1004,6 @@ def resolve_theta(
 
     Parameters
     ----------
-    body : Body
     values : Parameters, mapping or sequence of float
         Parameters are evaluated at their guesses.
 

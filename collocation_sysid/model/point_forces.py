@@ -213,7 +213,6 @@ class Pointwise(ForceTerm):
             Derivatives at T states, changed in place.
         places : AssemblyIndices
             Entries of the points' matrices, and columns of the constants among all inputs.
-        states : States
         weights : (T, 3n)
             Weights of the forces; those of h are this force's `variable_weights`.
         """
@@ -301,7 +300,6 @@ class Pointwise(ForceTerm):
 
         Parameters
         ----------
-        states : States
         weights : (T, 3n)
             Weights of the forces.
         """
@@ -470,7 +468,6 @@ def law_function(force: NodeForce, dofs: int) -> GeneratedFunction:
 
     Parameters
     ----------
-    force : NodeForce
     dofs : int
         Number of dofs of one instance.
     """
@@ -490,7 +487,6 @@ def air_drag_terms(experiment: Experiment, t_s: Array) -> tuple[CustomForce, ...
 
     Parameters
     ----------
-    experiment : Experiment
     t_s : (T,)
         Times [s].
     """

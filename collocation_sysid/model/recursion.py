@@ -108,7 +108,6 @@ class RecursionTrajectory:
 
         Parameters
         ----------
-        recursion : Recursion
         constants : (C,)
         data : (d, N, I) or broadcastable to it
             Data that are equal for all instances may have the shape (d, N, 1).

@@ -142,7 +142,6 @@ def as_scheme(scheme_or_name: str | Scheme, start_rule: str = "standard") -> Sch
 
     Parameters
     ----------
-    scheme_or_name : str or Scheme
     start_rule : {"standard", "paper"}
         "standard": the scheme as it is. "paper" drops the inertia of the first step (a = 0); for
         backward Euler only.

@@ -86,33 +86,19 @@ class DofMasses:
 
 @dataclass(frozen=True, eq=False)
 class Weight(ForceTerm):
-    """Weight of a body and its loads at T times.
-
-    Attributes
-    ----------
-    body : Body
-    mass : DofMasses
-        Masses of the dofs, including all tied masses.
-    gravity_m_s2 : (3,)
-    applied_n : (T, 3n)
-        Applied nodal forces, independent of the positions of the nodes.
-    has_gravity_input : bool
-        Whether gravity is an input.
-    joining_kg : (L, 3n)
-        Masses m_l of the loads whose time is estimated.
-    joining_n : (L, T, 3n)
-        Forces f_l of these loads.
-    share : (T, L)
-        Shares s_l of these loads, as a change from the stated share.
-    """
+    """Weight of a body and its loads at T times."""
 
     body: Body
+    # Masses of the dofs, including all tied masses.
     mass: DofMasses = field(metadata=PARTS_OVER_TIME)
-    gravity_m_s2: Array = field(metadata=LOAD)
+    gravity_m_s2: Array = field(metadata=LOAD)  # (3,)
+    # (T, 3n): applied nodal forces, independent of the positions of the nodes.
     applied_n: Array = field(metadata=over_time(is_load=True))
-    has_gravity_input: bool
-    joining_kg: Array
+    has_gravity_input: bool  # whether gravity is an input
+    joining_kg: Array  # (L, 3n): masses m_l of the loads whose time is estimated
+    # (L, T, 3n): forces f_l of these loads.
     joining_n: Array = field(metadata=over_time(axis=1, is_load=True))
+    # (T, L): shares s_l of these loads, as a change from the stated share.
     share: Array = field(metadata=over_time())
 
     couplings = None
@@ -257,7 +243,6 @@ class Weight(ForceTerm):
             Shared arrays; modified.
         places : AssemblyIndices
             Columns of the inputs; its entries are not used.
-        states : States
         """
         np.add(linearisation.force, self.external_n, out=linearisation.force)
         for density, slope in self.body.mass_derivatives.items():
@@ -288,7 +273,6 @@ class Weight(ForceTerm):
             Shared arrays; modified.
         places : AssemblyIndices
             Columns of the inputs; its entries are not used.
-        states : States
         weights : (T, 3n)
             Weights of the forces.
         """

@@ -144,9 +144,6 @@ def add_displacement(
 
     Parameters
     ----------
-    table : BenchTable
-    layout : DisplacementSection
-    grasp : Grasp
     rest_length_m : float or None
         Undeformed length [m] over which the displacement along the axis, before it is scaled, is
         the strain; None if the table has no strain.
@@ -173,7 +170,6 @@ def add_loads(table: BenchTable, layout: ForceSensorSection, at_s: Array, loads:
 
     Parameters
     ----------
-    table : BenchTable
     layout : ForceSensorSection
         Sign, axis and symmetry; the loads of a body that the problem models in part are multiplied
         by `symmetry`. The stress is written instead of the force if `area_m2` is stated.

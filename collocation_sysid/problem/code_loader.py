@@ -123,8 +123,6 @@ class CodeLoader:
         ----------
         file : str
             Name of the file, relative to the folder of the problem.
-        name : str
-            Name of the function.
         key : str
             Key of the problem file that names the file, for messages.
 

@@ -24,7 +24,6 @@ def with_guessed_densities(section: ObjectSection, parameters: Sections) -> Obje
 
     Parameters
     ----------
-    section : ObjectSection
     parameters : mapping of name to ParameterSection or float
         Table [parameters]; a number is a fixed value.
 

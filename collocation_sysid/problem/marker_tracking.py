@@ -62,7 +62,6 @@ def transform_to_body_frame(
 
     Parameters
     ----------
-    markers : MarkersSection
     table : MarkerTable
         Tracks in the camera's frame; not changed.
 

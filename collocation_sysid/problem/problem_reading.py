@@ -35,8 +35,6 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
 
     Parameters
     ----------
-    path : str or Path
-        Problem file.
     overrides : sequence of str
         Overrides "dotted.key=value", with values in TOML syntax. Words without quotes are strings.
         Items of a list are selected by index, counted from 0, and tables of a list also by name.

@@ -113,7 +113,6 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
 
     Parameters
     ----------
-    size : Size
     say : callable, optional
         Called with a sentence if the estimated time is beyond `ANNOUNCED_SOLVE_S`, or if a single
         sample has more than `ANNOUNCED_NODES` nodes; None announces nothing.

@@ -257,7 +257,6 @@ class RecordingFrames:
 
         Parameters
         ----------
-        section : ForceSensorSection
         key : str
             Dotted key of the section, for messages.
         k : int

@@ -687,8 +687,6 @@ def require_plausible_markers(
 
     Parameters
     ----------
-    experiment : Experiment
-        Experiment with markers.
     constants : mapping of str to float
         Physical values by name, to find the likely cause, which the message then names.
     frames_fault : str

@@ -83,27 +83,13 @@ def convert_variables(z: Array, source: Collocation, target: Collocation) -> Arr
 
 @dataclass(frozen=True)
 class Violation:
-    """Residual of one equation of motion.
-
-    Attributes
-    ----------
-    experiment : str
-        Name of the experiment.
-    time_s : float
-        Grid time [s].
-    node : int
-        Index of the node.
-    axis : str
-        "x", "y" or "z".
-    residual_n : float
-        Residual [N].
-    """
+    """Residual of one equation of motion."""
 
     experiment: str
-    time_s: float
-    node: int
-    axis: str
-    residual_n: float
+    time_s: float  # grid time [s]
+    node: int  # index of the node
+    axis: str  # "x", "y" or "z"
+    residual_n: float  # residual [N]
 
     def __str__(self) -> str:
         return (

@@ -78,8 +78,6 @@ class CustomSensorResidual(MeasurementResidual):
             The user's sensor with its samples.
         number : int
             Index of the sensor in the experiment, from 0.
-        observable : Observable
-            Observable.
         at_s : (n,) array
             Times of the observable [s]; samples outside are not compared.
         nuisance : NuisanceMap

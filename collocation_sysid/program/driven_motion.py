@@ -196,8 +196,6 @@ class DrivenMotion:
 
         Parameters
         ----------
-        drive : Drive
-            The drive.
         start : (3n,) array, optional
             Positions at the first time, where they are known from another drive that begins in the
             same way.

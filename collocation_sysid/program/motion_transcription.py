@@ -419,8 +419,6 @@ class MotionTranscription:
         ----------
         x : (N, 3n) array
             Positions [m].
-        equations : EquationsAtParameters
-            Equations of motion at the parameters.
         histories : sequence of histories
             History variables at x, of the body and of forces; empty if there are none, or if they
             are to be computed from x.
@@ -487,8 +485,6 @@ class MotionTranscription:
         ----------
         x : (N, 3n) array
             Positions [m].
-        equations : EquationsAtParameters
-            Equations of motion at the parameters.
         forces : Linearisation
             Forces and their derivatives at the evaluations of x.
         values : (jacobian.nnz,) array
@@ -569,8 +565,6 @@ class MotionTranscription:
         ----------
         x : (N, 3n) array
             Positions [m].
-        equations : EquationsAtParameters
-            Equations of motion at the parameters.
         weights : (N, 3n) array
             Weights of the forces F at the evaluations [1/N].
 
@@ -698,8 +692,6 @@ class MotionTranscription:
             Positions [m].
         phi : (k,) array
             Nuisance parameters in units of their priors.
-        equations : EquationsAtParameters
-            Equations of motion at the parameters.
         weights : RowWeights
             Weights of the constraints, see `lagrangian_weights`.
         loss_weight : float

@@ -25,21 +25,11 @@ S = TypeVar("S", PolylineLength, EnclosedVolume)
 
 
 class Calibration(NamedTuple):
-    """Calibration of an actuator.
+    """Calibration of an actuator."""
 
-    Attributes
-    ----------
-    factor : float
-        Factor on the stated tension or pressure.
-    offset : float
-        Part of the tension [N] or pressure [Pa] that is lost.
-    log_lag_ratio : float
-        Logarithm of the ratio of its lag to the stated lag.
-    """
-
-    factor: float
-    offset: float
-    log_lag_ratio: float
+    factor: float  # factor on the stated tension or pressure
+    offset: float  # part of the tension [N] or pressure [Pa] that is lost
+    log_lag_ratio: float  # logarithm of the ratio of its lag to the stated lag
 
 
 @dataclass(frozen=True, eq=False)

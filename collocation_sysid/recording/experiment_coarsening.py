@@ -36,7 +36,6 @@ def coarse_experiment(experiment: Experiment, relation: CoarseBody) -> Experimen
     ----------
     experiment : Experiment
         Experiment on `relation.body`, or on that body with frames of obstacles.
-    relation : CoarseBody
 
     Raises
     ------

@@ -25,7 +25,6 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
 
     Parameters
     ----------
-    experiment : Experiment
     finer : Body
         Refined body of the same shape.
     """

@@ -240,7 +240,6 @@ def read_wrench(
 
     Parameters
     ----------
-    path : str or Path
     columns : mapping, optional
         Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t,
         if their names are not recognised.

@@ -50,7 +50,6 @@ def read_poses(
 
     Parameters
     ----------
-    path : str or Path
     quaternion : {"xyzw", "wxyz"}, optional
         Order of a quaternion whose columns do not name its components.
     length_unit : {"m", "cm", "mm", "in"}, optional

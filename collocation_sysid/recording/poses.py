@@ -391,7 +391,6 @@ def require_determined_motion(
 
     Parameters
     ----------
-    poses : PoseSequence
     t_s : (T,) array
         Times of the recording's samples.
     interval_s : (float, float)

@@ -170,7 +170,6 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
 
     Parameters
     ----------
-    path : str or Path
     layout : SpecimenLayout
         Meaning of the columns.
 
@@ -268,7 +267,6 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
 
     Parameters
     ----------
-    grid : TextTable
     layout : SpecimenLayout
         Meaning of the columns.
     """
@@ -565,8 +563,6 @@ def specimen_columns(
 
     Parameters
     ----------
-    experiment : Experiment
-        Experiment of a specimen.
     values : mapping of str to (T,) array
         Values of its sensors by name, at the sample times; a quantity that does not follow from
         them has no column.

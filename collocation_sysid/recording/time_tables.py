@@ -122,7 +122,6 @@ def read_displacement(
 
     Parameters
     ----------
-    path : str or Path
     columns : mapping, optional
         Names of the columns of x, y, z, or of a machine's displacement or strain, and of t, if
         their names are not recognised.
@@ -231,7 +230,6 @@ def read_custom_sensor(
 
     Parameters
     ----------
-    path : str or Path
     columns : sequence of str
         Columns of the values; all besides the times by default.
 

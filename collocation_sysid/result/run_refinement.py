@@ -51,8 +51,6 @@ def refine_run(
 
     Parameters
     ----------
-    folder : str or Path
-        The run folder.
     levels : int
         Number of discretisations, with that of the run: 2, or 3 to observe the orders of
         convergence.

@@ -84,8 +84,6 @@ class CoarseStart:
 
         Parameters
         ----------
-        problem : Problem
-            Given problem.
         solution : Solution
             Solution on the coarse meshes.
         undetermined : sequence of str

@@ -57,8 +57,6 @@ def nuisance_of_fitted_recordings(transcription: Transcription, solution: Soluti
     ----------
     transcription : Transcription
         Transcription of the recording to be predicted.
-    solution : Solution
-        Solution of the fitted recordings.
     """
     nuisance = transcription.nuisance
     places = transcription.markers.observable.coordinate_parameters

@@ -122,24 +122,12 @@ class ReportedEstimate(Estimate):
 
 @dataclass(frozen=True)
 class Limit:
-    """What limits the precision of an estimate.
+    """What limits the precision of an estimate."""
 
-    Attributes
-    ----------
-    determined : bool
-        Whether the combined interval is not wider than the value.
-    source : str
-        Largest source of the variance in the budget.
-    share : float
-        Its share of the variance.
-    remedy : str
-        What to measure or to state in order to reduce it, an imperative phrase.
-    """
-
-    determined: bool
-    source: str
-    share: float
-    remedy: str
+    determined: bool  # whether the combined interval is not wider than the value
+    source: str  # largest source of the variance in the budget
+    share: float  # its share of the variance
+    remedy: str  # what to measure or to state in order to reduce it, an imperative phrase
 
 
 @dataclass(frozen=True)

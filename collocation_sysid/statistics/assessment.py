@@ -664,7 +664,6 @@ def rotation_step_concerns(
 
     Parameters
     ----------
-    experiment : Experiment
     substeps : int
         Steps per sample of the grid.
     limit_rad : float

@@ -59,24 +59,13 @@ def precision_text(factor: float) -> str:
 
 @dataclass(frozen=True)
 class Direction:
-    """A product of powers, or a sum, of estimated constants, with its precision.
+    """A product of powers, or a sum, of estimated constants, with its precision."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Constants, the one with the largest power first.
-    powers : tuple of float
-        Powers of the constants in a product, the first of them 1; or their factors in a sum.
-    form : {"sum", "product", "unstated"}
-        "unstated" if a value is not positive, so that powers of it do not exist.
-    factor : float
-        Half width of the 95 % interval, as a factor.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # constants, the one with the largest power first
+    # Powers of the constants in a product, the first of them 1; or their factors in a sum.
     powers: tuple[float, ...]
-    form: Form
-    factor: float
+    form: Form  # "unstated" if a value is not positive, so that powers of it do not exist
+    factor: float  # half width of the 95 % interval, as a factor
 
     @classmethod
     def from_weights(
@@ -91,7 +80,6 @@ class Direction:
 
         Parameters
         ----------
-        names : sequence of str
         values : (k,) array
         weights : (k,) array
         covariance : (k, k) array
@@ -136,21 +124,11 @@ class Direction:
 
 @dataclass(frozen=True)
 class Fix:
-    """What would determine the constants of a combination, with its predicted effect.
+    """What would determine the constants of a combination, with its predicted effect."""
 
-    Attributes
-    ----------
-    what : str
-        The known value, sensor or recording, as a phrase.
-    name : str
-        Constant with the widest interval afterwards.
-    factor : float
-        Half width of that interval, as a factor.
-    """
-
-    what: str
-    name: str
-    factor: float
+    what: str  # the known value, sensor or recording, as a phrase
+    name: str  # constant with the widest interval afterwards
+    factor: float  # half width of that interval, as a factor
 
     def sentence(self) -> str:
         """Return the effect as a clause."""

@@ -50,29 +50,17 @@ CONFOUNDED_DEVIATION = 0.1
 
 @dataclass(frozen=True)
 class Estimate:
-    """One value with its statistical uncertainty.
+    """One value with its statistical uncertainty."""
 
-    Attributes
-    ----------
-    value : float
-        Estimate, or the stated value if it was not estimated.
-    statistical_std_error : float or None
-        Standard error due to noise and nuisance parameters. None for what was not estimated, is at
-        a bound, or is not identified by the data.
-    statistical95 : (lower, upper) or None
-        95 % interval due to noise and nuisance parameters, within what is physically possible. It
-        may exist, and be wide, where there is no `statistical_std_error`.
-    at_bound : bool
-        Whether the value, or one it follows from, ended at a bound.
-    reason : str or None
-        Why an estimated value has no `statistical_std_error`.
-    """
-
-    value: float
+    value: float  # estimate, or the stated value if it was not estimated
+    # Standard error due to noise and nuisance parameters. None for what was not estimated, is at a
+    # bound, or is not identified by the data.
     statistical_std_error: float | None = None
+    # (lower, upper) or None: 95 % interval due to noise and nuisance parameters, within what is
+    # physically possible. It may exist, and be wide, where there is no `statistical_std_error`.
     statistical95: tuple[float, float] | None = None
-    at_bound: bool = False
-    reason: str | None = None
+    at_bound: bool = False  # whether the value, or one it follows from, ended at a bound
+    reason: str | None = None  # why an estimated value has no `statistical_std_error`
 
 
 @dataclass(frozen=True)
@@ -238,7 +226,6 @@ def derived_estimates(
 
     Parameters
     ----------
-    derived : DerivedModuli
     covariance_q : (nq, nq) array
         Covariance of q.
     at_bound : (nq,) array of bool

@@ -271,8 +271,6 @@ def field_estimates(
 
     Parameters
     ----------
-    body : Body
-        The body.
     parameters : Parameters
         Shared parameters.
     q : (nq,) array
@@ -407,7 +405,6 @@ def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEst
 
     Parameters
     ----------
-    collocation : Collocation
     z : (variables,) array
         Variables at the answer.
     """
@@ -429,7 +426,6 @@ def mean_logarithm(
 
     Parameters
     ----------
-    body : Body
     parameters : Parameters
         Shared parameters.
     q : (nq,) array

@@ -44,7 +44,6 @@ def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
 
     Parameters
     ----------
-    collocation : Collocation
     z : (variables,) array
         Variables that satisfy the equations of motion.
 
@@ -71,7 +70,6 @@ def observable_responses(collocation: Collocation, z: Array) -> list[ObservableR
 
     Parameters
     ----------
-    collocation : Collocation
     z : (variables,) array
         Variables that satisfy the equations of motion.
 

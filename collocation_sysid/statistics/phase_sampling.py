@@ -76,7 +76,6 @@ class InternalFaces:
 
         Parameters
         ----------
-        mesh : TetMesh
         cells : (E,) array
             Indices of the elements; `pairs` has indices into this array. Faces to other elements
             are left out.

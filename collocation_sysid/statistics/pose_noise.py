@@ -88,8 +88,6 @@ def with_pose_noise(
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The fit.
     collocation : Collocation
         The program.
     z : (variables,) array

@@ -125,8 +125,6 @@ def write_film(updates: Sequence[LiveUpdate], file: str | Path) -> Path:
     ----------
     updates : sequence of LiveUpdate
         At least one update, in order of time, all with the same parameters.
-    file : str or Path
-        File to write.
 
     Returns
     -------

@@ -460,26 +460,13 @@ def _with_values_of_file(section: ReferenceSection, task: Path) -> ReferenceSect
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Reference of one point at the samples of a plan.
+    """Reference of one point at the samples of a plan."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the point.
-    place_m : (3,) array
-        Place on the undeformed body [m].
-    position_m : (T, 3) array
-        Wanted positions; NaN where a coordinate is free.
-    velocity_m_s : (T, 3) array
-        Wanted velocities; NaN where a component is free.
-    sigma_m, sigma_m_s : float
-        Units of the deviations.
-    """
-
-    name: str
-    place_m: Array
-    position_m: Array
-    velocity_m_s: Array
+    name: str  # name of the point
+    place_m: Array  # (3,): place on the undeformed body [m]
+    position_m: Array  # (T, 3): wanted positions; NaN where a coordinate is free
+    velocity_m_s: Array  # (T, 3): wanted velocities; NaN where a component is free
+    # Units of the deviations.
     sigma_m: float
     sigma_m_s: float
 

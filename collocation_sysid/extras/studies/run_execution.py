@@ -222,8 +222,6 @@ class RunStore:
 
         Parameters
         ----------
-        key : str
-            Key of the run.
         time_limit_s : float or None
             Present time limit [s]; None for no limit.
         """

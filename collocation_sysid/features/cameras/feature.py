@@ -96,7 +96,6 @@ def depth_image_hypotheses(
 
     Parameters
     ----------
-    problem : Problem
     parts : sequence of ExperimentIterate
         Experiments simulated at the guess.
     most_nodes : int or None

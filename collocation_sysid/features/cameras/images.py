@@ -117,7 +117,6 @@ def camera_image_hypotheses(
 
     Parameters
     ----------
-    experiment : Experiment
     constants : mapping of str to float
         Constants of the body; only ratios of stiffness within it matter.
     """
@@ -157,7 +156,6 @@ def equilibrium_shapes_m(
 
     Parameters
     ----------
-    experiment : Experiment
     constants : mapping of str to float
         Constants of the body; its moduli are scaled together.
     time_s : float

@@ -94,8 +94,6 @@ def contact_concerns(summaries: Iterable[ContactSummary], guess: str = "") -> li
 
     Parameters
     ----------
-    summaries : iterable of ContactSummary
-        Contact summaries.
     guess : str
         Text that refers to the guess, such as " at the guess"; empty for an answer.
 

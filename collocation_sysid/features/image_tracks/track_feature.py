@@ -60,7 +60,6 @@ def track_hypotheses(
 
     Parameters
     ----------
-    reading : ImageTrackResidual
     predicted : (s, N, 2) array
         Predicted pixels of the first s images.
     of : str

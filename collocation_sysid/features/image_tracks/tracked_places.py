@@ -61,7 +61,6 @@ def find_places(
 
     Parameters
     ----------
-    experiment : Experiment
     shape_at : callable
         ``shape_at(t_s)``, nodes (n, 3) of the body at a time [m].
 

@@ -51,8 +51,6 @@ def averaging_kernel(name: str, point: QuadraturePoint, outputs: Outputs) -> Ele
 
     Parameters
     ----------
-    name : str
-        Name of the kernel.
     outputs : dict
         Derivatives that are summed in each output.
     """

@@ -104,8 +104,6 @@ def minimise_cg_descent(
         domain.
     x0 : (n,) array
         Initial variables; not modified.
-    options : CgDescentOptions, optional
-        Options.
     callback : callable, optional
         Function that is called with the start and every iterate; it stops the minimisation by
         returning true. Its exceptions are not caught. The direction of the start is that of the

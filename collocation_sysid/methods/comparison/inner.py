@@ -47,8 +47,6 @@ def minimise_merit(
     ----------
     inner : str
         Name of the solver.
-    merit : MeritFunction
-        Merit function.
     z : (variables,) array
         Initial variables, within their bounds; not modified.
     tolerance : float

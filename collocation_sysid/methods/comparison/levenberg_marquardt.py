@@ -57,8 +57,6 @@ def minimise_levenberg_marquardt(
 
     Parameters
     ----------
-    merit : MeritFunction
-        Merit function.
     z : (variables,) array
         Initial variables, at which no element is inverted; not modified.
     tolerance : float

@@ -106,8 +106,6 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
     Parameters
     ----------
-    experiment : Experiment
-        Experiment.
     count : int
         Number of samples; it is increased to three and to the first sample with a marker, and as in
         `shortened_experiment`, but not beyond the recording.

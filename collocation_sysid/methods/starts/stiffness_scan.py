@@ -102,25 +102,16 @@ class ScanSummary:
 
 @dataclass(frozen=True, eq=False)
 class Scan(ScanSummary):
-    """Result of a scan of the stiffness, with parameters to start from.
+    """Result of a scan of the stiffness, with parameters to start from."""
 
-    Attributes
-    ----------
-    parameters : Parameters
-        Parameters with the guesses to start from.
-    starts : mapping of int to Parameters
-        Parameters with guesses by the index of a modulus, for `best` and `others`.
-    others : tuple of int
-        Indices of other moduli that may lead to a better solution where there are local minima:
-        those next to the best, and other minima of the misfit, in ascending order of the misfit.
-    share : float
-        Share of the samples that were compared.
-    """
-
-    parameters: Parameters
+    parameters: Parameters  # parameters with the guesses to start from
+    # mapping of int to Parameters: parameters with guesses by the index of a modulus, for `best`
+    # and `others`.
     starts: Mapping[int, Parameters] = field(default_factory=dict)
+    # Indices of other moduli that may lead to a better solution where there are local minima: those
+    # next to the best, and other minima of the misfit, in ascending order of the misfit.
     others: tuple[int, ...] = ()
-    share: float = SHARES[0]
+    share: float = SHARES[0]  # share of the samples that were compared
 
 
 def start_problem(
@@ -138,8 +129,6 @@ def start_problem(
 
     Parameters
     ----------
-    collocation : Collocation
-        Problem.
     is_complete : bool
         Whether the simulation at the start must reach the end of the recordings.
 

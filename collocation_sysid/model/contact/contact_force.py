@@ -106,10 +106,6 @@ class Contact(ComplementarityForce):
         therefore the present pressure at a gap larger by g, at all points with a pressure: they
         move to the surface of the obstacle, from inside it or in front of it. The pressure must not
         be averaged over a step. This is not checked; the result would be wrong.
-
-        Parameters
-        ----------
-        states : States
         """
         evaluated = self._inputs_at(states)
         y = evaluated.u[evaluated.y]
@@ -219,7 +215,6 @@ def contact_terms(experiment: Experiment, step_s: float = 0.0) -> tuple[Contact,
 
     Parameters
     ----------
-    experiment : Experiment
     step_s : float
         Length of the time steps over which pressures are averaged; 0 for the pressure at each
         state. Relaxed contact is not averaged.

@@ -450,8 +450,6 @@ def contact_law(
 
     Parameters
     ----------
-    body : Body
-    obstacle : Obstacle
     static : bool
         Whether the experiment is static.
     averaged : bool

@@ -58,8 +58,6 @@ def surface_gaps_and_pressures(
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     theta : (k,) array
         Constants of the body.
     x : (T, 3n) array
@@ -100,8 +98,6 @@ def friction_summaries(
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     dynamics : Dynamics
         Equations of motion at the parameters, whose time step must be that of x.
     x : (N, 3n) array

@@ -280,8 +280,6 @@ def iterate_alignments(
 
     Parameters
     ----------
-    camera : DepthCameraModel
-        Model of the camera.
     cloud : NearestPoints
         Points of the cloud in the camera's frame.
     places, normals : (P, 3) arrays

@@ -64,31 +64,19 @@ class Outline:
 
     Arrays have S samples of E points at most, of which those that do not exist are zero and not
     `is_compared`.
-
-    Attributes
-    ----------
-    nodes, weights : (S, E, v) arrays
-        Indices of the v surface nodes of each outline point's face, and their shape functions.
-    normals : (S, E, 3) array
-        Unit normals of the planes in the world, outwards from the body.
-    points, rays : (S, E, 3) arrays
-        A point of each plane in the camera's frame [m], and zeros.
-    pixel_m : (S, E) array
-        Width of a pixel at the outline point, along the plane's normal [m].
-    places_m : (S, E, 3) array
-        Outline points on the undeformed body [m].
-    is_compared : (S, E) array of bool
-        Outline points whose edge is known.
     """
 
+    # (S, E, v): indices of the v surface nodes of each outline point's face, and their shape
+    # functions.
     nodes: Index
     weights: Array
-    normals: Array
+    normals: Array  # (S, E, 3): unit normals of the planes in the world, outwards from the body
+    # (S, E, 3): a point of each plane in the camera's frame [m], and zeros.
     points: Array
     rays: Array
-    pixel_m: Array
-    places_m: Array
-    is_compared: NDArray[np.bool_]
+    pixel_m: Array  # (S, E): width of a pixel at the outline point, along the plane's normal [m]
+    places_m: Array  # (S, E, 3): outline points on the undeformed body [m]
+    is_compared: NDArray[np.bool_]  # (S, E) of bool: outline points whose edge is known
 
     @classmethod
     def from_shapes(
@@ -107,12 +95,8 @@ class Outline:
 
         Parameters
         ----------
-        camera : DepthCameraModel
-            Model of the camera.
         surface : VisibleSurface
             Surface of the body.
-        body : Body
-            The body.
         shapes_m : (S, n, 3) array
             Positions of the surface's nodes at the times of the images [m].
         phi : (k,) array
@@ -216,8 +200,6 @@ def no_depth_is_empty(
 
     Parameters
     ----------
-    camera : DepthCameraModel
-        Model of the camera.
     image_m : (rows, columns) array
         Depths [m], NaN where missing.
     sample : int
@@ -384,7 +366,6 @@ def image_edges(
 
     Parameters
     ----------
-    points : OutlinePoints
     shown_at : callable
         Classes (…, P) of pixels (…, P, 2) beside the points.
     is_nothing : callable

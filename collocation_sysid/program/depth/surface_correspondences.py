@@ -61,61 +61,37 @@ class SurfaceCorrespondences(Correspondences):
 
     Only points within the gate are contained; arrays of images with fewer points are padded with
     zeros, and the padding is not `is_compared`.
-
-    Attributes
-    ----------
-    camera : DepthCameraModel
-        Model of the camera.
-    body : Body
-        The body.
-    surface : VisibleSurface
-        Surface of the body.
-    nodes, weights : (S, E, v) arrays
-        Indices of the v surface nodes of each corresponding point's face, and their shape
-        functions.
-    normals : (S, E, 3) array
-        Unit vectors in the world along which distances are measured: normals of the surface, and
-        for a point beyond an edge of the visible surface the direction to it.
-    points, rays : (S, E, 3) arrays
-        Measured points [m], and directions of their depths, in the camera's frame.
-    places_m : (S, E, 3) array
-        Corresponding points on the undeformed body [m].
-    is_compared : (S, E) array of bool
-        Points that are compared.
-    gate_m : float
-        Points farther from the surface are taken to belong to something else [m].
-    excluded_counts : mapping of str to int
-        Number of points that are not compared, by reason (`EXCLUSION_REASONS`).
-    shapes_m : (S, n, 3) array
-        Surface nodes for which the correspondences were found [m].
-    start_values : mapping of str to float
-        The camera's nuisance parameters for which they were found, by label.
-    has_converged : bool
-        Whether shapes had hardly changed since the correspondences before. Only then are points
-        left out that the body hides from the camera: with wrong shapes, too many would seem hidden.
-    outline : Outline
-        Outline of the body in these shapes and the edges in the images; without points if there are
-        no images.
-    is_aligned : bool
-        Whether they are those after an alignment of the camera, see `from_alignment`.
     """
 
     camera: DepthCameraModel
     body: Body
-    surface: VisibleSurface
+    surface: VisibleSurface  # surface of the body
+    # (S, E, v): indices of the v surface nodes of each corresponding point's face, and their shape
+    # functions.
     nodes: Index
     weights: Array
+    # (S, E, 3): unit vectors in the world along which distances are measured: normals of the
+    # surface, and for a point beyond an edge of the visible surface the direction to it.
     normals: Array
+    # (S, E, 3): measured points [m], and directions of their depths, in the camera's frame.
     points: Array
     rays: Array
-    places_m: Array
-    is_compared: NDArray[np.bool_]
-    gate_m: float
+    places_m: Array  # (S, E, 3): corresponding points on the undeformed body [m]
+    is_compared: NDArray[np.bool_]  # (S, E) of bool: points that are compared
+    gate_m: float  # points farther from the surface are taken to belong to something else [m]
+    # mapping of str to int: number of points that are not compared, by reason
+    # (`EXCLUSION_REASONS`).
     excluded_counts: Mapping[str, int]
-    shapes_m: Array
+    shapes_m: Array  # (S, n, 3): surface nodes for which the correspondences were found [m]
+    # mapping of str to float: the camera's nuisance parameters for which they were found, by label.
     start_values: Mapping[str, float]
+    # Whether shapes had hardly changed since the correspondences before. Only then are points left
+    # out that the body hides from the camera: with wrong shapes, too many would seem hidden.
     has_converged: bool
+    # Outline of the body in these shapes and the edges in the images; without points if there are
+    # no images.
     outline: Outline
+    # Whether they are those after an alignment of the camera, see `from_alignment`.
     is_aligned: bool = False
 
     @property
@@ -145,10 +121,6 @@ class SurfaceCorrespondences(Correspondences):
 
         Parameters
         ----------
-        camera : DepthCameraModel
-            Model of the camera.
-        body : Body
-            The body.
         shapes_m : (S, n, 3) array
             Surface nodes at all S images [m].
         phi : (k,) array
@@ -203,10 +175,6 @@ class SurfaceCorrespondences(Correspondences):
 
         Parameters
         ----------
-        camera : DepthCameraModel
-            Model of the camera.
-        body : Body
-            The body.
         shapes_m : (S, n, 3) array
             Surface nodes at all S images [m].
         phi : (k,) array

@@ -48,8 +48,6 @@ def equilibrium(
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     theta : (k,) array
         Constants of the body.
     time_s : float, optional
@@ -210,8 +208,6 @@ def initial_state(
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     forces : Forces
         Forces at the start.
     solver : NewtonSolver

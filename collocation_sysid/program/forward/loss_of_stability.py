@@ -140,8 +140,6 @@ def find_stability_loss(
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     theta : (k,) array
         Constants of the body.
     x : (3n,) array

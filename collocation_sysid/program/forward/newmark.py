@@ -74,8 +74,6 @@ def simulate_newmark(
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     theta : (k,) array
         Constants of the body.
     steps_per_sample : int

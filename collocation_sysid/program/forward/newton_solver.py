@@ -267,8 +267,6 @@ class NewtonSolver:
         ----------
         x : (3n,) array
             First guess [m]; not modified. Prescribed dofs keep their values.
-        equations : StepEquations
-            Equations of the step.
 
         Returns
         -------
@@ -789,8 +787,6 @@ def simulation_error(
     ----------
     solver : NewtonSolver
         The solver that failed.
-    failure : NewtonFailure
-        The failure.
     time_s : float
         Time of the step [s].
     what : str

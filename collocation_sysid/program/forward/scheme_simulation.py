@@ -333,8 +333,6 @@ def solve_row(
     ----------
     solver : NewtonSolver
         Newton's method for the dofs prescribed at this time.
-    row : RowEquations
-        The row.
     guess : (3n,) array
         First guess [m].
     previous : (3n,) array

@@ -75,8 +75,6 @@ def find_branch_change(experiment: Experiment, dynamics: Dynamics, x: Array) -> 
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
     dynamics : Dynamics
         Its equations of motion at the parameters.
     x : (N, 3n) array

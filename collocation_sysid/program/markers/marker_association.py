@@ -41,43 +41,23 @@ class ShapeFunctions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MarkerAssociation:
-    """Element of each marker, and directions in which its place may move.
-
-    Attributes
-    ----------
-    body : Body
-        The body.
-    sigma_m : (M,) array
-        Prior standard deviation of each place [m], zero where it is exact.
-    prior_places_m : (M, 3) array
-        Places at the centres of the priors [m].
-    on_surface : bool
-        Whether places move in the plane of the nearest face (k = 2) or freely (k = 3).
-    nodes, weights : (M, npe) arrays
-        Nodes and shape functions of exact places.
-    cells : (M,) array
-        Elements of estimated places.
-    centre_places_m : (M, 3) array
-        Places at the centre of the association [m].
-    axes : (M, 3, k) array
-        Orthonormal directions in which places may move.
-    crossed_edges : (M, 2, 3) array
-        Point and direction of the edge across which each place last left the surface; NaN if it did
-        not.
-    crossing_counts : (M,) array
-        How often in succession it left the surface across this edge before.
-    """
+    """Element of each marker, and directions in which its place may move."""
 
     body: Body
-    sigma_m: Array
-    prior_places_m: Array
+    sigma_m: Array  # (M,): prior standard deviation of each place [m], zero where it is exact
+    prior_places_m: Array  # (M, 3): places at the centres of the priors [m]
+    # Whether places move in the plane of the nearest face (k = 2) or freely (k = 3).
     on_surface: bool
+    # (M, npe): nodes and shape functions of exact places.
     nodes: Index
     weights: Array
-    cells: Index
-    centre_places_m: Array
-    axes: Array
+    cells: Index  # (M,): elements of estimated places
+    centre_places_m: Array  # (M, 3): places at the centre of the association [m]
+    axes: Array  # (M, 3, k): orthonormal directions in which places may move
+    # (M, 2, 3): point and direction of the edge across which each place last left the surface; NaN
+    # if it did not.
     crossed_edges: Array
+    # (M,): how often in succession it left the surface across this edge before.
     crossing_counts: Index
 
     @classmethod

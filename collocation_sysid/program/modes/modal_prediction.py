@@ -157,8 +157,6 @@ class ModalResponse:
 
         Parameters
         ----------
-        experiment : Experiment
-            The experiment.
         constants : mapping of str to float
             Constants of the body by name; only their ratios matter.
         """

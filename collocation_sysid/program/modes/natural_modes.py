@@ -33,24 +33,13 @@ RIGID_MOTIONS = 6
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Lowest oscillating modes, by ascending frequency.
+    """Lowest oscillating modes, by ascending frequency."""
 
-    Attributes
-    ----------
-    frequencies_hz : (k,) array
-        Undamped natural frequencies ω / 2π.
-    damping_ratios : (k,) array
-        Damping ratios ζ; modes with 1 and above do not oscillate.
-    shapes : (k, n, 3) array
-        Displacements with φᵀ M φ = 1 kg (unit m); zero at prescribed dofs.
-    omitted_count : int
-        Number of modes left out because they have no restoring force: six rigid ones of a body
-        without grasp, and those in which a state is unstable.
-    """
-
-    frequencies_hz: Array
-    damping_ratios: Array
-    shapes: Array
+    frequencies_hz: Array  # (k,): undamped natural frequencies ω / 2π
+    damping_ratios: Array  # (k,): damping ratios ζ; modes with 1 and above do not oscillate
+    shapes: Array  # (k, n, 3): displacements with φᵀ M φ = 1 kg (unit m); zero at prescribed dofs
+    # Number of modes left out because they have no restoring force: six rigid ones of a body
+    # without grasp, and those in which a state is unstable.
     omitted_count: int = 0
 
     def compute_angular_frequencies_rad_s(self) -> Array:

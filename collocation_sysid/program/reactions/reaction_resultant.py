@@ -196,10 +196,6 @@ class ReactionResultant:
 
         Parameters
         ----------
-        experiment : Experiment
-            The experiment.
-        grasp : Grasp
-            One of its grasps.
         frame : str
             Frame of the sensor, in whose axes components are expressed.
         point_m : (3,) array

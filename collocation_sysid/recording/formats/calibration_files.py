@@ -77,27 +77,15 @@ CORNER_OF_PIXEL = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibration of one camera.
+    """Calibration of one camera."""
 
-    Attributes
-    ----------
-    name : str
-        Name in the file; "" without one.
-    matrix : (3, 3) array
-    distortion : (k,) array
-        In the order of OpenCV.
-    model : {"pinhole", "fisheye"}
-    size_px : (int, int) or None
-        Columns and rows of the images; None if the file does not state them.
-    pose : (4, 4) array or None
-        Transform from the camera to the world of the file; None if it states none.
-    """
-
-    name: str
-    matrix: Array
-    distortion: Array
+    name: str  # name in the file; "" without one
+    matrix: Array  # (3, 3)
+    distortion: Array  # (k,): in the order of OpenCV
     model: Lens = "pinhole"
+    # (int, int) or None: columns and rows of the images; None if the file does not state them.
     size_px: tuple[int, int] | None = None
+    # (4, 4) or None: transform from the camera to the world of the file; None if it states none.
     pose: Array | None = None
 
 
@@ -106,7 +94,6 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
 
     Parameters
     ----------
-    path : path
     camera : str, optional
         Name or number of the camera in a file of several; not needed for a file of one.
 

@@ -64,7 +64,6 @@ def camera_matrix(message: Any, rectified: bool, shape: tuple[int, int]) -> Arra
 
     Parameters
     ----------
-    message : message
     rectified : bool
         Whether the images are rectified; then the matrix is that of the projection p, unless p is
         missing or zero.

@@ -193,8 +193,6 @@ def read_columns(
 
     Parameters
     ----------
-    path : str or Path
-    quantities : sequence of Quantity
     column_names : mapping, optional
         Column name by a quantity's key; "t" for the time. A unit that the file does not state may
         follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
@@ -324,8 +322,6 @@ def find_column(
 
     Parameters
     ----------
-    grid : TextTable
-    quantity : Quantity
     others : sequence of Quantity
         Further quantities that the table may have: a column whose name and unit fit one of them
         needs no other unit.

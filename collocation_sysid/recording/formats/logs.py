@@ -119,7 +119,6 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
 
     Parameters
     ----------
-    path : Path
     episode : int, optional
         Episode of a dataset, from 0; the only one by default. Ignored for other logs.
 

@@ -79,7 +79,6 @@ def tracks_of_table(
 
     Parameters
     ----------
-    table : TextTable
     labels : sequence of str
         Labels of all markers of the table.
     coordinate_columns : sequence of (int, int, int)
@@ -140,7 +139,6 @@ class Header:
 
         Parameters
         ----------
-        key : str
         count : int
             Actual number.
         what : str
@@ -171,14 +169,10 @@ def tracks_of_frames(
 
     Parameters
     ----------
-    header : Header
     count_key, rate_key : str
         Keys of the number of frames, and of their rate.
     leading : sequence of str
         Names of the columns before those of the markers; "Time" is the time.
-    labels : sequence of str
-    frames : list of Row
-    choose : LabelChooser
     **fields
         Further fields of `RawTracks`.
 

@@ -159,7 +159,6 @@ def separated_rows(text: str, separator: str | None = None) -> list[Row]:
 
     Parameters
     ----------
-    text : str
     separator : str, optional
         Separator of cells; by default the semicolon or tab if most lines have one, else the comma.
 
@@ -214,8 +213,6 @@ def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> T
 
     Parameters
     ----------
-    columns : list of str
-    rows : list of Row
     names_line : int
         Line of the column names, counted from 1.
 
@@ -286,7 +283,6 @@ def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) 
 
     Parameters
     ----------
-    grid : TextTable
     columns : sequence of int
         Indices of the columns.
     blank_allowed : bool
@@ -321,7 +317,6 @@ def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
 
     Parameters
     ----------
-    grid : TextTable
     column : int
         Index of the column.
     factor : float

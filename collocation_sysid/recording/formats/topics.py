@@ -276,7 +276,6 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
 
     Parameters
     ----------
-    message : object
     recorded_ns : int
         Time at which the message was recorded [ns].
     start_ns : int
@@ -502,7 +501,6 @@ def chains_from(
 
     Parameters
     ----------
-    edges : Edges
     frames : iterable of str
         Frames at which chains begin; those without a transform are ignored.
     chains : iterable of (str, str)

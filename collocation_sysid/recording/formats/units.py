@@ -84,7 +84,6 @@ def length_unit_of_text(text: str, where: str) -> str | None:
 
     Parameters
     ----------
-    text : str
     where : str
         Place in the file, for messages.
 

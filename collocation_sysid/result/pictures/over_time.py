@@ -100,8 +100,6 @@ def marker_tracks(
     ----------
     t_s : (T,)
         Times of the samples.
-    names : sequence of M str
-        Names of the markers.
     measured_m : (T, M, 3)
         Measured markers, NaN where missing.
     fitted_m, simulated_m : (T, M, 3) or None

@@ -199,8 +199,6 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
 
     Parameters
     ----------
-    chosen : MethodCost
-        Cost of the chosen method.
     others : sequence of MethodCost
         Costs of at least one method; the chosen one may be among them.
     """
@@ -222,8 +220,6 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
 
     Parameters
     ----------
-    chosen : MethodCost
-        Cost of the chosen method.
     others : sequence of MethodCost
         Costs of all methods; the chosen one may be among them.
     """

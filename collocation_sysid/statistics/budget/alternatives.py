@@ -31,20 +31,11 @@ ALONG = 0.7
 
 @dataclass(frozen=True)
 class Alternative:
-    """Estimates under another assumption, to first order.
+    """Estimates under another assumption, to first order."""
 
-    Attributes
-    ----------
-    assumption : str
-        Name of the assumption, such as "damping_law".
-    condition : str
-        What would have to be true, such as "with the damping law material".
-    values : mapping of str to float
-        Estimates whose interval does not contain the effect, by name.
-    """
-
-    assumption: str
-    condition: str
+    assumption: str  # name of the assumption, such as "damping_law"
+    condition: str  # what would have to be true, such as "with the damping law material"
+    # mapping of str to float: estimates whose interval does not contain the effect, by name.
     values: Mapping[str, float]
 
 
@@ -143,8 +134,6 @@ def origin_answers(
         Uncertainty budgets.
     parameters : Parameters
         Parameters with their coordinates.
-    body : Body
-        The body.
     stated : Assumptions
         Stated deviations.
     """

@@ -120,7 +120,6 @@ def changes_of_nuisances(
 
     Parameters
     ----------
-    collocation : Collocation
     z : array
         Variables at the answer.
     deviations : mapping

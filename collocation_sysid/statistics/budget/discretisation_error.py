@@ -392,8 +392,6 @@ def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The fit.
     residual_changes : sequence of (T, M, 3) arrays
         Changes of the residuals of each block, in units of σ, without Huber's weights.
     """
@@ -406,8 +404,6 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The fit.
     changes : sequence of (T, M, 3, a) arrays
         Changes of the residuals of each block, in units of σ; where nothing is measured they are
         ignored. Huber's weights are applied here.

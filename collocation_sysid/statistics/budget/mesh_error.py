@@ -71,7 +71,6 @@ def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array
 
     Parameters
     ----------
-    collocation : Collocation
     z : (variables,) array
         Variables that satisfy the equations of motion.
     fit : LinearisedFit
@@ -144,7 +143,6 @@ def _equivalent_forces(
 
     Parameters
     ----------
-    at : ExperimentAtAnswer
     dynamics : Dynamics
         Equations of motion on the finer mesh.
     interpolation : (3m, 3n) sparse array

@@ -194,7 +194,6 @@ def sliding_faces(
 
     Parameters
     ----------
-    experiment : Experiment
     dofs : (g,) int array
         Prescribed dofs.
     reactions_n : (N, g) array

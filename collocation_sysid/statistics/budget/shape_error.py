@@ -121,8 +121,6 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
 
     Parameters
     ----------
-    body : Body
-        The body.
     known : (k,) array
         Nodes of the mesh near which the surface is known, such as those that touch an obstacle.
     correlation : float
@@ -231,8 +229,6 @@ def sag_m(body: Body, theta: Array, support_dofs: Index, axis: int) -> Array:
 
     Parameters
     ----------
-    body : Body
-        The body.
     theta : (k,) array
         Constants of the body.
     support_dofs : (k,) array

@@ -94,26 +94,19 @@ CORRELATION_KEY = "surface_correlation"
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """Change of the equations of motion if an assumption is off by one unit.
+    """Change of the equations of motion if an assumption is off by one unit."""
 
-    Attributes
-    ----------
-    force_n : (N, 3n) array or None
-        Change of the forces at the evaluations [N]; None means no change.
-    mass_kg : (3n,) array or None
-        Change of the inertial masses, whose weight is not in `force_n` [kg]; None means no change.
-    time_stretch : float
-        Relative change of the times in the inertia.
-    displacement_m : (N, g) array or None
-        Change of the prescribed positions of the grasped dofs [m]; None means no change.
-    start_m : (3n,) array or None
-        Change of given start positions [m]; None means no change. Equilibria follow the forces.
-    """
-
+    # (N, 3n) or None: change of the forces at the evaluations [N]; None means no change.
     force_n: Array | None = None
+    # (3n,) or None: change of the inertial masses, whose weight is not in `force_n` [kg]; None
+    # means no change.
     mass_kg: Array | None = None
-    time_stretch: float = 0.0
+    time_stretch: float = 0.0  # relative change of the times in the inertia
+    # (N, g) or None: change of the prescribed positions of the grasped dofs [m]; None means no
+    # change.
     displacement_m: Array | None = None
+    # (3n,) or None: change of given start positions [m]; None means no change. Equilibria follow
+    # the forces.
     start_m: Array | None = None
 
 

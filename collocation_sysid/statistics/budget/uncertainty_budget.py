@@ -73,8 +73,6 @@ class BudgetLine:
             Name of the source.
         deviation : float
             Its standard deviation in the coordinate of the estimate.
-        coordinate : IntervalCoordinate
-            That coordinate.
 
         Notes
         -----
@@ -239,8 +237,6 @@ class VarianceSources:
         ----------
         by_q : (nq,) array
             Derivatives of the estimate.
-        others : float
-            Variance of all other sources.
         counted : float
             Variance between recordings that is counted already.
 

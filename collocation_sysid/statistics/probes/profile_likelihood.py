@@ -40,29 +40,17 @@ HIGHEST = 16.0
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Loss as a function of one parameter, with everything else fitted.
-
-    Attributes
-    ----------
-    parameter : str
-        Name.
-    values, losses : (n,) arrays
-        Ascending values and the losses there; infinite where there is no solution.
-    threshold : float
-        Increase of the loss at which the interval ends.
-    interval : (lower or None, upper or None)
-        95 % interval; None where it is open, because the loss does not rise so far up to the last
-        value.
-    message : str
-        Message for the user.
-    """
+    """Loss as a function of one parameter, with everything else fitted."""
 
     parameter: str
+    # (n,): ascending values and the losses there; infinite where there is no solution.
     values: Array
     losses: Array
-    threshold: float
+    threshold: float  # increase of the loss at which the interval ends
+    # (lower or None, upper or None): 95 % interval; None where it is open, because the loss does
+    # not rise so far up to the last value.
     interval: tuple[float | None, float | None]
-    message: str
+    message: str  # message for the user
 
 
 def compute_profile(

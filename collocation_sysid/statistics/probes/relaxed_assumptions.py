@@ -227,8 +227,6 @@ def with_relaxed_assumption(
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The fit.
     changes : ResidualChanges
         Changes of its residuals by the assumptions, each off by its standard deviation, which is
         the unit of the new parameters.
@@ -260,8 +258,6 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
 
     Parameters
     ----------
-    fit : SolvedFit
-        The fit.
     name : str
         The assumption with its component.
     wide : LinearisedFit

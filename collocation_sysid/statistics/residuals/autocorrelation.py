@@ -85,10 +85,6 @@ class LaggedProducts:
 
         Parameters
         ----------
-        fit : LinearisedFit
-            The fit.
-        information : Information
-            Its information.
         tails : sequence of (T,) arrays
             Autocovariances of each experiment by lag, zero at the lags in `lags`.
         """
@@ -117,10 +113,6 @@ def lagged_products(
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The fit.
-    information : Information
-        Its information.
     lags : sequence of int
         Last lag of each experiment.
     """
@@ -371,7 +363,6 @@ def error_processes(fit: LinearisedFit, information: Information) -> tuple[Error
 
     Parameters
     ----------
-    fit : LinearisedFit
     information : Information
         Information of the fit.
     """

@@ -131,13 +131,6 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
 
     Blocks with a floor of noise are left out.
 
-    Parameters
-    ----------
-    fit : LinearisedFit
-        The fit.
-    information : Information
-        Its information.
-
     Notes
     -----
     Sums of squares that Huber's loss has shortened are corrected by `shortened_power`. If residuals

@@ -47,8 +47,6 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
 
     Parameters
     ----------
-    block : ResidualBlock
-        The block.
     slope : (T, n, r) array
         Its D = S L, see `linearised`.
 
