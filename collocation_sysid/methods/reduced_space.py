@@ -65,9 +65,9 @@ class ReducedSpace(SearchOptions):
     Attributes
     ----------
     coarse_start : {"auto", false}
-        "auto": solve a problem with a large body on a coarser mesh first, and start from there,
-        unless a start is given. The result on the given mesh is that of a direct start, to within
-        `coarse_start_tolerance`.
+        "auto": solve a problem with a large body on a coarser mesh first, and one with many samples
+        with some of them, and start from there, unless a start is given. The result is that of a
+        direct start, to within `coarse_start_tolerance`.
     coarse_start_nodes : int
         Number of nodes above which a body is large.
     coarse_start_tolerance : float

@@ -20,6 +20,8 @@ from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S
 from .time_tables import FEWEST_SHARED_SAMPLES
 
+# Twice the standard deviation of a sample less the mean of two others, in that of a sample.
+NOISE_OF_CURVATURE = 2.5
 # Fewest samples of a placeholder, which resampling and a low-pass need.
 FEWEST_PLACEHOLDERS = 3
 
@@ -86,6 +88,34 @@ def thinned_experiment(experiment: Experiment, *, many: int, most: int) -> Exper
         sensor.thinned(most) if many_points else sensor
         for sensor, many_points in zip(experiment.measurements, has_many, strict=True)
     )
+
+
+def smooth_distance(experiment: Experiment, *, most: int, share: float) -> int:
+    """Return the largest distance n of samples of a motion, from 1 to `most`, between which the
+    marker tracks are linear, to a share of their standard deviation and the noise; 1 with other
+    measurements and with obstacles.
+    """
+    markers = experiment.markers
+    is_alone = experiment.measurements == (markers,) and not experiment.obstacles
+    if experiment.is_static or not is_alone or markers.offsets_s is not None:
+        return 1
+    tracks = np.asarray(markers.positions_m)
+    noise_m = NOISE_OF_CURVATURE * float(np.sqrt(np.mean(markers.sigma_m**2)))
+    varying_m = float(np.sqrt(np.nanmean(np.nanvar(tracks, axis=0))))
+    for distance in range(most, 1, -1):
+        half = max(1, distance // 2)
+        bend = tracks[half:-half] - (tracks[: -2 * half] + tracks[2 * half :]) / 2
+        known = bend[np.isfinite(bend)]
+        if known.size and np.sqrt(np.mean(known**2)) < noise_m + share * varying_m:
+            return distance
+    return 1
+
+
+def with_some_samples(experiment: Experiment, distance: int) -> Experiment:
+    """Return a recording of markers with every n-th sample, from the first on."""
+    rows = np.arange(0, len(experiment.t_s), distance)
+    some = at_times(experiment.markers, rows)
+    return experiment.with_measurements([some], t_s=experiment.t_s[rows])
 
 
 def moved_grasp(grasp: Grasp, poses: PoseSequence, t_s: Array) -> Grasp:

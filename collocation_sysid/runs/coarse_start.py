@@ -1,9 +1,10 @@
-"""Start of a search on a large body: the same problem is solved on a coarser mesh first.
+"""Start of a large search: the same problem is solved on a coarser mesh, or with fewer samples, first.
 
 The parameters, the nuisance parameters and the interpolated motion of the coarse body are the start
 on the given mesh, which replaces the scan of the stiffness, the simulations and the horizons of
 increasing length there. The criterion of convergence on the given mesh is the same, and so is the
-answer. As both meshes see the same recordings, the difference of both answers also estimates the
+answer. Of a recording that is sampled much faster than the body moves, every n-th sample serves in
+the same way. As both meshes see the same recordings, the difference of both answers also estimates the
 error that the given mesh leaves, see `mesh_error_note`.
 """
 
@@ -13,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
@@ -25,7 +27,9 @@ from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import Recorder
 from ..problem import Problem
 from ..program.collocation import Collocation
+from ..recording.experiment import Experiment
 from ..recording.experiment_coarsening import coarse_experiment, node_sets
+from ..recording.measurement_selection import smooth_distance, with_some_samples
 from ..statistics.budget.discretisation_error import MESH_ORDER
 from ..statistics.estimates import IntervalCoordinate
 from ..statistics.linearised import parameter_values
@@ -45,26 +49,50 @@ LARGEST_STANDARD_ERROR = 1.0
 BOUND_DISTANCE = 1e-6
 
 
+# Numbers of samples from which a search starts with some of them, and that those are at least: with
+# fewer, most of the time passes after the search.
+MANY_SAMPLES = 500
+FEWEST_SAMPLES = 150
+# Deviation from a straight line between these samples, over the standard deviation of the tracks:
+# that of a swing with 12 samples a period.
+SMOOTH_SHARE = 0.03
+
+
 class NoCoarseStartError(Exception):
     """Reason why a problem has no coarse start, as a part of a sentence."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseStart:
-    """Problem on coarser meshes."""
+    """Problem on coarser meshes, or with fewer samples."""
 
     # Fitted experiments on coarse bodies, with the parameters of the given problem.
     problem: Problem
     # mapping of str to CoarseBody: relation of coarse and given body, by experiment name;
     # experiments whose body is small are left out.
     relations: Mapping[str, CoarseBody]
+    # n of the experiments of which every n-th sample is used, by name; others are left out.
+    distances: Mapping[str, int]
+    # Number of samples of these experiments in the given problem.
+    given_samples: int
 
     def describe_size(self) -> str:
-        """Return the numbers of nodes of the coarse and the given bodies, in words."""
-        distinct = {id(r.coarse): r for r in self.relations.values()}.values()
-        coarse = sum(len(each.coarse.nodes.points_m) for each in distinct)
-        given = sum(len(each.body.nodes.points_m) for each in distinct)
-        return f"{coarse:,} of {given:,} nodes"
+        """Return the numbers of nodes of the coarse and the given bodies, and of samples, in words."""
+        parts = []
+        if self.relations:
+            distinct = {id(r.coarse): r for r in self.relations.values()}.values()
+            coarse = sum(len(each.coarse.nodes.points_m) for each in distinct)
+            given = sum(len(each.body.nodes.points_m) for each in distinct)
+            parts.append(f"{coarse:,} of {given:,} nodes")
+        if self.distances:
+            some = (e for e in self.problem.experiments if e.name in self.distances)
+            count = sum(len(each.t_s) for each in some)
+            parts.append(f"{count:,} of {self.given_samples:,} samples")
+        return " and ".join(parts)
+
+    def describe_target(self) -> str:
+        """Return on what the search ends, as a phrase."""
+        return "on the given mesh" if self.relations else "with all samples"
 
     def compute_edge_ratio(self) -> float:
         """Return the mean edge length of the coarse mesh over that of the given one, the smallest
@@ -114,19 +142,28 @@ class CoarseStart:
         p, _ = WarmStart.of(solution).apply_to_nuisance(collocation)
         p = np.clip(p, *collocation.compute_parameter_bounds())
         _, coarse_positions = solution.collocation.unpack(solution.z)
-        return collocation.pack(p, self.interpolated(coarse_positions))
+        rows = [each.grid_times for each in collocation.transcriptions]
+        return collocation.pack(p, self.interpolated(coarse_positions, rows))
 
-    def interpolated(self, coarse_positions: Sequence[Array]) -> list[Array]:
-        """Return positions (N, 3n) [m] of each fitted experiment on the given bodies from those on
-        the coarse ones, (N, 3m).
+    def interpolated(self, coarse_positions: Sequence[Array], rows: Sequence[int]) -> list[Array]:
+        """Return positions (N, 3n) [m] of each fitted experiment on the given bodies and at the
+        given times from those of the coarse problem, (M, 3m).
 
-        Both lists are in the order of the experiments of `problem`; the positions of experiments
-        whose body is not coarsened are returned themselves.
+        All lists, of which `rows` has the numbers of times N, are in the order of the experiments
+        of `problem`; positions of experiments that are not coarser are returned themselves.
         """
         names = [each.name for each in self.problem.experiments]
         return [
-            self._interpolated(name, x) for name, x in zip(names, coarse_positions, strict=True)
+            self._at_all_times(name, self._interpolated(name, x), count)
+            for name, x, count in zip(names, coarse_positions, rows, strict=True)
         ]
+
+    def _at_all_times(self, experiment: str, x: Array, count: int) -> Array:
+        """Return positions at all times of an experiment from those with some of its samples."""
+        distance = self.distances.get(experiment)
+        if distance is None:
+            return x
+        return make_interp_spline(distance * np.arange(len(x)), x)(np.arange(count))
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
         """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m); nodes of
@@ -147,8 +184,9 @@ class CoarseStart:
 
 
 def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | None:
-    """Return the fitted experiments of a problem on coarser meshes, or None if the method's options
-    or the sizes of the bodies do not call for a coarse start.
+    """Return the fitted experiments of a problem on coarser meshes and with fewer samples, or None if
+    the method's options, the sizes of the bodies and the numbers of samples do not call for a
+    coarse start.
 
     Validation experiments and notes are left out, and small bodies keep their mesh; the problem is
     not modified.
@@ -166,7 +204,8 @@ def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | N
         for each in fitted
         if each.specimen is None and len(each.body.nodes.points_m) > method.coarse_start_nodes
     }
-    if not large:
+    distances = {each.name: n for each in fitted if (n := _sample_distance(each)) > 1}
+    if not large and not distances:
         return None
     if problem.find_two_phase_fields():
         raise NoCoarseStartError(
@@ -179,10 +218,23 @@ def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | N
             coarse_experiment(each, relations[each.name]) if each.name in relations else each
             for each in fitted
         ]
+        experiments = [
+            with_some_samples(each, distances[each.name]) if each.name in distances else each
+            for each in experiments
+        ]
         moved = replace(problem, experiments=experiments, notes=())
     except InputError as error:
         raise NoCoarseStartError(error.message) from error
-    return CoarseStart(moved, relations)
+    samples = sum(len(each.t_s) for each in fitted if each.name in distances)
+    return CoarseStart(moved, relations, distances, samples)
+
+
+def _sample_distance(experiment: Experiment) -> int:
+    """Return the distance of the samples of a recording with which the search starts."""
+    most = len(experiment.t_s) // FEWEST_SAMPLES
+    if len(experiment.t_s) < MANY_SAMPLES:
+        return 1
+    return smooth_distance(experiment, most=most, share=SMOOTH_SHARE)
 
 
 def _coarse_body(body: Body, problem: Problem) -> CoarseBody:
@@ -238,8 +290,8 @@ def interrupted_solution(start: CoarseStart, problem: Problem, coarse: Solution)
         evaluations=0,
     )
     note = (
-        f"interrupted during the coarse start ({start.describe_size()}): the motion is interpolated and does "
-        "not satisfy the equations of motion of the given mesh"
+        f"interrupted during the coarse start ({start.describe_size()}): the motion is interpolated "
+        f"and does not satisfy the equations of motion {start.describe_target()}"
     )
     return replace(
         solution, notes=(note,), scan=coarse.scan, timing=solution.timing + coarse.timing
@@ -289,14 +341,15 @@ def start_note(start: CoarseStart, coarse: Solution, given: Solution) -> str:
     """
     return (
         f"coarse start: solved on {start.describe_size()} first, with {coarse.iterations} sweeps in "
-        f"{coarse.timing.total:.2g} s, then on the given mesh with {given.iterations} sweeps in "
+        f"{coarse.timing.total:.2g} s, then {start.describe_target()} with {given.iterations} sweeps in "
         f"{given.timing.total:.2g} s"
     )
 
 
 def mesh_error_note(start: CoarseStart, coarse: Solution, given: Solution) -> str | None:
     """Return a note with the estimated error of the given mesh [%] in each estimated scalar
-    parameter; None if none is estimated, or every estimate is zero or has no finite error.
+    parameter; None if none is estimated, or every estimate is zero or has no finite error, and if
+    the mesh was the same.
 
     With edge lengths in the ratio r, elements of order 2 leave the r² − 1-th part of the difference
     of both solutions (Richardson's extrapolation, as in `discretisation_error`), in the coordinate
@@ -310,6 +363,8 @@ def mesh_error_note(start: CoarseStart, coarse: Solution, given: Solution) -> st
     coarse, given : Solution
         Converged solutions on the coarse and on the given mesh.
     """
+    if not start.relations:
+        return None
     before = parameter_values(coarse.collocation, coarse.q)
     after = parameter_values(given.collocation, given.q)
     share = 1.0 / (start.compute_edge_ratio() ** MESH_ORDER - 1.0)

@@ -311,9 +311,10 @@ def _solve_from_coarse(
             f"the search from the solution on {coarse_start.describe_size()} ended with: "
             f"{solution.message}"
         )
+    where = "on the coarse mesh" if coarse_start.relations else "with some samples"
     notes = [
         start_note(coarse_start, coarse, solution),
-        *(f"on the coarse mesh: {note}" for note in coarse.notes),
+        *(f"{where}: {note}" for note in coarse.notes),
     ]
     if solution.status.converged:
         error_note = mesh_error_note(coarse_start, coarse, solution)
@@ -343,7 +344,7 @@ def _solve_once(
             solution = _solve_by_coarse_start(problem, solver, watch=watch, workers=workers)
         except NoCoarseStartError as reason:
             solution = None
-            notes.append(f"the search was not started on a coarser mesh: {reason}")
+            notes.append(f"the search had no coarse start: {reason}")
         if solution is not None:
             return solution
         try:

@@ -1,4 +1,4 @@
-"""Start on a coarser mesh: same answer, transferred recordings, fallback, interruption, display."""
+"""Coarse start, of mesh and samples: same answer, transferred recordings, fallback, interruption."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ from collocation_sysid.fem.coarse_body import coarsen_body
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution, Status
+from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.experiment_coarsening import coarse_experiment, node_sets
+from collocation_sysid.runs import coarse_start
 from collocation_sysid.runs.coarse_start import plan_coarse_start
 from collocation_sysid.runs.solving import solve
 
@@ -139,9 +141,7 @@ def test_an_unsuccessful_coarse_start_is_noted_and_solved_directly():
     limit = replace(COARSE, max_iterations=2)
     solution = solve(problem, limit)
     assert solution.status is Status.ITERATION_LIMIT
-    assert solution.notes[0].startswith(
-        "the search was not started on a coarser mesh: the solve on "
-    )
+    assert solution.notes[0].startswith("the search had no coarse start: the solve on ")
     direct = solve(problem, replace(limit, coarse_start=False))
     assert solution.q == pytest.approx(direct.q)
 
@@ -150,7 +150,7 @@ def test_a_mesh_that_cannot_be_coarser_is_noted():
     problem = problem_of(measured(hung_cube(10, divisions=(1, 1, 2))))
     solution = solve(problem, ReducedSpace(coarse_start_nodes=10))
     assert solution.status is Status.CONVERGED
-    assert solution.notes[0].startswith("the search was not started on a coarser mesh: only ")
+    assert solution.notes[0].startswith("the search had no coarse start: only ")
 
 
 def test_small_bodies_and_given_starts_have_no_coarse_start():
@@ -225,6 +225,41 @@ def test_cavities_and_tendons_are_transferred():
         )
 
 
+def finely_sampled() -> Problem:
+    """A small swung cube with 61 samples, without guesses."""
+    return problem_of(noisy(hung_cube(60)))
+
+
+def test_a_search_with_many_samples_starts_with_some_of_them(monkeypatch):
+    problem = finely_sampled()
+    direct = solve(problem, DIRECT)
+    assert coarse_note(solve(problem)) == ""
+    monkeypatch.setattr(coarse_start, "MANY_SAMPLES", 60)
+    monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 25)
+    start = plan_coarse_start(problem, ReducedSpace())
+    assert start is not None
+    (some,) = start.problem.experiments
+    (given,) = problem.experiments
+    assert 25 <= len(some.t_s) < 60
+    assert some.t_s[0] == given.t_s[0]
+    solution = solve(problem)
+    assert f"solved on {len(some.t_s)} of {len(given.t_s)} samples first" in coarse_note(solution)
+    assert solution.status is direct.status is Status.CONVERGED
+    assert len(solution.collocation.transcriptions[0].experiment.t_s) == len(given.t_s)
+    for name, value in direct.parameters.items():
+        assert solution.parameters[name] == pytest.approx(value, rel=1e-5), name
+
+
+def test_all_samples_of_fast_motions_and_of_other_sensors_are_the_start(monkeypatch):
+    monkeypatch.setattr(coarse_start, "MANY_SAMPLES", 10)
+    monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 4)
+    (swing,) = finely_sampled().experiments
+    ripple_m = 0.02 * np.sin(np.arange(len(swing.t_s)) * np.pi / 2)[:, None, None]
+    tracks = with_markers(swing, swing.markers.positions_m + ripple_m)
+    assert plan_coarse_start(problem_of(tracks), ReducedSpace()) is None
+    assert plan_coarse_start(problem_of(swing), ReducedSpace()) is not None
+
+
 def test_frames_of_obstacles_are_copied():
     experiment = pressed_box()
     problem = Problem([experiment], TRUTH | {"mu_pa": Unknown(250.0)})
@@ -238,7 +273,7 @@ def test_frames_of_obstacles_are_copied():
             start.problem.experiments, start.problem.collocation().transcriptions, strict=True
         )
     ]
-    (positions,) = start.interpolated(undeformed)
+    (positions,) = start.interpolated(undeformed, [len(undeformed[0])])
     given_m = experiment.body.nodes_m
     assert len(coarse.body.nodes_m) < len(given_m)
     assert positions[0] == pytest.approx(given_m.ravel(), abs=1e-12)

@@ -19,6 +19,7 @@ from collocation_sysid.runs.mesh_resolution import estimate_mesh_error, mesh_res
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.numerical_error import finer_mesh
 from collocation_sysid.runs.solving import solve
+from collocation_sysid.statistics.budget import mesh_error
 from collocation_sysid.statistics.budget.discretisation_error import Refinement, with_estimated_mesh
 from collocation_sysid.statistics.budget.mesh_error import mesh_change
 from collocation_sysid.statistics.estimates import Estimate
@@ -238,3 +239,34 @@ def test_intervals_of_a_body_that_obstacles_touch_say_that_they_contain_no_error
     assert note == (
         "the intervals contain no error of the mesh: obstacles touch the body; `refine` measures it"
     )
+
+
+@pytest.mark.long
+def test_a_motion_between_whose_samples_little_changes_has_the_error_of_a_part_of_them(monkeypatch):
+    body = cs.Body(cs.box_mesh((0.02, 0.02, 0.08), (1, 1, 3)), density_kg_m3=1000.0)
+    t_s = np.arange(101) / 1000.0
+    sway_m = 0.02 * (1 - np.cos(20 * t_s))
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    poses = cs.PoseSequence(t_s, np.outer(sway_m, [1.0, 0.5, 0.3]), turns)
+    held = np.flatnonzero(body.nodes_m[:, 2] > 0.079)
+    unseen = cs.Markers(t_s, np.zeros((101, 1, 3)), 1e-4, places_m=[[0.0, 0.0, 0.0]])
+    swing = cs.Experiment(
+        body,
+        t_s,
+        [cs.Grasp(held, poses)],
+        unseen,
+        nuisance=cs.Nuisance.none(),
+        air_density_kg_m3="none",
+    )
+    constants = {"young_pa": 3e4, "poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
+    measured = cs.with_markers(
+        swing, cs.simulate(swing, constants, "midpoint", substeps=1).markers_m
+    )
+    solution = solve(cs.Problem([measured], constants | {"young_pa": cs.Unknown(3e4)}))
+    fit = linearise_fit(solution.collocation, solution.z)
+    of_part = mesh_change(solution.collocation, solution.z, fit)
+    monkeypatch.setattr(mesh_error, "ROW_DISTANCES", ())
+    of_all = mesh_change(solution.collocation, solution.z, fit)
+    assert abs(of_all[0]) > 0.05
+    assert of_part[0] != of_all[0]
+    np.testing.assert_allclose(of_part, of_all, rtol=0.02)

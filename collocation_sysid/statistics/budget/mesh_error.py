@@ -32,6 +32,7 @@ from functools import partial
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
@@ -61,6 +62,8 @@ from .systematic_effects import Effect, ExperimentAtAnswer
 LARGEST_NODE_COUNT = 1500
 # Relative accuracy of e: that of an estimate of an error.
 ACCURACY = 1e-2
+# Largest distances of the rows of a motion at which e is solved for; it is linear between them.
+ROW_DISTANCES = (16, 8, 4, 2)
 # Weight of the shape function of a node below which it is zero apart from rounding.
 NO_WEIGHT = 1e-9
 
@@ -163,8 +166,15 @@ def _equivalent_forces(
     )
     relative = np.zeros((1, dynamics.pattern.size))
     equivalent_n = np.zeros_like(given_xi)
-    rows = zip(_forces_by_row(dynamics, x), _forces_by_row(at.dynamics, at.iterate.x), strict=True)
-    for k, (forces, given_forces) in enumerate(rows):
+    rows = _sampled_rows(given_xi, is_static=at.dynamics.is_static)
+    corrections_n = np.zeros((len(rows), dynamics.pattern.size))
+    of_rows = zip(
+        rows,
+        _forces_by_row(dynamics, x, rows),
+        _forces_by_row(at.dynamics, at.iterate.x, rows),
+        strict=True,
+    )
+    for number, (k, forces, given_forces) in enumerate(of_rows):
         now = slice(k, k + 1)
         stiffness = -forces.linearise(xi[now], nu[now]).by_position
         if dynamics.body.element.mean_dilatation:
@@ -174,17 +184,34 @@ def _equivalent_forces(
             stiffness += forces.joint_pattern.expand(lagged[None])
         system = ReusedFactor(sequence, Matrix(stiffness[0], NONE), points_m=xi[k].reshape(-1, 3))
         relative[0, moving] = system.solve(unbalanced_n[k, moving], guess=relative[0, moving])
-        unbalanced_n[now] -= dynamics.pattern.products(stiffness, relative)
+        corrections_n[number] = dynamics.pattern.products(stiffness, relative)[0]
         if at.dynamics.is_static:
             own = -given_forces.linearise(given_xi[now], given_nu[now]).by_position
             equivalent_n[now] = at.dynamics.pattern.products(own, relative[:, given])
-    return equivalent_n + unbalanced_n @ interpolation
+    if len(rows) < len(given_xi):
+        corrections_n = make_interp_spline(rows, corrections_n, k=1)(np.arange(len(given_xi)))
+    return equivalent_n + (unbalanced_n - corrections_n) @ interpolation
 
 
-def _forces_by_row(dynamics: Dynamics, x: Array) -> Iterator[Forces]:
-    """Yield the forces of each evaluation along a motion (N, 3n) [m]."""
+def _sampled_rows(xi: Array, *, is_static: bool) -> Index:
+    """Return those of the evaluations along a motion (N, 3n) [m] between which the motion is linear
+    to the accuracy of e; all of equilibria.
+    """
+    every = np.arange(len(xi))
+    largest_m = np.abs(xi - xi.mean(axis=0)).max()
+    for distance in ROW_DISTANCES if not is_static else ():
+        rows = np.append(every[:-1:distance], every[-1])
+        if len(rows) > 2:
+            between = make_interp_spline(rows, xi[rows], k=1)(every)
+            if np.abs(between - xi).max() < ACCURACY * largest_m:
+                return rows
+    return every
+
+
+def _forces_by_row(dynamics: Dynamics, x: Array, rows: Index) -> Iterator[Forces]:
+    """Yield the forces of some evaluations along a motion (N, 3n) [m]."""
     histories = dynamics.histories(x)
-    for row in range(dynamics.first_row, dynamics.row_count):
+    for row in dynamics.first_row + rows:
         yield dynamics.forces_with_histories(histories, slice(row, row + 1))
 
 
