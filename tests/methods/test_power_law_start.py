@@ -167,6 +167,23 @@ def test_terms_that_run_together_are_held_apart():
     assert abs(distance) == pytest.approx(0.5, abs=0.01)
 
 
+def test_terms_that_run_together_are_left_out_where_they_explain_little_of_a_misfit():
+    """A ripple that no term explains is larger than what the second term explains."""
+    tests = []
+    for test, largest in (("uniaxial", 2.0), ("equibiaxial", 1.0), ("planar", 1.5)):
+        strain = np.linspace(0.05, largest, 200)
+        stretch = 1 + strain
+        free = {"uniaxial": stretch**-0.5, "equibiaxial": stretch**-2, "planar": 1 / stretch}[test]
+        stress_pa = 3e3 * np.sin(40 * strain)
+        for mu_pa, alpha in ((-29e3, 4.0), (30e3, 4.1)):
+            stress_pa = stress_pa + mu_pa * (stretch**alpha - free**alpha) / stretch
+        tests.append(cs.Specimen(test, strain, stress_pa, 300.0, strain_zero=0.0, area_error=0.0))
+    start, items = start_of(without_guess("ogden-2", tests))
+    assert "1 of 2 terms" in start.note
+    assert items["mu_2_pa"].is_fixed
+    assert items["mu_2_pa"].guess == 0.0
+
+
 def test_specimens_of_other_laws_have_no_closed_start():
     strain = np.linspace(0.0, 0.5, 10)
     specimen = cs.Specimen("uniaxial", strain, 1e5 * strain, 100.0)

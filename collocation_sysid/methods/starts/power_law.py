@@ -49,6 +49,10 @@ EQUAL_LOSS = 4.0
 # Least decrease of χ² per constant that a larger law has more, over χ² of one measurement: normal
 # noise exceeds it in 1 of 1000 fits.
 LEAST_GAIN = 10.8
+# Least decrease of χ², relative to the laws with fewer terms, by two exponents that run together:
+# of a misfit of the law itself they explain a little more with factors that cancel, and a search
+# among such terms does not end.
+LEAST_SHARE_TOGETHER = 0.2
 # Exponents nearer to zero are replaced by this one: the quotients by α lose digits.
 SMALLEST_EXPONENT = 1e-5
 # Largest exponent of e in a power of a stretch.
@@ -115,6 +119,12 @@ class _Fit:
     beta: Array | None  # (n,) or None: none for an incompressible law
     has_one_beta: bool  # whether all terms share one estimated β
     constants: int  # number of fitted constants of the law
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Successive exponents that run together: they are as near as they may be."""
+        successive = pairwise(range(len(self.alpha)))
+        return [(a, b) for a, b in successive if self.alpha[b] - self.alpha[a] < 1.01 * SEPARATION]
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +411,16 @@ class _PowerLawFits:
             fits += [each for each in (own or fit, fit if own and not has_guess else None) if each]
         if not fits:
             return None
-        return self._with_fit(self._smallest_sufficient(fits), may_fix=not has_guess)
+        apart = [each for each in fits if not each.pairs or self._is_worth_a_pair(each, fits)]
+        return self._with_fit(self._smallest_sufficient(apart), may_fix=not has_guess)
+
+    @staticmethod
+    def _is_worth_a_pair(fit: _Fit, fits: Sequence[_Fit]) -> bool:
+        """Return whether a fit with two exponents that run together is clearly better than those
+        with fewer terms.
+        """
+        fewer = [each.loss for each in fits if len(each.alpha) < len(fit.alpha)]
+        return fit.loss < (1 - LEAST_SHARE_TOGETHER) * min(fewer, default=np.inf)
 
     def _with_fit(self, fit: _Fit, may_fix: bool) -> PowerLawStart:
         """Return the start from a fit; constants that it lacks are fixed or tied if `may_fix`."""
@@ -422,11 +441,7 @@ class _PowerLawFits:
                 guesses[f"beta_{p}"] = float(fit.beta[k])
                 if p > 1 and fit.has_one_beta and may_fix and self.beta_is_free[0]:
                     tied[f"beta_{p}"] = Tied("beta_1")
-        near = [
-            order.index(max(pair, key=order.index)) + 1
-            for pair in pairwise(range(len(fit.alpha)))
-            if np.diff(fit.alpha[[*pair]])[0] < 1.01 * SEPARATION
-        ]
+        near = [order.index(max(pair, key=order.index)) + 1 for pair in fit.pairs]
         notes = []
         if may_fix:
             fixed |= {f"alpha_{p}": guesses.pop(f"alpha_{p}") for p in near}
