@@ -5,7 +5,7 @@ errors.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -30,6 +30,7 @@ from .methods.starts.initial_trajectories import simulate_trajectories
 from .model.schemes import as_scheme
 from .problem import Problem
 from .program.collocation import Collocation
+from .recording.deviation import in_readable_unit
 from .recording.impact_steps import IMPACT_NOTE
 from .runs.check.cost import require_memory
 from .runs.expected_precision import with_measurements
@@ -48,9 +49,13 @@ from .runs.solving import (
 )
 from .runs.warm_start import WarmStart
 from .statistics.assessment import WITHIN_BUDGET, fit_concerns, rotation_step_concerns
-from .statistics.budget.consider_analysis import ResidualChanges, changes_of_assumptions
+from .statistics.budget.consider_analysis import (
+    ResidualChanges,
+    changes_of_assumptions,
+    prescribes_no_motion,
+)
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
-from .statistics.budget.systematic_effects import ASSUMPTIONS
+from .statistics.budget.systematic_effects import ASSUMPTIONS, DEVIATIONS
 from .statistics.budget.uncertainty_budget import VarianceSources
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
@@ -234,6 +239,7 @@ def run(
                 changes = _changes(answer, say)
                 sources = _sources(answer, fit, known=known, changes=changes)
                 answer = replace(answer, profiles=profiles, systematic_effects=sources)
+                answer = replace(answer, notes=(*answer.notes, *_ruler_notes(problem, sources)))
                 answer = _with_added_measurements(answer, say)
                 solved_fit = _solved_fit(answer, fit, changes)
                 answer = replace(answer, probes=_probes(solved_fit, say=say, deep=probe))
@@ -424,7 +430,22 @@ def _sources(
         deviations=problem.assumed_deviations,
         evaluated=_evaluated_deviations(problem),
         means=problem.uncertainty.assumptions.collect_means(),
+        has_rulers=prescribes_no_motion(solution.collocation),
     )
+
+
+def _ruler_notes(problem: Problem, sources: VarianceSources) -> Iterator[str]:
+    """Yield a note on each ruler that the data determine."""
+    for name, (value, error) in sources.rulers.items():
+        row = DEVIATIONS[name.partition(" ")[0]]
+        deviation = problem.assumed_deviations[row.name] or 0.0
+        (size, unit), (spread, _), (prior, _) = (
+            in_readable_unit(deviation * each, row.unit) for each in (value, error, 1.0)
+        )
+        yield (
+            f"the data determine the {row.label} better than its deviation of {prior:.2g}{unit} "
+            f"in the budget: {size:+.2g} ± {spread:.1g}{unit}; the estimates are corrected for it"
+        )
 
 
 def _evaluated_deviations(problem: Problem) -> dict[str, float | None]:

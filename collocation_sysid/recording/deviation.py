@@ -119,6 +119,9 @@ class Deviation:
         Whether `effect` concerns homogeneous specimens too, which have neither a mesh nor grips.
     is_one_sided : bool
         Whether it is never negative, so that a known mean may be stated.
+    is_ruler : bool
+        Whether it is estimated by one linear step, instead of considered, where the data determine
+        it much better than the budget does, see `uncertainty_budget`.
     redefines : tuple of str
         Constants, without a region, that another answer would define differently. Their intervals
         do not contain the effect; the values under the alternative are reported instead.
@@ -189,6 +192,7 @@ class Deviation:
     is_whole: bool = False
     of_specimens: bool = False
     is_one_sided: bool = False
+    is_ruler: bool = False
     redefines: tuple[str, ...] = ()
     alternative: str = ""
     proportional_to: Callable[[str], bool] | None = None

@@ -192,6 +192,7 @@ CALIBRATION_SCALE = Deviation(
     sigma=None,
     key="calibration_scale",
     considered=2e-3,
+    is_ruler=True,
     remedy=FILM_A_RULER,
     label="scale of the cameras",
     sentence="scale error of the cameras: {signed}",

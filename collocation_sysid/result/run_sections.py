@@ -217,9 +217,7 @@ def parameter_section(result: Result) -> TitledParts:
         for name, each in values.items()
         if each.known_correction and each.value
     ]:
-        parts.append(
-            f"corrected for the stated grip layer and machine compliance: {', '.join(known)}"
-        )
+        parts.append(f"corrected for effects of known size: {', '.join(known)}")
     parts += [each.statement() for each in result.combinations]
     parts += _undetermined_sentence(result)
     parts += alternative_sentences(result)

@@ -25,7 +25,11 @@ from ..recording.measured_wrench import Wrench
 from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
-from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions
+from ..statistics.budget.consider_analysis import (
+    UNWEIGHTED,
+    changes_of_assumptions,
+    prescribes_no_motion,
+)
 from ..statistics.budget.uncertainty_budget import VarianceSources
 from ..statistics.combinations import (
     WIDE,
@@ -97,7 +101,15 @@ def expected_precision(
     parameters = collocation.parameters
     q = z[: collocation.nq]
     changes = changes_of_assumptions(collocation, z, deviations)
-    sources = VarianceSources.from_fit(fit, changes, parameters, q, known, deviations=deviations)
+    sources = VarianceSources.from_fit(
+        fit,
+        changes,
+        parameters,
+        q,
+        known,
+        deviations=deviations,
+        has_rulers=prescribes_no_motion(collocation),
+    )
     sizes = relative_derivatives(parameters, q)
     of_noise = known.complete_covariance
     covariance = sources.combine_covariance(known.names, of_noise, sizes, np.zeros(len(q)))

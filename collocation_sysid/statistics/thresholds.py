@@ -164,6 +164,12 @@ GRANTED = Threshold(
     "budget, up to which it is within the budget.",
     study="laboratory",
 )
+DETERMINED = Threshold(
+    1 / 3,
+    "Standard error of a ruler over its deviation in the budget, with the whole budget relaxed, up to "
+    "which it is estimated. The prior then has a tenth of the information.",
+    study="contact_accuracy",
+)
 BETTER = Threshold(
     1.5,
     "Factor by which the misfit of a refit must decrease, unless only noise remains.",

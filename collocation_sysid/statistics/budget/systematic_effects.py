@@ -899,6 +899,7 @@ ASSUMPTIONS = (
         "body_scale",
         "1",
         considered=0.01,
+        is_ruler=True,
         description="relative error of the size of the mesh",
         remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,

@@ -7,6 +7,11 @@ the covariance P + C Cᵀ, P being that of the fit (considered parameters: Schmi
 1962; type B evaluation: JCGM 100:2008, 4.3). Differences of parameters between recordings are
 estimated from the recordings, see `recording_scatter`; where they dominate, intervals are Student's
 with their degrees of freedom (Welch & Satterthwaite: ibid., G.4).
+
+Rulers are not considered but estimated where the data determine them much better than their prior:
+of a body that falls and stops, gravity determines the scale of the cameras. With S their covariance
+and s their estimates by one linear step, the estimates change by C s, and have P + C S Cᵀ. This holds
+only if no motion is prescribed, which the same cameras may have measured.
 """
 
 from __future__ import annotations
@@ -21,10 +26,11 @@ from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
 from ..distributions import student_ppf
 from ..estimates import Estimate, IntervalCoordinate
-from ..linearised import LinearisedFit, least_squares_of_fit
+from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..thresholds import DETERMINED, GRANTED
 from ..uncertainty import Uncertainty
 from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
-from .consider_analysis import ResidualChanges
+from .consider_analysis import ResidualChanges, with_relaxed_columns
 from .discretisation_error import DiscretisationError, estimate_changes
 from .memory_effect import RELAXATION_TIME
 from .systematic_effects import ASSUMPTIONS, DEVIATIONS
@@ -120,6 +126,9 @@ class VarianceSources:
     # mapping of str to (nq,): changes of q if an assumption with an alternative
     # (`Deviation.alternative`) is wrong by one unit, by its name with its component.
     alternatives: Mapping[str, Array] = field(default_factory=dict)
+    # Estimates and standard errors of the rulers that the data determine, in deviations of the budget.
+    rulers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    shift: Array | float = 0.0  # (nq,) array: changes of q by these estimates
 
     @classmethod
     def from_fit(
@@ -133,6 +142,7 @@ class VarianceSources:
         deviations: Mapping[str, float | None] | None = None,
         evaluated: Mapping[str, float | None] | None = None,
         means: Mapping[str, float] | None = None,
+        has_rulers: bool = False,
     ) -> VarianceSources:
         """Compute the sources of a fit.
 
@@ -156,6 +166,8 @@ class VarianceSources:
             known.
         means : mapping of str to float, optional
             Known effects over their standard deviations; None if there are none.
+        has_rulers : bool
+            Whether rulers that the data determine are estimated, see `prescribes_no_motion`.
 
         Notes
         -----
@@ -181,6 +193,15 @@ class VarianceSources:
         }
         known_deviations = deviations or {}
         budgeted = [k for k, row in enumerate(rows) if known_deviations.get(row, 1.0) is not None]
+        considered = budgeted if has_rulers else []
+        rulers, values, covariance = _determined_rulers(fit, assumed, columns=considered)
+        shift = moved[:, rulers] @ values
+        if rulers:
+            joint = with_relaxed_columns(fit, assumed, rulers)
+            widths, axes = np.linalg.eigh(covariance)
+            others = [k for k in budgeted if k not in rulers]
+            moved[:, rulers] = moved[:, rulers] @ (axes * np.sqrt(widths)) @ axes.T
+            moved[:, others] = estimate_changes(joint, assumed.blocks)[: fit.shared_count, others]
         by_q = _estimate_derivatives(fit, parameters, q=q)
         scatter = uncertainty.scatter
         between = np.zeros((fit.shared_count, 0))
@@ -201,6 +222,11 @@ class VarianceSources:
             freedom=freedom,
             means=known_effects,
             alternatives=alternatives,
+            rulers={
+                assumed.names[k]: (float(values[n]), float(np.sqrt(covariance[n, n])))
+                for n, k in enumerate(rulers)
+            },
+            shift=shift,
         )
 
     def noise_shares(self, by_q: Array) -> tuple[float, float]:
@@ -278,12 +304,12 @@ class VarianceSources:
         return statistical + ways @ ways.T + np.outer(discretisation, discretisation)
 
     def known_effect(self, by_q: Array) -> float:
-        """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects,
-        to first order; 0 without known effects. Of an assumption with several components each
+        """Return the change of an estimate with the derivative `by_q` (nq,) by all known effects
+        and rulers, to first order; 0 without any. Of an assumption with several components each
         has the effect.
         """
         sizes = [self.means.get(name.partition(" ")[0], 0.0) for name in self.names]
-        return float(by_q @ self.sensitivities @ sizes)
+        return float(by_q @ (self.sensitivities @ sizes + self.shift))
 
     def variances_of_assumptions(self, estimate: str, by_q: Array) -> dict[str, float]:
         """Return the variance by each assumption, its components summed, of an estimate with the
@@ -300,6 +326,40 @@ class VarianceSources:
         """Return whether the interval of an estimate contains the effect of an assumption."""
         counted = any(name.partition(" ")[0] == row for name in self.names)
         return counted and not is_definition(row, estimate)
+
+
+def _determined_rulers(
+    fit: LinearisedFit, assumed: ResidualChanges, columns: Sequence[int]
+) -> tuple[list[int], Array, Array]:
+    """Return the columns of the rulers that the data determine, their values (r,) by one linear step,
+    and the covariance (r, r) of these, in the deviations of the budget; nothing if a value is
+    larger than the budget grants.
+
+    `columns` are those of the budget: whether a ruler is determined is tested with all of them
+    relaxed.
+    """
+    rulers = [k for k in columns if DEVIATIONS[assumed.names[k].partition(" ")[0]].is_ruler]
+    nothing: tuple[list[int], Array, Array] = [], np.zeros(0), np.zeros((0, 0))
+    if not rulers:
+        return nothing
+    first = len(fit.names)
+    wide = with_relaxed_columns(fit, assumed, columns)
+    errors = np.sqrt(np.diag(_covariance(wide))[first:])
+    rulers = [
+        k for k, error in zip(columns, errors, strict=True) if k in rulers and error < DETERMINED
+    ]
+    if not rulers:
+        return nothing
+    joint = with_relaxed_columns(fit, assumed, rulers)
+    values = gauss_newton_step(joint)[first:]
+    if (np.abs(values) > GRANTED).any():
+        return nothing
+    return rulers, values, _covariance(joint)[first:, first:]
+
+
+def _covariance(fit: LinearisedFit) -> Array:
+    information = least_squares_of_fit(fit).compute_information()
+    return np.linalg.pinv(information, hermitian=True)
 
 
 def rescaled(step: Array, parameters: Parameters, is_proportional: Callable[[str], bool]) -> Array:

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..budget.consider_analysis import with_relaxed_assumption
 from ..budget.systematic_effects import DEVIATIONS
 from ..budget.uncertainty_budget import source_label
 from ..distributions import chi2_isf, normal_isf
 from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..thresholds import GRANTED, RARE
 from ..uncertainty import ErrorBasis
-from .relaxed_assumptions import SolvedFit, assumption_name, with_relaxed_assumption
+from .relaxed_assumptions import SolvedFit, assumption_name
 from .routine_probes import prior_widening, significance_limit
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...methods.starts.initial_trajectories import simulate_trajectories
+from ..budget.consider_analysis import with_relaxed_assumption
 from ..budget.systematic_effects import CORRELATION_KEY
 from ..distributions import normal_isf
 from ..linearised import (
@@ -37,7 +38,6 @@ from .relaxed_assumptions import (
     assumption_name,
     probed_changes,
     relaxed_probe,
-    with_relaxed_assumption,
 )
 from .routine_probes import (
     is_alarming,

@@ -220,39 +220,6 @@ def has_monotonic_load(iterate: ExperimentIterate, collocation: Collocation) -> 
     return bool((steps >= -slack).all() or (steps <= slack).all())
 
 
-def with_relaxed_assumption(
-    fit: LinearisedFit, changes: ResidualChanges, name: str, widening: float = 1.0
-) -> LinearisedFit:
-    """Return a fit in which an assumption is one more nuisance parameter, or several of its name.
-
-    Parameters
-    ----------
-    changes : ResidualChanges
-        Changes of its residuals by the assumptions, each off by its standard deviation, which is
-        the unit of the new parameters.
-    name : str
-        Name of the assumption with its component. If `changes` does not contain it, no parameter is
-        added; if it does several times (once for each recording), as many are added at the end,
-        named by it and a number from 0.
-    widening : float
-        Standard deviation of the prior of the new parameters, in these deviations.
-    """
-    columns = [k for k, other in enumerate(changes.names) if other == name]
-    blocks = []
-    for block, change in zip(fit.blocks, changes.blocks, strict=True):
-        more = change[..., columns] * (block.compute_root_weight() * block.is_measured)[..., None]
-        blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
-    count = len(columns)
-    return replace(
-        fit,
-        blocks=tuple(blocks),
-        names=(*fit.names, *(f"{name} {k}" for k in range(count))),
-        prior_residual=np.append(fit.prior_residual, np.zeros(count)),
-        prior_jacobian=np.append(fit.prior_jacobian, np.full(count, 1 / widening)),
-        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
-    )
-
-
 def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> Probe:
     """Return the optimum of a fit with one assumption relaxed, by one linear step.
 

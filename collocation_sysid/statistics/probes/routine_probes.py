@@ -24,19 +24,12 @@ from dataclasses import replace
 import numpy as np
 
 from ...model.parameters import FieldCoefficients
-from ..budget.consider_analysis import ResidualChanges
+from ..budget.consider_analysis import ResidualChanges, with_relaxed_assumption
 from ..budget.systematic_effects import DEVIATIONS
 from ..distributions import normal_isf
 from ..linearised import gauss_newton_step
 from ..thresholds import RARE, RELEVANT, WIDENING_OF_FIELDS
-from .relaxed_assumptions import (
-    MEMORY,
-    Probe,
-    SolvedFit,
-    assumption_name,
-    relaxed_probe,
-    with_relaxed_assumption,
-)
+from .relaxed_assumptions import MEMORY, Probe, SolvedFit, assumption_name, relaxed_probe
 
 # Deviations that are tested in every solve, by name: each can occur while the residuals look white,
 # biases the estimates, and is determined by a single recording.
