@@ -69,6 +69,7 @@ from .statistics.probes.profile_likelihood import Profile, profile_of_solution
 from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
 from .statistics.probes.routine_probes import is_alarming, probed_deviations
 from .statistics.residuals.residual_diagnostics import diagnose_markers
+from .statistics.thresholds import NOISE
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 if TYPE_CHECKING:
@@ -477,7 +478,8 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     """Return the run with a note and the residuals that deviations within the budget leave, if
     there are concerns about the residuals or significant probes, and these deviations explain all
     concerns about the residuals. Routine probes that do not remain beside them are then not
-    significant.
+    significant, and none is where residuals as small as noise may be those of the mesh in contact,
+    whose error is not known.
     """
     assert answer.uncertainty is not None
     concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
@@ -492,11 +494,17 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
     left = {each.code for each in fit_concerns(answer.uncertainty, budgeted.basis)}
     if left & {*WITHIN_BUDGET}:
         return answer
+    may_be_mesh = answer.uncertainty.level.pooled <= NOISE**2 and any(
+        each.experiment.obstacles for each in answer.solution.collocation.transcriptions
+    )
     probes = tuple(
         replace(probe, sentences=())
         if probe.routine
         and is_alarming(probe)
-        and not is_significant_beside_budget(solved_fit, granted, relaxed, probe.name)
+        and (
+            may_be_mesh
+            or not is_significant_beside_budget(solved_fit, granted, relaxed, probe.name)
+        )
         else probe
         for probe in answer.probes
     )
