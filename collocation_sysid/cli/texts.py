@@ -7,9 +7,12 @@ import shlex
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import typer
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.markdown import CodeBlock, Markdown
+from rich.text import Text
 
 from ..common.console import PlainConsole
 from ..common.display import Shown, Table
@@ -18,6 +21,24 @@ from ..common.serialisation import as_json as json_text
 from ..errors import InputError, hint_at, located
 from .command_options import AsJson, command, option
 from .common import error_console, print_result
+
+
+class UnbrokenCode(CodeBlock):
+    """A code block of Markdown whose lines are never broken."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the lines of the code, each indented by two spaces, whatever the width of the
+        console.
+        """
+        for line in str(self.text).rstrip().splitlines():
+            yield Text(f"  {line}", style="cyan", no_wrap=True, overflow="ignore")
+
+
+class TerminalPage(Markdown):
+    """Markdown document whose text is wrapped to the terminal and whose code is not."""
+
+    elements: ClassVar = {**Markdown.elements, "fence": UnbrokenCode, "code_block": UnbrokenCode}
+
 
 commands = typer.Typer()
 
@@ -105,8 +126,6 @@ def explain(
                 if table.rows:
                     print_result(table)
         elif console.is_terminal:
-            from .markdown import TerminalPage
-
             console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
         else:
             typer.echo(page_text(topic))

@@ -8,6 +8,5 @@
   terminal output; `pages`: pages of the documentation.
 - `signal_handling`, `isolated_process`: interrupts, and work in a process of its own.
 - `step_counting`: progress of long operations; `machine`: available memory; `cluster`: Dask.
-- `array_types`: array types for annotations; `cached_values`: cached values that copies share;
-  `unique_codes`: sorted sets of integers.
+- `array_types`: array types for annotations; `unique_codes`: sorted sets of integers.
 """

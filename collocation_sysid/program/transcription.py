@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..common.array_types import Array, Index
-from ..common.cached_values import cached_values
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..recording.nuisance import TIME
 from .association import Association
@@ -358,3 +357,24 @@ class Transcription(MotionTranscription):
             (np.minimum(first, second), np.maximum(first, second)),
             *self.constraint_hessian_entries(first_phi),
         ]
+
+
+def cached_values(instance: object, cls: type) -> dict[str, Any]:
+    """Return the values of the cached properties that a class defines, as far as an instance has
+    computed them, by name.
+
+    A copy of the instance may share them if the class knows nothing of what differs in the copy:
+    declare what depends on more than a base class in a subclass.
+
+    Parameters
+    ----------
+    instance : object
+        Instance of `cls` or of a subclass of it.
+    cls : type
+        Class whose own cached properties are returned; those of its subclasses and bases are not.
+    """
+    return {
+        name: value
+        for name, value in vars(instance).items()
+        if isinstance(vars(cls).get(name), cached_property)
+    }

@@ -15,8 +15,7 @@ from kit.problem_files import run_command
 
 import collocation_sysid as cs
 from collocation_sysid import Problem, run
-from collocation_sysid.cli.markdown import TerminalPage
-from collocation_sysid.cli.texts import _key_table, _word_table
+from collocation_sysid.cli.texts import TerminalPage, _key_table, _word_table
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.common.display import Table, plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url

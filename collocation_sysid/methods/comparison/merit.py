@@ -4,7 +4,7 @@
 
 with loss and constraints in the scaling of the NLP and y = 0 for a penalty. Positions of grasped
 nodes, history variables of materials with memory and lifted measurements are variables with
-constraints of their own (see `program.lifted.lifting`). Variables with equal bounds, such as a
+constraints of their own (see `program.lifted`). Variables with equal bounds, such as a
 given start, are constant.
 """
 

@@ -3,7 +3,7 @@
 Interior-point methods and the methods for comparison keep them, because the sparse program then
 has simpler equations; reduced space eliminates them.
 
-- `lifted_collocation`: the program with these variables; `lifting`: its groups of variables;
+- `lifted_collocation`: the program with these variables, and its groups of variables;
   `lifted_variables`: their base class.
 - `lifted_memory`: internal variables of viscoelastic materials; `lifted_force_histories`: those of
   forces with a history.

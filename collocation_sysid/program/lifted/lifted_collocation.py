@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,13 @@ from ...common.array_types import Array, Index
 from ..collocation import Collocation
 from ..experiment_iterate import ExperimentIterate
 from ..motion_transcription import RowWeights, WeightedHistory
+from ..transcription import Transcription
+from .lifted_force_histories import LiftedForceHistory
+from .lifted_memory import LiftedMemory
+from .lifted_pressures import LiftedPressure
+from .lifted_reactions import LiftedReactions
+from .lifted_resultants import LiftedResultant
 from .lifted_variables import LiftedOffsets, LiftedVariables
-from .lifting import lift_variables
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,3 +190,56 @@ def lifted_nonzeros(collocation: Collocation) -> tuple[int, int]:
     """
     both = [each.entry_counts for each in lifted_variables(collocation)]
     return sum(each for each, _ in both), sum(each for _, each in both)
+
+
+def lift_variables(
+    transcriptions: Sequence[Transcription], first_phi: int, offsets: LiftedOffsets
+) -> tuple[LiftedVariables, ...]:
+    """Create the groups of lifted variables of all experiments.
+
+    For each experiment, in this order: reaction forces of instrumented grasps, memory of the
+    material, history variables of forces, pressures of complementarity problems, and
+    measured resultants of reactions. Quantities that an experiment does not have are left out.
+
+    Parameters
+    ----------
+    transcriptions : sequence of Transcription
+        Transcriptions of the experiments.
+    first_phi : int
+        Index in z where the nuisance parameters of all experiments begin.
+    offsets : LiftedOffsets
+        Offsets of the first group.
+
+    Returns
+    -------
+    tuple of LiftedVariables
+        The groups in the order of their variables in z, and of their equations in g.
+    """
+    groups: list[LiftedVariables] = []
+    for number, transcription in enumerate(transcriptions):
+        lift = {"transcription": transcription, "segment_index": number, "first_phi": first_phi}
+
+        def add(kind: type[LiftedVariables], lift: dict[str, Any] = lift, **own: Any) -> None:
+            start = groups[-1].next_offsets if groups else offsets
+            groups.append(kind(**lift, offsets=start, **own))
+
+        resultants = [
+            (k, residual)
+            for k, residual in enumerate(transcription.residuals)
+            if residual.observable.local is None and residual.observable.count
+        ]
+        if resultants:
+            add(LiftedReactions)
+        reactions = groups[-1] if resultants else None
+        if transcription.body.has_memory:
+            add(LiftedMemory, reactions=reactions)
+        forces = transcription.dynamics.forces
+        of_forces = [
+            *((LiftedForceHistory, k) for k in forces.find_terms_with_internal_variables()),
+            *((LiftedPressure, k) for k in forces.find_complementarity_terms()),
+        ]
+        for history, (kind, k) in enumerate(of_forces, int(transcription.body.has_memory)):
+            add(kind, motion_history=history, force_index=k, reactions=reactions)
+        for k, residual in resultants:
+            add(LiftedResultant, residual_index=k, residual=residual, reactions=reactions)
+    return tuple(groups)

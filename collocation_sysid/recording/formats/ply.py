@@ -1,7 +1,8 @@
 """Points of PLY files (polygon file format): the columns of the element `vertex`.
 
 Files whose first element is `vertex` with numbers only, as scanners write them, are read here:
-the time and memory that this takes are bounded by the size of the file. Others are read by meshio.
+the time and memory that this takes are bounded by the size of the file. Others are read by meshio,
+whose isolated process starts anew for each image of a recording.
 """
 
 from __future__ import annotations
