@@ -320,16 +320,16 @@ def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
 
 
 def _with_added_measurements(answer: Run, say: Log) -> Run:
-    """Return the run with the sensors or tests that would determine constants of which only a
-    combination is determined.
+    """Return the run with the sensors or tests that would determine constants that are not, or of
+    which only a combination is.
     """
-    if not answer.combinations or answer.uncertainty is None:
+    if not answer.vague_constants or answer.uncertainty is None:
         return answer
     say("predicting the effect of another measurement")
     solution = answer.solution
     level = 1.0 if answer.uncertainty.noise == "given" else answer.uncertainty.level.pooled
     found = with_measurements(
-        answer.combinations,
+        answer.vague_constants,
         solution.collocation,
         solution.z,
         answer.problem.assumed_deviations,
@@ -337,7 +337,7 @@ def _with_added_measurements(answer: Run, say: Log) -> Run:
     )
     added = {
         frozenset(new.determined.names): new.fixes[0]
-        for old, new in zip(answer.combinations, found, strict=True)
+        for old, new in zip(answer.vague_constants, found, strict=True)
         if new is not old
     }
     return replace(answer, added_measurements=added)

@@ -413,8 +413,11 @@ class ConstantsModel:
         Raises
         ------
         InputError
-            If a constant is missing or given twice.
+            If a constant, or a parameter of a shift, is missing, or a constant is given twice.
         """
+        for part in self.parts:
+            if part.shift:
+                part.shift.require_names(known)
         return [
             find_source(
                 part.name,

@@ -29,7 +29,7 @@ from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Specimen
 from ..recording.homogeneous_deformation import DEFORMATIONS
 from ..recording.node_selection import selection_from_section
-from ..recording.specimen import cell_body
+from ..recording.specimen import cell_body, conditioned
 from ..recording.specimen_checks import require_equal_units
 from ..statistics.misspecification.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
@@ -95,7 +95,7 @@ def problem_arguments(
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
             first = file.list_specimens()[0]
-            body = cells.body_for(first.deformation, first.cut_angle_deg)
+            body = cells.body_for(first)
             unknowns = with_undamped(unknowns, body.constants)
     with _locate_in_table(path, "parameters"):
         body_with_friction = body.with_frames(0, frictions=_frictions(file))
@@ -103,7 +103,9 @@ def problem_arguments(
         parameters = Parameters.from_mapping(
             {name: _as_parameter(name, each) for name, each in sections.items()}
         )
-        parameters.require_constants_of([body_with_friction])
+        parameters.require_constants_of(
+            [body_with_friction, *map(cells.body_for, file.list_specimens())]
+        )
     experiments = []
     notes = []
     specimens: dict[str, Specimen] = {}
@@ -112,10 +114,7 @@ def problem_arguments(
             where = f"experiment '{section.name}'"
             if isinstance(section, SpecimenSection):
                 specimen_reader = SpecimenReader(
-                    section,
-                    folder,
-                    cells.body_for(section.deformation, section.cut_angle_deg),
-                    simulation,
+                    section, folder, cells.body_for(section), simulation
                 )
                 with _locate_in_table(path, where):
                     specimens[section.name], experiment = specimen_reader.read()
@@ -192,32 +191,39 @@ class SpecimenCells:
     def __init__(self, section: ObjectSection, code: CodeLoader) -> None:
         self._section = section
         self._code = code
-        self._bodies: dict[tuple[bool, float], Body] = {}
+        self._bodies: dict[tuple[object, ...], Body] = {}
 
-    def body_for(self, test: str, cut_angle_deg: float) -> Body:
-        """Return the cell of a kind of test, one of `homogeneous_deformation.TESTS`, of a specimen
-        that was cut at an angle; the same object for all tests with the same kind of cell.
+    def body_for(self, specimen: SpecimenSection) -> Body:
+        """Return the cell of a specimen; the same object for all tests with the same kind of cell.
 
         Raises
         ------
         InputError
-            If the material is a Python file that may not be run or is invalid.
+            If the material is a Python file that may not be run or is invalid, or has no memory
+            although a test is harmonic or has another temperature.
         """
         fibres = fibres_of(self._section, "fibres")
-        cell = (not DEFORMATIONS[test].free, 0.0 if fibres is None else cut_angle_deg)
+        test, angle_deg = specimen.deformation, specimen.cut_angle_deg
+        condition = (
+            specimen.modulus == "harmonic",
+            specimen.shift,
+            specimen.temperature_difference_k,
+        )
+        cell = (not DEFORMATIONS[test].free, 0.0 if fibres is None else angle_deg, *condition)
         if cell not in self._bodies:
             law = self._section.material
             is_code = isinstance(law, CodeSection)
             material = self._code.material(law, "material") if is_code else law
-            self._bodies[cell] = cell_body(
+            body = cell_body(
                 test,
                 material,
                 fibres=fibres,
-                cut_angle_deg=cut_angle_deg,
+                cut_angle_deg=angle_deg,
                 prony=tuple(b.name for b in self._section.prony if b.region is None),
                 damping=self._section.damping,
                 made=self._section.made,
             )
+            self._bodies[cell] = conditioned(body, *condition)
         return self._bodies[cell]
 
 

@@ -22,7 +22,7 @@ from ..recording.specimen_checks import (
 )
 from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
 from .named_files import existing_file
-from .specimen_schema import RELAXATIONS, SpecimenSection, deviation
+from .specimen_schema import SpecimenSection, deviation
 
 # Strain of the first sample, over the largest, above which a memory's unknown past matters.
 UNKNOWN_PAST = 0.05
@@ -57,9 +57,12 @@ class SpecimenReader:
             file,
             layout_from_section(
                 section,
-                requires_times=self.body.has_memory
-                or section.window_s is not None
-                or section.test in RELAXATIONS,
+                requires_times=section.modulus != "harmonic"
+                and (
+                    self.body.has_memory
+                    or section.window_s is not None
+                    or section.modulus is not None
+                ),
             ),
         )
         if table.is_incompressible:
@@ -81,7 +84,7 @@ class SpecimenReader:
             require_plausible_specimen(
                 specimen, is_stretch=not {"stretch", "volume_ratio"}.isdisjoint(table.columns)
             )
-        if section.test not in RELAXATIONS:
+        if not section.modulus:
             for warning in order_warnings(specimen):
                 self._add_note(warning)
         if table.is_displacement and section.area_m2 is None:
@@ -115,15 +118,33 @@ class SpecimenReader:
         if len(rows) < len(table.t_s):
             self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
         arguments = values_over_time(at_times(table, rows))
-        if section.test in RELAXATIONS:
+        temperature = {
+            "shift": section.shift,
+            "temperature_difference_k": section.temperature_difference_k,
+        }
+        area_error = deviation(section.area_error)
+        if section.modulus == "harmonic":
+            assert section.relative_sigma is not None
+            specimen = Specimen.harmonic(
+                arguments["frequency_hz"],
+                arguments["stress_pa"],
+                arguments["loss_pa"],
+                section.relative_sigma,
+                section.deformation,
+                **temperature,
+            )
+            return replace(specimen, area_error=area_error)
+        del arguments["frequency_hz"], arguments["loss_pa"]
+        if section.modulus == "relaxation":
             sigma = arguments["sigma_pa"]
             specimen = Specimen.relaxation(
                 arguments["t_s"],
                 arguments["stress_pa"],
                 self._sigma_pa() if sigma is None else sigma,
                 section.deformation,
+                **temperature,
             )
-            return replace(specimen, area_error=deviation(section.area_error))
+            return replace(specimen, area_error=area_error)
         arguments |= dict.fromkeys(self._placeholders(arguments))
         if arguments["sigma_pa"] is None:
             arguments["sigma_pa"] = self._sigma_pa()
@@ -138,8 +159,9 @@ class SpecimenReader:
             transverse_stretch=section.transverse_stretch,
             cut_angle_deg=section.cut_angle_deg,
             strain_zero=deviation(section.strain_zero),
-            area_error=deviation(section.area_error),
+            area_error=area_error,
             stress_zero_pa=deviation(section.stress_zero_pa),
+            **temperature,
         )
 
     def _placeholders(self, arguments: Mapping[str, Array | None]) -> list[str]:
@@ -221,7 +243,7 @@ def layout_from_section(
     """
     return SpecimenLayout(
         test=section.deformation,
-        is_relaxation=section.test in RELAXATIONS,
+        modulus=section.modulus,
         noise_columns=section.noise_columns,
         columns=section.columns,
         strain_sign=section.strain_sign,

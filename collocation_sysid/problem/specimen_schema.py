@@ -10,15 +10,20 @@ from ..common.schema_tables import Among, ByForm, Noise, require_one
 from ..common.validated_types import AtLeastOne, Boundless, Count, Finite, Flag, Positive, Text
 from ..recording.homogeneous_deformation import TESTS
 from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
+from ..recording.specimen_files import ModulusTable
 from .measurement_section import NamedSection
 
-# Kind of deformation of the tables of a relaxation modulus.
-RELAXATIONS = {"relaxation": "uniaxial", "shear-relaxation": "simple-shear"}
-# Keys that such a table has.
-RELAXATION_KEYS = frozenset(
+# Kind of deformation of the tables of a modulus, over time or frequency.
+MODULI = {
+    **{"relaxation": "uniaxial", "shear-relaxation": "simple-shear"},
+    **{"harmonic": "uniaxial", "shear-harmonic": "simple-shear"},
+}
+# Keys that only other tests have.
+NOT_OF_MODULI = frozenset(
     (
-        *("kind", "name", "test", "file", "columns", "sigma_pa", "area_error", "window_s"),
-        *("every", "validation"),
+        *("strain_sign", "stress_sign", "stress", "length_m", "area_m2", "axial_stretch"),
+        *("transverse_stretch", "cut_angle_deg", "sigma_n", "lateral_sigma", "strain_zero"),
+        *("stress_zero_pa", "skip_cycles", "branch"),
     )
 )
 Prior = Annotated[Literal["none"] | Positive, ByForm(str)]
@@ -36,7 +41,8 @@ class SpecimenSection(NamedSection):
         Homogeneous specimen.
     test : str
         Kind of test; stresses across free surfaces vanish. "relaxation" is a table of the times and
-        of the relaxation modulus E(t), "shear-relaxation" one of G(t).
+        of the relaxation modulus E(t), "shear-relaxation" one of G(t); "harmonic" is one of the
+        frequencies, storage and loss moduli E′ and E″ (DMA), "shear-harmonic" of G′ and G″.
     file : str
         Table with a row for each sample, in the order of time.
     columns : mapping of name to str
@@ -67,6 +73,14 @@ class SpecimenSection(NamedSection):
     sigma_pa : float or str, optional
         Standard deviation of the noise of the stress, or the column of the file that has that of
         each row.
+    relative_sigma : float, optional
+        Standard deviation of the noise of storage and loss modulus, over |E*|, of a harmonic test.
+    shift : str
+        Name of the temperature of the test: its relaxation times are 10^x times those of the
+        parameters, where x is the parameter <shift>.log10_shift.
+    temperature_difference_k : float
+        Instead of shift: temperature of the test, less that of the parameters, by which the
+        parameters wlf_c1 and wlf_c2_k shift the relaxation times.
     sigma_n : float or str, optional
         Standard deviation of the noise of the force, or its column, which is divided by area_m2;
         instead of sigma_pa.
@@ -94,7 +108,7 @@ class SpecimenSection(NamedSection):
     """
 
     kind: Literal["specimen"]
-    test: Annotated[str, Among((*TESTS, *RELAXATIONS))]
+    test: Annotated[str, Among((*TESTS, *MODULI))]
     file: Text
     columns: dict[str, Text] = Field(default_factory=dict)
     strain_sign: Literal[1, -1] = 1
@@ -106,6 +120,9 @@ class SpecimenSection(NamedSection):
     cut_angle_deg: Finite = 0.0
     area_m2: Positive | None = None
     sigma_pa: Noise | None = None
+    relative_sigma: Positive | None = None
+    shift: Annotated[str, Field(pattern=r"^[\w-]*$")] = ""
+    temperature_difference_k: Finite = 0.0
     sigma_n: Noise | None = None
     lateral_sigma: Noise = LATERAL_SIGMA
     strain_zero: Prior = STRAIN_ZERO
@@ -120,7 +137,14 @@ class SpecimenSection(NamedSection):
     @property
     def deformation(self) -> str:
         """Kind of test of the homogeneous deformation."""
-        return RELAXATIONS.get(self.test, self.test)
+        return MODULI.get(self.test, self.test)
+
+    @property
+    def modulus(self) -> ModulusTable | None:
+        """Whether the table has a modulus over time or over frequency."""
+        if self.test not in MODULI:
+            return None
+        return "harmonic" if self.test.endswith("harmonic") else "relaxation"
 
     @property
     def noise_columns(self) -> dict[str, str]:
@@ -132,14 +156,22 @@ class SpecimenSection(NamedSection):
     def _require_consistent(self) -> SpecimenSection:
         """Return the section itself, or raise `ValueError`: unless exactly one of sigma_pa and
         sigma_n is given, for sigma_n without area_m2, for a window that does not begin before it
-        ends, and for keys that a table of a relaxation modulus does not have.
+        ends, for keys that a table of a modulus does not have, and for two temperatures.
         """
-        if self.test in RELAXATIONS and (more := self.model_fields_set - RELAXATION_KEYS):
+        sigmas = ("relative_sigma",) if self.modulus == "harmonic" else ("sigma_pa", "sigma_n")
+        excluded = NOT_OF_MODULI if self.modulus else frozenset()
+        excluded |= {"sigma_pa", "window_s"} if self.modulus == "harmonic" else {"relative_sigma"}
+        if more := self.model_fields_set & excluded:
             raise ValueError(
-                f'found {", ".join(sorted(more))} with test = "{self.test}"; expected only the times '
-                "and the modulus of the table, with sigma_pa"
+                f'found {", ".join(sorted(more))} with test = "{self.test}", which has no such key; '
+                f"expected {' or '.join(sigmas[:1] if self.modulus else sigmas)} for its noise"
             )
-        require_one(self, "sigma_pa", "sigma_n")
+        require_one(self, *sigmas)
+        if self.shift and self.temperature_difference_k:
+            raise ValueError(
+                "found shift and temperature_difference_k; expected one of them, which shifts the "
+                "relaxation times"
+            )
         if self.sigma_n is not None and self.area_m2 is None:
             raise ValueError(
                 "found sigma_n without area_m2; expected area_m2 too, because the noise of the "

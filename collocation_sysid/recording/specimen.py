@@ -50,6 +50,8 @@ AREA_ERROR = 0.01
 LATERAL_SIGMA = 5e-3
 # Strain of a table of a relaxation modulus, at which every law is linear.
 RELAXED_STRAIN = 1e-4
+# Negative loss modulus over the storage modulus that may be noise about zero.
+LOSS_NOISE = 0.1
 STRESS_NAME = "stress"
 SECOND_STRESS_NAME = "second stress"
 LATERAL_NAME = "lateral stretch"
@@ -349,9 +351,12 @@ class Specimen:
         if not len(frequency) or frequency.min() <= 0:
             raise InputError("expected positive frequencies", None, where="frequency_hz")
         size = np.hypot(np.nan_to_num(storage), np.nan_to_num(loss))
-        for name, values in (("storage_pa", storage), ("loss_pa", loss)):
-            if (values < 0).any() or not size.all():
-                row = int(np.flatnonzero((values < 0) | (size == 0))[0]) + 1
+        for name, values, lowest in (
+            ("storage_pa", storage, 0.0),
+            ("loss_pa", loss, -LOSS_NOISE * np.nan_to_num(storage)),
+        ):
+            if (values < lowest).any() or not size.all():
+                row = int(np.flatnonzero((values < lowest) | (size == 0))[0]) + 1
                 fault = (
                     f"found no modulus, or a negative one, in row {row}; expected moduli above 0"
                 )
@@ -415,7 +420,7 @@ class Specimen:
         if cell is None:
             angle = self.cut_angle_deg
             cell = cell_body(self.test, material, prony, fibres=fibres, cut_angle_deg=angle)
-            cell = self.conditioned(cell)
+            cell = conditioned(cell, self.oscillates, self.shift, self.temperature_difference_k)
         assert self.t_s is not None
         require_evaluable_law(
             cell, self.find_deformation(), strain=self.strain, second_strain=self.second_strain
@@ -434,30 +439,6 @@ class Specimen:
             validation=validation,
             specimen=self.find_deformation(),
         )
-
-    def conditioned(self, cell: Body) -> Body:
-        """Return the cell of its test as it responds to a steady oscillation and at its temperature.
-
-        Raises
-        ------
-        InputError
-            If it oscillates or has another temperature, but the material has no memory.
-        """
-        shift = None
-        if self.shift or self.temperature_difference_k:
-            shift = TimeShift(self.shift, self.temperature_difference_k)
-        if not (self.oscillates or shift):
-            return cell
-        if not cell.has_memory:
-            raise InputError(
-                "found a harmonic test, or another temperature, of a material without memory; "
-                "expected branches ([[object.prony]], in Python prony=...), whose loss and relaxation "
-                "times they determine",
-                None,
-                where="prony",
-            )
-        parts = (replace(part, oscillates=self.oscillates, shift=shift) for part in cell.parts)
-        return cell.with_parts(tuple(parts))
 
     def _grasps(self, has_fibres: bool) -> list[Grasp]:
         """Return a grasp for each of the four nodes of the cell, in their order: at rest, or with
@@ -632,6 +613,32 @@ def cell_body(
         made=made,
         fibres=None if fibres is None else _cut(fibres, cut_angle_deg),
     )
+
+
+def conditioned(cell: Body, oscillates: bool, shift: str, temperature_difference_k: float) -> Body:
+    """Return a cell as it responds to a steady oscillation and at the temperature of its test, see
+    `Specimen`.
+
+    Raises
+    ------
+    InputError
+        If it oscillates or has another temperature, but the material has no memory.
+    """
+    if not (oscillates or shift or temperature_difference_k):
+        return cell
+    if not cell.has_memory:
+        raise InputError(
+            "found a harmonic test, or another temperature, of a material without memory; expected "
+            "branches ([[object.prony]], in Python prony=...), whose loss and relaxation times they "
+            "determine",
+            None,
+            where="prony",
+        )
+    factor = TimeShift(shift, temperature_difference_k)
+    if not (shift or temperature_difference_k):
+        factor = None
+    parts = (replace(part, oscillates=oscillates, shift=factor) for part in cell.parts)
+    return cell.with_parts(tuple(parts))
 
 
 def cell_of_other_test(body: Body, test: str) -> Body:

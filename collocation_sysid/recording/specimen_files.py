@@ -23,14 +23,18 @@ from .experiment import Experiment
 from .formats.columns import (
     DISPLACEMENT,
     FORCE,
+    FREQUENCY,
     LATERAL_STRAIN,
     LATERAL_STRETCH,
+    LOSS,
+    LOSS_FACTOR,
     MODULUS,
     NOISES,
     PRESSURE,
     SECOND_STRAIN,
     SECOND_STRESS,
     SECOND_STRETCH,
+    STORAGE,
     STRAIN,
     STRESS,
     STRESS_DIFFERENCE,
@@ -50,12 +54,14 @@ from .formats.columns import (
 from .formats.text import TextTable, names_file_in_errors
 from .formats.units import si_factor
 from .homogeneous_deformation import AXES, CELL_SIZE_M, DEFORMATIONS, transverse_stretch
-from .specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
+from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME
 
 # Most statements of columns that a message lists: more are not read.
 MOST_STATEMENTS = 4
 Sign = Literal[1, -1]
 StressMeasure = Literal["engineering", "true"]
+# What a table of a modulus has: the relaxation modulus over time, or the complex one over frequency.
+ModulusTable = Literal["relaxation", "harmonic"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,9 +83,9 @@ class SpecimenLayout:
     # Those of `Specimen`.
     axial_stretch: float = 1.0
     transverse_stretch: float | None = None
-    # Whether the table has the relaxation modulus over time, E(t) of a "uniaxial" and G(t) of a
-    # "simple-shear" test.
-    is_relaxation: bool = False
+    # Whether the table has a modulus, E of a "uniaxial" and G of a "simple-shear" test: over time, or
+    # storage and loss modulus over frequency.
+    modulus: ModulusTable | None = None
     # mapping of str to str: columns of standard deviations by their keys "sigma_pa" or "sigma_n",
     # and "lateral_sigma".
     noise_columns: Mapping[str, str] = field(default_factory=dict)
@@ -91,10 +97,12 @@ class SpecimenLayout:
         "volumetric" tests have volume ratio, stretch, strain, pressure and stress only,
         "biaxial-difference" tests the difference of the stresses and no other. The second axis and
         a lateral stretch or strain are added where the test has them, true stress if `stress` is
-        "true". A relaxation has its modulus only.
+        "true". A table of a modulus has nothing else.
         """
-        if self.is_relaxation:
+        if self.modulus == "relaxation":
             return (MODULUS,)
+        if self.modulus == "harmonic":
+            return FREQUENCY, STORAGE, LOSS, LOSS_FACTOR
         deformation = DEFORMATIONS[self.test]
         stresses = (STRESS,) if self.stress == "engineering" else (STRESS, TRUE_STRESS)
         if self.test == "volumetric":
@@ -156,6 +164,9 @@ class SpecimenTable:
     # None without a column of them.
     sigma_pa: Array | None = field(default=None, metadata=over_time())
     lateral_sigma: Array | None = field(default=None, metadata=over_time())
+    # Frequency and loss modulus of a harmonic test, whose storage modulus counts as stress.
+    frequency_hz: Array | None = field(default=None, metadata=over_time())
+    loss_pa: Array | None = field(default=None, metadata=over_time())
 
     @property
     def is_displacement(self) -> bool:
@@ -195,8 +206,10 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         noise_columns=layout.noise_columns,
     )
     sigma_pa = table.noises.get("sigma_pa")
-    if layout.is_relaxation:
+    if layout.modulus == "relaxation":
         return _relaxation(table, sigma_pa)
+    if layout.modulus == "harmonic":
+        return _harmonic(table, layout)
     strain = _strain(table, layout)
     second_strain = _second_strain(table, layout)
     lateral = _lateral_stretch(table, layout)
@@ -241,17 +254,51 @@ def _relaxation(table: QuantityTable, sigma_pa: Array | None) -> SpecimenTable:
             f"the time is {table.t_s[0]:g} s; expected times after the strain was applied, above 0",
             0,
         )
+    return _modulus_table(table, table.values[MODULUS.key], sigma_pa=sigma_pa)
+
+
+def _harmonic(table: QuantityTable, layout: SpecimenLayout) -> SpecimenTable:
+    """Return the table of a harmonic test; the loss modulus may be that of the loss factor tan δ."""
+    storage_pa = _complete(table, _one_of(table, (STORAGE,), "storage modulus", layout))
+    frequency_hz = _complete(table, _one_of(table, (FREQUENCY,), "frequency", layout))
+    if LOSS.key in table.values:
+        loss_pa = _complete(table, LOSS)
+    else:
+        loss_pa = storage_pa * _complete(
+            table, _one_of(table, (LOSS, LOSS_FACTOR), "loss modulus", layout)
+        )
+    for quantity, values, is_wrong in (
+        (FREQUENCY, frequency_hz, frequency_hz <= 0),
+        (STORAGE, storage_pa, storage_pa < 0),
+        (LOSS, loss_pa, (loss_pa < -LOSS_NOISE * storage_pa) | (storage_pa + loss_pa <= 0)),
+    ):
+        if is_wrong.any():
+            row = int(is_wrong.argmax())
+            fault = f"the {quantity.key} is {values[row]:g}; expected a positive number"
+            raise table.grid.error_at(fault, row)
+    return _modulus_table(table, storage_pa, frequency_hz=frequency_hz, loss_pa=loss_pa)
+
+
+def _modulus_table(
+    table: QuantityTable,
+    modulus_pa: Array,
+    sigma_pa: Array | None = None,
+    frequency_hz: Array | None = None,
+    loss_pa: Array | None = None,
+) -> SpecimenTable:
     return SpecimenTable(
         table.t_s,
         np.ones_like(table.t_s),
-        stress_pa=table.values[MODULUS.key],
+        stress_pa=modulus_pa,
         second_strain=None,
         second_stress_pa=None,
         lateral_stretch=None,
         is_incompressible=False,
-        columns=(MODULUS.key,),
+        columns=tuple(table.values),
         unread=table.unread,
         sigma_pa=sigma_pa,
+        frequency_hz=frequency_hz,
+        loss_pa=loss_pa,
     )
 
 
@@ -270,6 +317,12 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
     layout : SpecimenLayout
         Meaning of the columns.
     """
+    if layout.modulus == "harmonic":
+        names: dict[str, str] = {}
+        for quantity in (FREQUENCY, STORAGE, LOSS):
+            found = _column_choices(grid, (quantity,), layout.columns, taken=names.values())
+            names |= found[0]
+        return column_statement(names)
     deformations = _column_choices(grid, layout.list_deformations(), stated=layout.columns)
     groups = [deformations]
     if second := layout.list_second_deformations():
@@ -301,17 +354,17 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
         other[SECOND_STRESS.key] = loads[1][STRESS.key]
     statements = []
     for combination in product(*groups):
-        names = {key: name for each in combination for key, name in each.items()}
+        chosen = {key: name for each in combination for key, name in each.items()}
         sizes = [
             size
             for quantity, size, value in (
                 (DISPLACEMENT, "length_m", layout.length_m),
                 (FORCE, "area_m2", layout.area_m2),
             )
-            if quantity.key in names and value is None
+            if quantity.key in chosen and value is None
         ]
         suffix = f" with {' and '.join(sizes)}" if sizes else ""
-        statements.append(column_statement(names | other) + suffix)
+        statements.append(column_statement(chosen | other) + suffix)
     return ", or ".join(statements[:MOST_STATEMENTS])
 
 
@@ -374,7 +427,7 @@ def _one_of(
             f"the columns are {', '.join(table.grid.columns)}; found "
             f"{present or 'no column'} of the {what}, "
             f"expected exactly one of {expected}, in these or other units"
-            f"{other_columns_text(table.grid)}. State "
+            f"{other_columns_text(table.grid, quantities)}. State "
             f"{column_advice(table.grid, layout)}"
         )
     return there[0]
@@ -615,8 +668,8 @@ def _noise_columns(
 
 def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
     """Return the quantities that are written for a test if the layout names no columns."""
-    if layout.is_relaxation:
-        return (MODULUS,)
+    if layout.modulus:
+        return layout.list_quantities()[: -1 if layout.modulus == "harmonic" else None]
     if layout.test == "volumetric":
         return VOLUME_RATIO, PRESSURE
     deformation = STRAIN if layout.test == "simple-shear" else STRETCH
@@ -632,7 +685,18 @@ def _specimen_quantities(
     sensors, in SI units and with the signs of `layout`; arguments as of `specimen_columns`.
     """
     strain, second_strain = specimen_strains(experiment)
-    if layout.is_relaxation:
+    if layout.modulus == "harmonic":
+        # After the sample at rest: those at the largest strain, and a quarter of a period later.
+        amplitude, moduli = strain[1::2], values[STRESS_NAME][1:].reshape(-1, 2)
+        storage_pa, loss_pa = moduli.T / amplitude
+        frequency_hz = 0.25 / np.diff(experiment.t_s)[::2]
+        return {
+            FREQUENCY: frequency_hz,
+            STORAGE: storage_pa,
+            LOSS: -loss_pa,
+            LOSS_FACTOR: -loss_pa / storage_pa,
+        }
+    if layout.modulus == "relaxation":
         # The first two samples are those of the step of the strain.
         modulus_pa = values[STRESS_NAME][2:] / strain[2:]
         return {TIME: experiment.t_s[2:], MODULUS: modulus_pa}

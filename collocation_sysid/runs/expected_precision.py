@@ -12,16 +12,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
+from ..common.time_dependence import values_over_time
 from ..errors import InputError, SimulationError
 from ..fem.laws.constants import symbol_of
 from ..program.collocation import Collocation
+from ..program.forward.scheme_simulation import simulate_scheme
 from ..program.measured_motion import fitted_values
 from ..program.simulation import simulate
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
+from ..recording.obstacle import Obstacle
+from ..recording.poses import PoseSequence
 from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
@@ -36,6 +41,7 @@ from ..statistics.combinations import (
     Combination,
     Fix,
     find_combinations,
+    lone_constants,
     undetermined_names,
     widest_after,
 )
@@ -71,12 +77,19 @@ class ExpectedPrecision:
     moduli: Mapping[str, Array]
 
     def combinations(self) -> tuple[Combination, ...]:
-        """Return the combinations that are determined where a constant alone is not, with the
-        constant whose known value would determine the others.
+        """Return the combinations that are determined where a constant alone is not, then the
+        constants that are not determined and in no combination, each with repetitions and the known
+        value that would determine its constants.
         """
         vague = undetermined_names(self.names, self.covariance)
         found = find_combinations(self.names, self.values, self.covariance, vague, self.moduli)
-        return tuple(each.with_known_value(self.names, self.covariance) for each in found)
+        lone = lone_constants(self.names, self.values, self.covariance, vague, found)
+        return tuple(
+            each.with_repetitions(self.names, self.covariance, self.statistical).with_known_value(
+                self.names, self.covariance
+            )
+            for each in (*found, *lone)
+        )
 
 
 def expected_precision(
@@ -250,7 +263,8 @@ def added_measurements(
 
     For specimens these are other tests of the same strains with the same relative noise and errors
     of area and zero. A body with a mesh, of which no force is measured, gets a force sensor at its
-    grasp. A test that the law or the body does not allow is left out.
+    grasp, and a recorded motion a second recording after which it is held as long again. A test
+    that the law or the body does not allow is left out.
     """
     experiments = [each.experiment for each in collocation.transcriptions]
     values = collocation.parameters.values(z[: collocation.nq])
@@ -263,6 +277,11 @@ def added_measurements(
                 yield (
                     f"a force sensor at the grasp{which} (noise {NOISE:.0%} of the largest force)",
                     [*experiments[:k], sensed, *experiments[k + 1 :]],
+                )
+            if (longer := _held_longer(experiment)) is not None:
+                yield (
+                    f"another recording of '{experiment.name}', held as long again at its end",
+                    [*experiments, longer],
                 )
         elif len(experiment.body.parts) == 1:
             for test, phrase in ADDED_TESTS.items():
@@ -289,6 +308,40 @@ def _other_test(experiment: Experiment, test: str, values: Mapping[str, float]) 
     (stresses_pa,) = simulate(added, values).custom_sensor_values
     specimen = replace(blank, sigma_pa=float(relative * np.abs(stresses_pa).max()))
     return specimen.experiment(body=body, name=f"added {test}")
+
+
+def _held_longer(experiment: Experiment) -> Experiment | None:
+    """Return a recorded motion with its grasps held at their last poses for as long again; None
+    unless only markers are measured and nothing else acts on the body.
+    """
+    more = (experiment.tendons, experiment.pressures, experiment.readings, experiment.depths)
+    loads = (experiment.forces, experiment.masses, experiment.wrenches)
+    if experiment.is_static or any(map(len, (*more, *loads))) or not experiment.grasps:
+        return None
+    times_s, markers = experiment.t_s, experiment.markers
+    later_s = times_s[-1] + experiment.timestep_s * np.arange(1, len(times_s))
+    rows = np.r_[np.arange(len(times_s)), np.full(len(later_s), len(times_s) - 1)]
+    grasps = []
+    for grasp in experiment.grasps:
+        if isinstance(grasp, Obstacle) or np.isfinite([grasp.from_s, grasp.until_s]).any():
+            return None
+        rotations, places_m = grasp.poses.at(times_s)
+        quaternions = Rotation.from_matrix(rotations).as_quat()
+        poses = PoseSequence(
+            np.r_[times_s, later_s], places_m[rows], quaternions[rows], interpolation="linear"
+        )
+        grasps.append(replace(grasp, poses=poses))
+    values = values_over_time(markers)
+    longer = {
+        name: value[rows] for name, value in values.items() if value is not None and name != "t_s"
+    }
+    return replace(
+        experiment,
+        t_s=np.r_[times_s, later_s],
+        grasps=grasps,
+        markers=replace(markers, t_s=np.r_[times_s, later_s], **longer),
+        name=f"longer {experiment.name}",
+    )
 
 
 def _with_force_sensor(collocation: Collocation, z: Array, number: int) -> Experiment:
@@ -325,12 +378,11 @@ def _extended(
         each.experiment.name: x
         for each, x in zip(collocation.transcriptions, positions, strict=True)
     }
-    values = collocation.parameters.values(z[: collocation.nq])
-    motions = [
-        known[each.name]
-        if each.name in known
-        else simulate(each, values).positions_m.reshape(len(each.t_s), -1)
-        for each in experiments
-    ]
     of_names = (by_name.get(name, 0.0) for name in wide.list_parameter_names())
+    motions = []
+    for each in wide.transcriptions:
+        if (motion := known.get(each.experiment.name)) is None:
+            dynamics = each.dynamics.with_theta(each.constants.theta(z[: each.nq]))
+            motion = simulate_scheme(each.experiment, dynamics)
+        motions.append(motion)
     return wide, wide.pack(np.fromiter(of_names, dtype=float), motions)

@@ -39,6 +39,7 @@ from ..statistics.combinations import (
     Direction,
     Fix,
     find_combinations,
+    lone_constants,
     principal_directions,
 )
 from ..statistics.concerns import Concern
@@ -577,19 +578,29 @@ class SolvedProblem:
 
     @cached_property
     def combinations(self) -> tuple[Combination, ...]:
-        """Combinations of constants that are determined although a constant alone is not; empty
-        without error bars. Coefficients of fields and parameters at a bound are left out.
+        """Combinations of constants that are determined although a constant alone is not, then
+        constants that are not determined and in no combination but would be by one of their
+        `fixes`; empty without error bars. Coefficients of fields and parameters at a bound are left
+        out.
         """
+        return tuple(each for each in self.vague_constants if each.fixes or not each.is_lone)
+
+    @cached_property
+    def vague_constants(self) -> tuple[Combination, ...]:
+        """`combinations`, and the constants that none of their `fixes` would determine."""
         names, values, covariance = self._stated_covariance()
-        if not names:
+        if not names or self.uncertainty is None:
             return ()
         vague = {name for name in names if not self._is_determined_alone(name)}
         found = find_combinations(names, values, covariance, vague, self._modulus_slopes(names))
+        found = (*found, *lone_constants(names, values, covariance, vague, found))
         added = (self.added_measurements.get(frozenset(each.determined.names)) for each in found)
+        places = [self._estimated_names.index(name) for name in names]
+        noise = self.uncertainty.complete_covariance[np.ix_(places, places)]
         return tuple(
-            (each if fix is None else replace(each, fixes=(fix,))).with_known_value(
-                names, covariance
-            )
+            (each if fix is None else replace(each, fixes=(fix,)))
+            .with_repetitions(names, covariance, noise)
+            .with_known_value(names, covariance)
             for each, fix in zip(found, added, strict=True)
         )
 

@@ -44,6 +44,8 @@ PERCENT = 1.5
 LARGEST_LOGARITHM = 700.0
 # Standard deviation of a constant that would be known, relative to its value.
 KNOWN = 0.05
+# Number of recordings whose effect is predicted, over those that were made.
+REPETITIONS = 4
 # A modulus replaces a combination if its interval is at most this many times as wide.
 SAME = 1.5
 
@@ -137,13 +139,20 @@ class Fix:
 
 @dataclass(frozen=True)
 class Combination:
-    """Constants of which only a combination is determined."""
+    """Constants of which only a combination is determined; or one that is not determined and not
+    confounded with others either.
+    """
 
     determined: Direction  # the combination with the narrowest interval
     loosest: Direction  # the combination of the same constants with the widest interval
     # Derived modulus that is known as well as `determined`, which it replaces in sentences.
     modulus: str | None = None
     fixes: tuple[Fix, ...] = ()  # ways to determine the constants, the most effective first
+
+    @property
+    def is_lone(self) -> bool:
+        """Whether it is one constant alone."""
+        return len(self.determined.names) == 1
 
     def precision(self) -> str:
         """Return how well the combination is determined, as text; empty if it has no formula."""
@@ -154,6 +163,12 @@ class Combination:
     def sentence(self) -> str:
         """Return what is determined and what is not, as a sentence without a full stop."""
         formula = self.determined.formula()
+        if self.is_lone:
+            loose = precision_text(self.loosest.factor)
+            is_open = loose.startswith("not")
+            return f"the data {'do not ' if is_open else ''}determine {formula}" + (
+                "" if is_open else f" only {loose}"
+            )
         if self.determined.form == "unstated":
             return f"the data determine {formula} better than each of them"
         if self.modulus is not None:
@@ -175,6 +190,7 @@ class Combination:
     def with_known_value(self, names: Sequence[str], covariance: Array) -> Combination:
         """Return the combination with the constant, among its `fixes`, of which a value known to
         `KNOWN` would determine the others best; unchanged if one of them would remain undetermined.
+        For a constant alone, the known value is that of any other one.
 
         Parameters
         ----------
@@ -185,14 +201,36 @@ class Combination:
         """
         members = self.determined.names
         fixes = []
-        for known in members:
+        for known in (name for name in names if (name in members) != self.is_lone):
             k = names.index(known)
             gain = np.outer(covariance[:, k], covariance[:, k]) / (covariance[k, k] + KNOWN**2)
             others = [name for name in members if name != known]
             what = f"{symbol_of(known)} known to {KNOWN:.0%}"
             fixes.append(widest_after(names, others, covariance - gain, what))
-        best = min(fixes, key=lambda fix: fix.factor)
-        return replace(self, fixes=(*self.fixes, best)) if best.factor < WIDE else self
+        return self._with_fix(min(fixes, key=lambda fix: fix.factor, default=None))
+
+    def with_repetitions(
+        self, names: Sequence[str], covariance: Array, noise: Array
+    ) -> Combination:
+        """Return the combination with `REPETITIONS` times as many recordings among its `fixes`;
+        unchanged if it is not one constant alone, or would remain undetermined.
+
+        Parameters
+        ----------
+        names : sequence of k str
+        covariance, noise : (k, k) arrays
+            Covariance of relative deviations, and its part by noise, which repetitions reduce.
+        """
+        if not self.is_lone:
+            return self
+        reduced = covariance - (1 - 1 / REPETITIONS) * noise
+        what = f"{REPETITIONS} times as many such recordings"
+        return self._with_fix(widest_after(names, self.determined.names, reduced, what))
+
+    def _with_fix(self, fix: Fix | None) -> Combination:
+        if fix is None or fix.factor >= WIDE:
+            return self
+        return replace(self, fixes=(*self.fixes, fix))
 
 
 def find_combinations(
@@ -244,6 +282,25 @@ def find_combinations(
         modulus = _equal_modulus(best, members, covariance, moduli or {})
         found.setdefault(tuple(members.tolist()), Combination(best, loosest, modulus))
     return tuple(found.values())
+
+
+def lone_constants(
+    names: Sequence[str],
+    values: Array,
+    covariance: Array,
+    undetermined: Collection[str],
+    combinations: Sequence[Combination],
+) -> tuple[Combination, ...]:
+    """Return the undetermined constants with a positive value that belong to no combination;
+    arguments as of `find_combinations`.
+    """
+    combined = {name for each in combinations for name in each.determined.names}
+    found = []
+    for k, name in enumerate(names):
+        if name in undetermined and name not in combined and values[k] > 0:
+            alone = Direction.from_weights(names, values, np.eye(len(names))[k], covariance)
+            found.append(Combination(alone, alone))
+    return tuple(found)
 
 
 def principal_directions(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from kit.problem_files import run_command, write_problem
 
 import collocation_sysid as cs
 
@@ -142,3 +145,164 @@ def test_a_material_without_memory_and_a_temperature_stated_twice_are_refused():
     long_term = {"young_pa": 1.0, "poisson": 0.4, "b.share": 1.0, "b.tau_s": 1.0}
     with pytest.raises(cs.InputError, match=r"a\.log10_shift"):
         body.theta_from_values(long_term | UNDAMPED)
+
+
+# Files ----------------------------------------------------------------------------------------
+
+FREQUENCY_HZ = np.geomspace(0.01, 100.0, 9)
+STORAGE_PA, LOSS_PA = complex_modulus_pa(FREQUENCY_HZ)
+
+
+def harmonic_file(folder, columns, lines=("relative_sigma = 0.01",), test="harmonic", more=""):
+    rows = np.column_stack([*columns.values()])
+    table = [",".join(columns), *(",".join(f"{x:.12g}" for x in row) for row in rows)]
+    (folder / "dma.csv").write_text("\n".join(table))
+    (folder / "problem.toml").write_text(
+        '[object]\nmaterial = "linear"\n[[object.prony]]\nname = "a"\n[[object.prony]]\n'
+        'name = "b"\n[parameters]\nyoung_pa = {}\npoisson = 0.45\n"a.share" = {}\n'
+        f'"a.tau_s" = {{ guess = 3.0 }}\n"b.share" = {{}}\n"b.tau_s" = {{ guess = 0.03 }}\n{more}'
+        f'[[experiment]]\nname = "dma"\nkind = "specimen"\ntest = "{test}"\nfile = "dma.csv"\n'
+        + "\n".join(lines)
+    )
+    return folder / "problem.toml"
+
+
+@pytest.mark.parametrize(
+    ("test", "kind", "columns"),
+    [
+        (
+            *("harmonic", "uniaxial"),
+            {
+                "Angular frequency (rad/s)": 2 * np.pi * FREQUENCY_HZ,
+                "Storage modulus (MPa)": STORAGE_PA / 1e6,
+                "Loss modulus (MPa)": LOSS_PA / 1e6,
+                "Tan delta": LOSS_PA / STORAGE_PA,
+            },
+        ),
+        (
+            *("shear-harmonic", "simple-shear"),
+            {
+                "frequency_hz": FREQUENCY_HZ,
+                "storage_pa": STORAGE_PA,
+                "Loss factor": LOSS_PA / STORAGE_PA,
+            },
+        ),
+    ],
+)
+def test_a_file_of_moduli_is_read_as_in_python(tmp_path, test, kind, columns):
+    (read,) = cs.Problem.read(harmonic_file(tmp_path, columns, test=test)).experiments
+    stated = cs.Specimen.harmonic(FREQUENCY_HZ, STORAGE_PA, LOSS_PA, 0.01, kind)
+    stated = stated.experiment("linear", prony=("a", "b"))
+    (found,), (expected,) = read.readings, stated.readings
+    assert read.specimen.test == kind
+    assert read.body.memory.oscillates
+    np.testing.assert_allclose(read.t_s, stated.t_s, rtol=1e-9)
+    np.testing.assert_allclose(found.measured_values, expected.measured_values, rtol=1e-9)
+    np.testing.assert_allclose(found.sigma, expected.sigma, rtol=1e-9)
+
+
+def test_columns_of_other_names_are_stated(tmp_path):
+    columns = {"f (Hz)": FREQUENCY_HZ, "E' (Pa)": STORAGE_PA, "E'' (Pa)": LOSS_PA}
+    with pytest.raises(cs.InputError) as fault:
+        cs.Problem.read(harmonic_file(tmp_path, columns))
+    assert 'frequency = "f (Hz)"' in str(fault.value)
+    stated = 'columns = { frequency = "f (Hz)", storage = "E\' (Pa)", loss = "E\'\' (Pa)" }'
+    file = harmonic_file(tmp_path, columns, ["relative_sigma = 0.01", stated])
+    assert len(cs.Problem.read(file).experiments[0].t_s) == 2 * len(FREQUENCY_HZ) + 1
+
+
+TABLE = {"frequency (Hz)": FREQUENCY_HZ, "storage (Pa)": STORAGE_PA, "loss (Pa)": LOSS_PA}
+
+
+@pytest.mark.parametrize(
+    ("columns", "lines", "expected"),
+    [
+        (TABLE, ["sigma_pa = 20"], "expected relative_sigma"),
+        (TABLE, [], "no relative_sigma"),
+        (TABLE, ["relative_sigma = 0.01", "window_s = [0, 1]"], "found window_s with"),
+        (TABLE | {"loss (Pa)": -LOSS_PA}, ["relative_sigma = 0.01"], "line 2: the loss is"),
+        (
+            {"storage (Pa)": STORAGE_PA, "loss (Pa)": LOSS_PA},
+            ["relative_sigma = 0.01"],
+            "frequency",
+        ),
+        (TABLE, ["relative_sigma = 0.01", 'shift = "warm"'], "warm.log10_shift is missing"),
+        (TABLE, ["relative_sigma = 0.01", 'shift = "a b"'], "shift"),
+    ],
+)
+def test_another_table_of_moduli_is_refused(tmp_path, columns, lines, expected):
+    with pytest.raises(cs.InputError) as fault:
+        cs.Problem.read(harmonic_file(tmp_path, columns, lines))
+    assert expected in str(fault.value)
+
+
+def test_a_shift_in_a_file_is_a_parameter(tmp_path):
+    lines = ["relative_sigma = 0.01", 'shift = "warm"']
+    file = harmonic_file(tmp_path, TABLE, lines, more='"warm.log10_shift" = {}\n')
+    problem = cs.Problem.read(file)
+    assert "warm.log10_shift" in problem.parameters.names
+    assert problem.experiments[0].body.parts[0].shift.name == "warm"
+
+
+def test_a_harmonic_test_of_an_elastic_material_is_refused_with_its_remedy(tmp_path):
+    file = harmonic_file(tmp_path, TABLE)
+    lines = [x for x in file.read_text().splitlines() if '"a.' not in x and '"b.' not in x]
+    text = "\n".join(lines).replace('[[object.prony]]\nname = "a"\n', "")
+    file.write_text(text.replace('[[object.prony]]\nname = "b"\n', ""))
+    with pytest.raises(cs.InputError, match="prony"):
+        cs.Problem.read(file)
+
+
+MIXED_TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "b.share": 0.8, "b.tau_s": 0.05}
+
+
+def mixed_file(folder):
+    """A swing, a table of G′ and G″ of the same foam, and their simulated data."""
+    write_problem(folder, {"swing": 12})
+    rows = "\n".join(f"{f:.6g},1,1" for f in np.geomspace(0.1, 30.0, 9))
+    (folder / "dma.csv").write_text(
+        "frequency (Hz),storage modulus (kPa),loss modulus (kPa)\n" + rows
+    )
+    file = folder / "problem.toml"
+    text = file.read_text().replace("[parameters]", '[[object.prony]]\nname = "b"\n[parameters]')
+    for line in text.splitlines():
+        if line.startswith("gamma_r_s"):
+            text = text.replace(line, "gamma_r_s = 0.0\nb.share = {}\nb.tau_s = {}")
+    text = text.replace('method = "interior-point"\n', "")
+    text += (
+        '\n[[experiment]]\nname = "dma"\nkind = "specimen"\ntest = "shear-harmonic"\n'
+        'file = "dma.csv"\nrelative_sigma = 0.01\n'
+    )
+    file.write_text(text)
+    values = [f"parameters.{name}={value}" for name, value in MIXED_TRUTH.items()]
+    settings = [
+        word for each in [*values, "parameters.gamma_m_1_s=1.0"] for word in ("--set", each)
+    ]
+    made = run_command(
+        "simulate",
+        file,
+        "--out",
+        folder / "made",
+        "--noise-m",
+        "1e-4",
+        "--noise-own",
+        "1",
+        *settings,
+    )
+    assert made.code == 0, made.err
+    for name in ("dma.csv", "swing_markers.csv"):
+        (folder / name).write_text((folder / "made" / name).read_text())
+    return file
+
+
+@pytest.mark.long
+def test_a_table_and_a_swing_of_one_body_are_one_problem(tmp_path):
+    file = mixed_file(tmp_path)
+    done = run_command("solve", file, "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    found = json.loads((tmp_path / "run" / "result.json").read_text())["parameters"]
+    for name, relative in {"mu_pa": 0.05, "b.share": 0.15, "b.tau_s": 0.15}.items():
+        lower, upper = found[name]["combined95"]
+        assert lower < MIXED_TRUTH[name] < upper
+        assert found[name]["value"] == pytest.approx(MIXED_TRUTH[name], rel=relative)
+    assert found["lambda_pa"]["value"] == pytest.approx(MIXED_TRUTH["lambda_pa"], rel=0.2)

@@ -7,7 +7,7 @@ the temperature of the parameters. The stiffness is the same (no vertical shift)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,21 +31,18 @@ class TimeShift:
             return {f"{self.name}.{LOG_SHIFT.name}": LOG_SHIFT}
         return {WLF_C1.name: WLF_C1, WLF_C2.name: WLF_C2}
 
-    def factor(self, values: Mapping[str, Any]) -> Any:
-        """Return a_T, a number or an expression, from parameters by name.
-
-        Raises
-        ------
-        InputError
-            If one of its parameters is missing.
-        """
-        if missing := [name for name in self.constants if name not in values]:
+    def require_names(self, names: Collection[str]) -> None:
+        """Raise an `InputError` unless its parameters are among the names."""
+        if missing := [name for name in self.constants if name not in names]:
             raise InputError(
                 f"{missing[0]} is missing, by which the relaxation times of a specimen are shifted; "
                 f"write {missing[0]} = {{}} to estimate it (in Python cs.Unknown()), or a number",
                 None,
                 where=missing[0],
             )
+
+    def factor(self, values: Mapping[str, Any]) -> Any:
+        """Return a_T, a number or an expression, from parameters by name."""
         own = [values[name] for name in self.constants]
         if self.name:
             return 10 ** own[0]

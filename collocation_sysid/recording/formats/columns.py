@@ -114,6 +114,16 @@ STRESS_DIFFERENCE = Quantity(
 MODULUS = Quantity(
     "modulus", "pressure", unit="pa", words="modulus modul module", qualifier="modulus"
 )
+FREQUENCY = Quantity(
+    "frequency", "frequency", unit="hz", words="frequency frequenz fréquence frecuencia frequenza"
+)
+STORAGE = Quantity(
+    "storage", "pressure", unit="pa", words="storage stor speichermodul", qualifier="storage"
+)
+LOSS = Quantity("loss", "pressure", unit="pa", words="loss verlustmodul", qualifier="loss")
+LOSS_FACTOR = Quantity(
+    *("loss_factor", "ratio"), unit="1", words="tan tanδ factor", qualifier="factor", unitless=True
+)
 # Standard deviations of samples, by the key of a problem file that names their column.
 NOISES = {
     noise.key: noise
@@ -129,6 +139,7 @@ KNOWN_QUANTITIES = (
     *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
     *(STRETCH, SECOND_STRETCH, LATERAL_STRETCH, SECOND_STRAIN, LATERAL_STRAIN),
     *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS, STRESS_DIFFERENCE, MODULUS),
+    *(FREQUENCY, STORAGE, LOSS, LOSS_FACTOR),
 )
 
 # A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
@@ -151,12 +162,15 @@ QUALIFIERS = {
     "lateral": {"lateral", "transverse", "quer"},
     "difference": {"difference", "differenz", "différence"},
     "modulus": {"modulus", "modul", "module"},
+    "storage": {"storage", "stor", "speichermodul"},
+    "loss": {"loss", "verlustmodul"},
+    "factor": {"factor", "tan", "tanδ"},
     # Of no quantity: values that are computed from others, of something else, or not measured.
     "other": {
         *("deviatoric", "hydrostatic", "mises", "tresca"),
         *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
         *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
-        *("soll", "vor", "storage", "loss"),
+        *("soll", "vor"),
         *("amplitude", "range", "strength", "limit", "noise"),
     },
 }
@@ -450,15 +464,23 @@ def _name_fits(column: str, quantity: Quantity) -> bool:
     qualifiers = {key for key, of_key in QUALIFIERS.items() if words & of_key}
     if "difference" in qualifiers:  # one of true stresses, whether the name says so or not
         qualifiers.discard("deformed")
+    if qualifiers & {"storage", "loss"}:
+        qualifiers.discard("modulus")
+    if "factor" in qualifiers:
+        qualifiers.discard("loss")
     own = {quantity.qualifier} if quantity.qualifier else set()
     return _key_of(name) == quantity.key or bool(called and qualifiers == own)
 
 
-def other_columns_text(grid: TextTable) -> str:
-    """Return the addition to a message on missing columns that names those of other quantities,
-    such as a stress difference; "" without any.
+def other_columns_text(grid: TextTable, quantities: Sequence[Quantity] = ()) -> str:
+    """Return the addition to a message on missing columns that names those of other quantities than
+    `quantities`, such as a stress difference; "" without any.
     """
-    others = {column: word for column in grid.columns if (word := _other_word(column))}
+    others = {
+        column: word
+        for column in grid.columns
+        if (word := _other_word(column)) and not any(_name_fits(column, q) for q in quantities)
+    }
     return "".join(
         f"; {column} is not read, because the word {word!r} makes it another quantity"
         for column, word in others.items()
@@ -469,8 +491,9 @@ def _other_word(column: str) -> str:
     """Return the word of a column's name that makes it another quantity than any that is read; ""
     without one.
     """
-    others = QUALIFIERS["other"] | QUALIFIERS["difference"] | QUALIFIERS["modulus"]
-    return next(iter(sorted(_words(name_and_unit(column)[0]) & others)), "")
+    keys = ("other", "difference", "storage", "loss", "modulus")
+    words = _words(name_and_unit(column)[0])
+    return next((word for key in keys for word in sorted(words & QUALIFIERS[key])), "")
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
@@ -532,7 +555,7 @@ def _columns_error(
     return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {TIME.column} and "
         f"{'all' if all_of else 'any'} of {expected}, each once, in these or other units"
-        f"{why}{''.join(needed)}{other_columns_text(grid)}{advice}"
+        f"{why}{''.join(needed)}{other_columns_text(grid, quantities)}{advice}"
     )
 
 

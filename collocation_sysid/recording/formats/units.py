@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from ...errors import InputError
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
@@ -24,6 +26,7 @@ UNITS: dict[str, dict[str, float]] = {
         **{"bar": 1e5, "mbar": 1e2, "atm": 101325.0, "psi": 6894.757293, "ksi": 6894757.293},
         **{"mmhg": 133.322387, "cmh2o": 98.0665, "cmh₂o": 98.0665, "dyn/cm²": 0.1},
     },
+    "frequency": {"hz": 1.0, "khz": 1e3, "mHz": 1e-3, "rad/s": 0.5 / math.pi},
     "ratio": {"-": 1.0, "1": 1.0, "mm/mm": 1.0, "m/m": 1.0, "%": 1e-2},
 }
 # Units as they are written, by their spelling in lower case; others are written as in `UNITS`.
@@ -31,6 +34,7 @@ _WRITTEN = {
     **{"n": "N", "mn": "mN", "kn": "kN", "µn": "µN", "nn": "nN", "nm": "nm", "pa": "Pa"},
     **{"hpa": "hPa", "kpa": "kPa", "mpa": "MPa", "gpa": "GPa", "n/m²": "N/m²", "n/cm²": "N/cm²"},
     **{"n/mm²": "N/mm²", "kn/m²": "kN/m²", "mn/m²": "mN/m²", "mmhg": "mmHg", "cmh₂o": "cmH₂O"},
+    **{"hz": "Hz", "khz": "kHz"},
 }
 _TORQUES = {"nm": "N m", "nmm": "N mm", "mnm": "mN m"}
 # Second spellings, which messages leave out.

@@ -336,7 +336,8 @@ def _expected_combinations(
     deviations = problem.assumed_deviations
     try:
         found = expected_precision(collocation, z, deviations).combinations()
-        return with_measurements(found, collocation, z, deviations)
+        with_fixes = with_measurements(found, collocation, z, deviations)
+        return tuple(each for each in with_fixes if each.fixes or not each.is_lone)
     except SimulationError:
         return ()
 

@@ -111,9 +111,16 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
             dict.fromkeys(filter(None, (each.instrument_text for each in experiment.measurements)))
         ),
         air_density_kg_m3=experiment.air_density_kg_m3,
-        test="" if experiment.specimen is None else f"{experiment.specimen.test} specimen",
+        test=_specimen_text(experiment),
         unplaced=int((~markers.located).sum()),
     )
+
+
+def _specimen_text(experiment: Experiment) -> str:
+    if experiment.specimen is None:
+        return ""
+    steady = "harmonic " if experiment.body.memory.oscillates else ""
+    return f"{steady}{experiment.specimen.test} specimen"
 
 
 def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Concern]:

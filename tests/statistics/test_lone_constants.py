@@ -1,0 +1,104 @@
+"""Constants that are not determined and confounded with none: what would determine them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from kit.problems import smooth_poses, times
+
+import collocation_sysid as cs
+from collocation_sysid.methods.starts.initial_trajectories import initial_variables
+from collocation_sysid.runs.expected_precision import added_measurements
+from collocation_sysid.statistics.combinations import find_combinations, lone_constants
+
+TRUTH = {"young_pa": 800.0, "poisson": 0.33, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+SIGMA_M = 4e-4
+UNKNOWN = {"young_pa": cs.Unknown(700.0), "gamma_m_1_s": cs.Unknown(0.7)}
+NAMES, VALUES = ("mu_pa", "gamma_m_1_s"), np.array([3e3, 1.0])
+
+
+def test_a_constant_that_is_confounded_with_none_is_stated_alone():
+    covariance = np.diag([0.01, 0.8]) ** 2
+    assert not find_combinations(NAMES, VALUES, covariance, {"gamma_m_1_s"})
+    (found,) = lone_constants(NAMES, VALUES, covariance, {"gamma_m_1_s"}, ())
+    assert found.is_lone
+    assert found.sentence() == "the data determine γ_m only to within a factor of 4.8"
+    wide = lone_constants(NAMES, VALUES, np.diag([1e-4, 1e3]), {"gamma_m_1_s"}, ())
+    assert wide[0].sentence() == "the data do not determine γ_m"
+
+
+def test_repetitions_reduce_noise_and_a_known_value_what_depends_on_it():
+    covariance = np.array([[0.09, 0.1], [0.1, 0.16]])
+    (found,) = lone_constants(NAMES, VALUES, covariance, {"gamma_m_1_s"}, ())
+    (repeated,) = found.with_repetitions(NAMES, covariance, 0.9 * covariance).fixes
+    assert repeated.what == "4 times as many such recordings"
+    left = 0.16 * (1 - 0.9 * 0.75)
+    assert np.log(repeated.factor) == pytest.approx(1.96 * np.sqrt(left), rel=1e-3)
+    (known,) = found.with_known_value(NAMES, covariance).fixes
+    assert known.what == "μ known to 5%"
+    left = 0.16 - 0.1**2 / (0.09 + 0.05**2)
+    assert np.log(known.factor) == pytest.approx(1.96 * np.sqrt(left), rel=1e-3)
+
+
+def short_swing(name, rng, count=12, force=False):
+    """A swing that is too short for the damping by mass, with the noise of its sensors."""
+    body = cs.Body(cs.box_mesh((0.06, 0.06, 0.09), (1, 1, 3)), density_kg_m3=30.0)
+    top, t_s = np.flatnonzero(body.nodes_m[:, 2] > 0.089), times(count)
+    places_m = body.nodes_m[body.nodes_m[:, 2] < 0.001]
+    blank = np.zeros((len(t_s), len(places_m), 3))
+    markers = cs.Markers(t_s, blank, SIGMA_M, places_m=places_m)
+    grasp = cs.Grasp(top, smooth_poses(t_s, turn_rad=(0.2, -0.15, 0.3)))
+    wrench = cs.Wrench(t_s, np.zeros((len(t_s), 3)), 1.0)
+    swing = cs.Experiment(
+        body, t_s, [replace(grasp, wrench=wrench)], markers, name=name,
+        nuisance=cs.Nuisance.none(), air_density_kg_m3="none",
+    )  # fmt: skip
+    motion = cs.simulate(swing, TRUTH)
+    seen_m = motion.markers_m + SIGMA_M * rng.normal(size=blank.shape)
+    if force:
+        forces_n = motion.wrenches[0][:, :3]
+        sigma_n = 0.01 * np.abs(forces_n).max()
+        noise_n = sigma_n * rng.normal(size=forces_n.shape)
+        grasp = replace(grasp, wrench=cs.Wrench(t_s, forces_n + noise_n, sigma_n))
+    return replace(swing, grasps=[grasp], markers=replace(markers, positions_m=seen_m))
+
+
+def half_width(run):
+    lower, upper = run.estimates["gamma_m_1_s"].combined95
+    return np.log(upper / lower) / 2
+
+
+def run_of(experiments):
+    uncertainty = cs.UncertaintyOptions(noise="given", assumptions=cs.Assumptions.exact())
+    return cs.run(cs.Problem(experiments, TRUTH | UNKNOWN, uncertainty=uncertainty))
+
+
+def test_a_swing_may_be_recorded_again_and_held_longer():
+    first = short_swing("first", np.random.default_rng(0), count=4)
+    problem = cs.Problem([first], TRUTH | UNKNOWN)
+    collocation = problem.collocation()
+    variables, _ = initial_variables(collocation)
+    phrases = dict(added_measurements(collocation, variables))
+    _, longer = phrases["another recording of 'first', held as long again at its end"]
+    np.testing.assert_allclose(longer.t_s, 0.01 * np.arange(9))
+    rotations, _ = longer.grasps[0].poses.at(longer.t_s)
+    np.testing.assert_allclose(rotations[4:], np.broadcast_to(rotations[4], (5, 3, 3)))
+
+
+@pytest.mark.long
+def test_what_would_determine_a_constant_does():
+    rng = np.random.default_rng(1)
+    first = short_swing("first", rng)
+    run = run_of([first])
+    (found,) = run.combinations
+    assert found.determined.names == ("gamma_m_1_s",)
+    by_words = {fix.what: fix for fix in found.fixes}
+    followed = {
+        "a force sensor": [short_swing("sensed", rng, force=True)],
+        "4 times": [first, *(short_swing(f"again {k}", rng) for k in range(3))],
+    }
+    for words, experiments in followed.items():
+        (fix,) = (each for what, each in by_words.items() if what.startswith(words))
+        assert half_width(run_of(experiments)) == pytest.approx(np.log(fix.factor), rel=0.3)
