@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..common.display import Line, Shown, Table, flattened_parts, number, quantity
 from ..common.serialisation import copy_fields
 from ..errors import listed
@@ -23,6 +25,7 @@ from ..fem.laws.constants import (
 from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
+from ..statistics.combinations import precision_text
 from ..statistics.remedies import remedy_for
 from .precision_sentences import alternative_sentences
 from .probe_sections import (
@@ -207,7 +210,21 @@ def _limit(result: Result) -> Iterator[str]:
     if alone := [name for name in shown if name not in combined]:
         symbols = listed(map(symbol_of, alone))
         subject = f"not determined: {symbols}; {subject}"
-    yield f"{subject}; to reduce {source_label(largest)}, {remedy_for(largest)}"
+    remedy = f"to reduce {source_label(largest)}, {remedy_for(largest)}"
+    yield f"{subject}; {remedy}{effect_of_remedy(result, name)}"
+
+
+def effect_of_remedy(result: Result, name: str) -> str:
+    """Return the effect on an estimate of knowing what its largest source stands for; "" if it is
+    determined anyway.
+    """
+    estimate = result.collect_estimates()[name]
+    if estimate.is_determined or estimate.combined95 is None or estimate.combined95[0] <= 0:
+        return ""
+    lower, upper = estimate.combined95
+    share = next(iter(result.budget[name].values()))
+    factor = (upper / lower) ** (0.5 * np.sqrt(max(0.0, 1 - share)))
+    return f": {symbol_of(name)} would then be determined {precision_text(factor)}"
 
 
 def _basis(result: Result) -> list[str]:

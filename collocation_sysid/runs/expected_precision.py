@@ -83,7 +83,8 @@ class ExpectedPrecision:
         """
         vague = undetermined_names(self.names, self.covariance)
         found = find_combinations(self.names, self.values, self.covariance, vague, self.moduli)
-        lone = lone_constants(self.names, self.values, self.covariance, vague, found)
+        noise = self.statistical
+        lone = lone_constants(self.names, self.values, self.covariance, noise, vague, found)
         return tuple(
             each.with_repetitions(self.names, self.covariance, self.statistical).with_known_value(
                 self.names, self.covariance

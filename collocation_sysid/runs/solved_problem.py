@@ -593,10 +593,10 @@ class SolvedProblem:
             return ()
         vague = {name for name in names if not self._is_determined_alone(name)}
         found = find_combinations(names, values, covariance, vague, self._modulus_slopes(names))
-        found = (*found, *lone_constants(names, values, covariance, vague, found))
-        added = (self.added_measurements.get(frozenset(each.determined.names)) for each in found)
         places = [self._estimated_names.index(name) for name in names]
         noise = self.uncertainty.complete_covariance[np.ix_(places, places)]
+        found = (*found, *lone_constants(names, values, covariance, noise, vague, found))
+        added = (self.added_measurements.get(frozenset(each.determined.names)) for each in found)
         return tuple(
             (each if fix is None else replace(each, fixes=(fix,)))
             .with_repetitions(names, covariance, noise)

@@ -288,13 +288,18 @@ def lone_constants(
     names: Sequence[str],
     values: Array,
     covariance: Array,
+    noise: Array,
     undetermined: Collection[str],
     combinations: Sequence[Combination],
 ) -> tuple[Combination, ...]:
-    """Return the undetermined constants with a positive value that belong to no combination;
-    arguments as of `find_combinations`.
+    """Return the undetermined constants with a positive value that belong to no combination, and
+    would be determined without noise; arguments as of `find_combinations`.
+
+    `noise` (k, k) is the part of the covariance by noise: what an assumption of the budget leaves
+    undetermined, no measurement of another kind is sought for.
     """
     combined = {name for each in combinations for name in each.determined.names}
+    combined |= undetermined_names(names, covariance - noise)
     found = []
     for k, name in enumerate(names):
         if name in undetermined and name not in combined and values[k] > 0:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from kit.problems import smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
+from collocation_sysid.result.run_summary import effect_of_remedy
 from collocation_sysid.runs.expected_precision import added_measurements
 from collocation_sysid.statistics.combinations import find_combinations, lone_constants
 
@@ -22,17 +25,21 @@ NAMES, VALUES = ("mu_pa", "gamma_m_1_s"), np.array([3e3, 1.0])
 def test_a_constant_that_is_confounded_with_none_is_stated_alone():
     covariance = np.diag([0.01, 0.8]) ** 2
     assert not find_combinations(NAMES, VALUES, covariance, {"gamma_m_1_s"})
-    (found,) = lone_constants(NAMES, VALUES, covariance, {"gamma_m_1_s"}, ())
+    (found,) = lone_constants(NAMES, VALUES, covariance, covariance, {"gamma_m_1_s"}, ())
     assert found.is_lone
     assert found.sentence() == "the data determine γ_m only to within a factor of 4.8"
-    wide = lone_constants(NAMES, VALUES, np.diag([1e-4, 1e3]), {"gamma_m_1_s"}, ())
-    assert wide[0].sentence() == "the data do not determine γ_m"
+    hopeless = np.diag([1e-4, 1e3])
+    (wide,) = lone_constants(NAMES, VALUES, hopeless, hopeless, {"gamma_m_1_s"}, ())
+    assert wide.sentence() == "the data do not determine γ_m"
+    # What an assumption leaves undetermined, no other measurement determines.
+    assert not lone_constants(NAMES, VALUES, hopeless, 0.1 * hopeless, {"gamma_m_1_s"}, ())
 
 
 def test_repetitions_reduce_noise_and_a_known_value_what_depends_on_it():
     covariance = np.array([[0.09, 0.1], [0.1, 0.16]])
-    (found,) = lone_constants(NAMES, VALUES, covariance, {"gamma_m_1_s"}, ())
-    (repeated,) = found.with_repetitions(NAMES, covariance, 0.9 * covariance).fixes
+    noise = 0.9 * covariance
+    (found,) = lone_constants(NAMES, VALUES, covariance, noise, {"gamma_m_1_s"}, ())
+    (repeated,) = found.with_repetitions(NAMES, covariance, noise).fixes
     assert repeated.what == "4 times as many such recordings"
     left = 0.16 * (1 - 0.9 * 0.75)
     assert np.log(repeated.factor) == pytest.approx(1.96 * np.sqrt(left), rel=1e-3)
@@ -102,3 +109,17 @@ def test_what_would_determine_a_constant_does():
     for words, experiments in followed.items():
         (fix,) = (each for what, each in by_words.items() if what.startswith(words))
         assert half_width(run_of(experiments)) == pytest.approx(np.log(fix.factor), rel=0.3)
+
+
+def test_the_effect_of_a_remedy_is_stated_for_what_it_would_determine():
+    estimate = SimpleNamespace(is_determined=False, combined95=(1.0, 16.0))
+    result: Any = SimpleNamespace(
+        collect_estimates=lambda: {"lambda_pa": estimate},
+        budget={"lambda_pa": {"scale": 0.75, "noise": 0.25}},
+    )
+    assert (
+        effect_of_remedy(result, "lambda_pa")
+        == ": λ would then be determined to within a factor of 2"
+    )
+    estimate.is_determined = True
+    assert not effect_of_remedy(result, "lambda_pa")
