@@ -25,7 +25,7 @@ from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
 from ..motion_transcription import RowWeights, WeightedHistory
 from .lifted_reactions import LiftedReactions, motion_equations
-from .lifted_variables import LiftedVariables, concatenated_entries
+from .lifted_variables import LiftedVariables
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,16 +218,6 @@ class LiftedForceHistory(LiftedVariables):
         for here, x, *_ in self._position_lags(self.first_evaluation):
             yield EntryBlock([x], [columns[:, here][..., self._points.nonzero_weights[0]]])
         yield EntryBlock([self._dynamic_columns[:, None, None, None]], [columns])
-
-    def jacobian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
-        values.
-        """
-        return concatenated_entries(each.indices() for each in self._jacobian_blocks())
-
-    def hessian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of the Hessian, upper triangle."""
-        return concatenated_entries(each.indices() for each in self._hessian_blocks())
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at an iterate and z, and the values of

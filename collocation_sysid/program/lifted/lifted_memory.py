@@ -26,7 +26,7 @@ from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
 from ..motion_transcription import RowWeights, WeightedHistory
 from .lifted_reactions import LiftedReactions, MotionEquations, motion_equations
-from .lifted_variables import LiftedVariables, concatenated_entries
+from .lifted_variables import LiftedVariables
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,18 +274,6 @@ class LiftedMemory(LiftedVariables):
                 EntryBlock(self._position_columns(each, dofs), self._memory_columns(each, own))
             )
         return blocks
-
-    def jacobian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of ∂g/∂z, in the order of their
-        values.
-        """
-        return concatenated_entries(each.indices() for each in self._jacobian_blocks())
-
-    def hessian_entries(self) -> tuple[Index, Index]:
-        """Return rows and columns of the additional entries of the Lagrangian's Hessian,
-        upper triangle.
-        """
-        return concatenated_entries(each.indices() for each in self._hessian_blocks())
 
     @property
     def entry_counts(self) -> tuple[int, int]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from ...common.array_types import Array, Index
 from ..experiment_iterate import ExperimentIterate
+from ..linear_algebra.sparse_assembly import EntryBlock
 from ..motion_transcription import RowWeights, WeightedHistory
 from ..transcription import Transcription
 from .expression_patterns import ExpressionPattern
@@ -102,10 +103,11 @@ class LiftedVariables(ABC):
         """Return rows in g and columns in z of the additional entries of ∂g/∂z, in the order of
         their values; an entry may be repeated, and its values are summed.
         """
-        rows, columns = concatenated_entries(
-            pattern.jacobian_entries() for pattern in self.patterns
+        of_patterns = (pattern.jacobian_entries() for pattern in self.patterns)
+        of_blocks = (block.indices() for block in self._jacobian_blocks())
+        return concatenated_entries(
+            [*((self.offsets.row + rows, columns) for rows, columns in of_patterns), *of_blocks]
         )
-        return self.offsets.row + rows, columns
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         """Return the scaled equations (count,) at the iterate and z, and the values of
@@ -119,7 +121,17 @@ class LiftedVariables(ABC):
         """Return rows and columns in z of the additional entries of the Lagrangian's Hessian, upper
         triangle; an entry may be repeated, and its values are summed.
         """
-        return concatenated_entries(pattern.hessian_entries() for pattern in self.patterns)
+        of_patterns = (pattern.hessian_entries() for pattern in self.patterns)
+        of_blocks = (block.indices() for block in self._hessian_blocks())
+        return concatenated_entries([*of_patterns, *of_blocks])
+
+    def _jacobian_blocks(self) -> Iterable[EntryBlock]:
+        """Return blocks of entries of ∂g/∂z besides those of `patterns`."""
+        return ()
+
+    def _hessian_blocks(self) -> Iterable[EntryBlock]:
+        """Return blocks of entries of the Hessian besides those of `patterns`."""
+        return ()
 
     def hessian_values(
         self,
