@@ -62,9 +62,9 @@ SAFETY = 0.3
 FEASIBLE_FORCE = 1e-10
 # Largest trust region.
 WIDEST = 4.0
-# Largest trust region with correspondences, which are valid only nearby.
+# Largest trust region with unlabelled points, whose correspondences are valid only nearby.
 SEEING = 0.25
-# With correspondences, a rejected step shorter than this ends the search.
+# With unlabelled points, a rejected step shorter than this ends the search.
 LEAST_DETERMINED_SHARE = 1e-3
 # Smallest share of the correspondences that a step must keep.
 LEAST_VISIBLE_SHARE = 0.97
@@ -162,8 +162,9 @@ class ReducedSearch:
     lower, upper : (np,) array
         Bounds of the parameters.
     has_correspondences : bool
-        Whether an experiment has measured points that correspond to the nearest surface, as those
-        of cameras do.
+        Whether an experiment has measurements with correspondences, as those of cameras have.
+    has_unlabelled : bool
+        Whether such measurements do not state which points of the body they are.
     has_impacts : bool
         Whether a body may strike an obstacle: the trajectory is then not smooth in the parameters.
     is_associated : bool
@@ -207,15 +208,18 @@ class ReducedSearch:
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
         self.sweeps = 0
-        self.has_correspondences = any(
-            transcription.association.correspondences
+        correspondences = [
+            each
             for transcription in collocation.transcriptions
-        )
+            for each in transcription.association.correspondences
+        ]
+        self.has_correspondences = bool(correspondences)
+        self.has_unlabelled = not all(each.is_labelled for each in correspondences)
         self.has_impacts = any(
             not transcription.experiment.is_static and transcription.experiment.obstacles
             for transcription in collocation.transcriptions
         )
-        self.largest_trust = SEEING if self.has_correspondences else WIDEST
+        self.largest_trust = SEEING if self.has_unlabelled else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
         self.refines_solutions = not all(
@@ -422,7 +426,7 @@ class ReducedSearch:
                 point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
             ):
                 return Status.CONVERGED  # rounding keeps it from getting better
-            if self.has_correspondences and length <= LEAST_DETERMINED_SHARE:
+            if self.has_unlabelled and length <= LEAST_DETERMINED_SHARE:
                 # The association changes the loss by more than such a step.
                 self.ended_by_association = True
                 return Status.CONVERGED
@@ -654,7 +658,7 @@ class ReducedSearch:
         A point may then belong to another part of the surface, or to none. The number of
         measurements, with those left out because of a crease (`Collocation.count_associated()`),
         must be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement
-        at most `EQUAL_MISFIT_RATIO` times that of the point. True without correspondences; false if
+        at most `EQUAL_MISFIT_RATIO` times that of the point. True without unlabelled points; false if
         the association may not be updated any more.
 
         Afterwards collocation and parameters are those of the point, in the search, the recorder
@@ -662,7 +666,7 @@ class ReducedSearch:
         `_reassociate`, and `most_measurements` is updated; `reassociations` is unchanged.
         """
         before = self.collocation
-        if not self.has_correspondences:
+        if not self.has_unlabelled:
             return True
         if self.reassociations >= REREADINGS:
             return False

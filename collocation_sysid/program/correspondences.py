@@ -10,14 +10,23 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from ..common.array_types import Array
 from .measurement_residual import MeasurementResidual
 
 
 class Correspondences(ABC):
-    """Points of the body that correspond to the measurements of one sensor."""
+    """Points of the body that correspond to the measurements of one sensor.
+
+    Attributes
+    ----------
+    is_labelled : bool
+        Whether the measurements state which points they are, so that other estimates change places
+        and visibility only: the correspondences are then valid far from the estimates, too.
+    """
+
+    is_labelled: ClassVar[bool] = False
 
     @property
     @abstractmethod

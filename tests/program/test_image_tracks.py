@@ -35,7 +35,7 @@ from collocation_sysid.features.image_tracks.rays import (
     poses_from_points,
 )
 from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
-from collocation_sysid.methods.solution import Solution
+from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.observables import ObservableDerivatives
 
 # Every deviation is estimated.
@@ -206,21 +206,20 @@ def test_unknown_places_are_where_the_first_rays_meet_the_surface() -> None:
 
 def test_hidden_points_are_not_compared() -> None:
     residual = residual_of(tracks_of("front"))
-    compared = dict(zip(NAMES, residual.is_compared[..., :2].all(axis=(0, 2)), strict=True))
+    seen = np.asarray(residual.is_compared[..., :2].all(axis=(0, 2)))
+    compared = dict(zip(NAMES, seen.tolist(), strict=True))
     assert not compared["tip_end"]  # its face looks away from the camera
     assert compared["tip_front"]
     assert compared["near_top"]
     # A point that turns away does not count as lost, so that the search may turn it.
     both = residual.is_compared.sum() + residual.uncompared_count
     assert both == 2 * len(T_S) * len(NAMES)
+    # Two shapes: a roof above the first point, and one that touches it.
     eyes = np.tile([0.0, 0.0, 1.0], (2, 1))
     roof = np.array([[[-1.0, -1.0, 0.5], [1.0, -1.0, 0.5], [0.0, 1.0, 0.5]]])
-    points = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    assert is_occluded(points, eyes, roof, 0.01).tolist() == [True, False]
-    assert is_occluded(points + np.array([0, 0, 0.495]), eyes, roof, 0.01).tolist() == [
-        False,
-        False,
-    ]
+    roofs = np.array([roof, roof - [0, 0, 0.495]])
+    points = np.tile([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], (2, 1, 1))
+    assert is_occluded(points, eyes, roofs, 0.01).tolist() == [[True, False], [False, False]]
 
 
 def test_points_behind_an_obstacle_are_not_compared() -> None:
@@ -252,6 +251,52 @@ def test_a_solid_hides_what_is_behind_it_and_not_what_touches_it() -> None:
     assert is_behind(points, eyes, ball, 0.01).tolist() == [True, False, True, False]
     floor = np.array([[0.0, 0.0, -1e-4]])
     assert not is_behind(floor, eyes[:1], lambda points_m: points_m[:, 2], 0.01).any()
+
+
+def test_unknown_places_cross_creases_to_faces_that_the_camera_sees() -> None:
+    found = residual_of(tracks_of(known=False)).correspondences
+    at = found.association.centre_places_m.copy()
+    front, top, end = map(NAMES.index, ("middle_front", "middle_top", "tip_front"))
+    at[front, 2] = 0.021  # beyond the upper edge of the front
+    at[top, 1] = -0.001  # beyond the front edge of the top
+    at[end, 0] = 0.121  # towards the end, which looks away from the camera
+    moved = found._with_faces_of(at)
+    places = moved.association.centre_places_m
+    axes = moved.association.axes
+    normals = np.cross(axes[..., 0], axes[..., 1])
+    np.testing.assert_allclose(places[front], [at[front, 0], 0.0, 0.02], atol=1e-12)
+    np.testing.assert_allclose(abs(normals[front]), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(places[top], [at[top, 0], 0.0, 0.02], atol=1e-12)
+    np.testing.assert_allclose(abs(normals[top]), [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(places[end], at[end], atol=1e-12)
+    np.testing.assert_allclose(abs(normals[end]), [0, 1, 0], atol=1e-12)
+    # Places that are stated stay on their side.
+    stated = residual_of(tracks_of()).correspondences
+    assert not np.any(stated._with_faces_of(at).crossings)
+
+
+@pytest.mark.long
+def test_unknown_places_that_the_guess_puts_on_the_wrong_side_do_not_bias() -> None:
+    # With a third of the stiffness the bar hangs lower, so that the first rays meet other faces.
+    near_edges = dict(PLACES_M) | {
+        "tip_top": (0.108, 0.004, 0.02),
+        "middle_top": (0.09, 0.003, 0.02),
+    }
+    places = np.array(list(near_edges.values()))
+    markers = cs.Markers(T_S, np.zeros((41, 7, 3)), 1e-3, names=NAMES, places_m=places)
+    true_m = cs.simulate(replace(swung(), markers=markers), TRUTH, "midpoint", substeps=1).markers_m
+    tracks = tracks_of(known=False)
+    pixels = projected(filming("front"), true_m)
+    pixels += NOISE_PX * np.random.default_rng(3).normal(size=pixels.shape)
+    tracks = tracks.with_samples(T_S, pixels.reshape(41, -1))
+    problem = cs.Problem([swung([tracks])], parameters=unknown_young(5e4))
+    solution = cs.solve(problem)
+    assert solution.status is Status.CONVERGED
+    assert solution.parameters["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=0.03)
+    (residual,) = solution.collocation.transcriptions[0].residuals_of(ImageTrackResidual)
+    found = residual.correspondences.places_m(solution.parts[0].phi)
+    for name in ("tip_top", "middle_top"):
+        np.testing.assert_allclose(found[NAMES.index(name)], near_edges[name], atol=3e-3)
 
 
 def test_points_off_the_body_are_excluded() -> None:

@@ -407,7 +407,7 @@ def test_depth_images_of_a_topic_come_with_their_camera_and_times(
     assert topics[raw].serves == "depth images, 7 x 5: [[experiment.depth]]"
     assert topics[raw].write == (f"{log.name}#{raw}",)
     assert topics["/camera/camera_info"].serves == (
-        "matrix of the camera, for depth images in the same namespace"
+        "calibration of a camera; its matrix is used for depth images in the same namespace"
     )
 
 

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from kit.logs import json_mcap
 
 import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.track_files import read_tracks
 from collocation_sysid.recording.formats.calibration_files import read_calibration
+from collocation_sysid.recording.formats.topics import list_topics
 
 RNG = np.random.default_rng(7)
 PIXELS = np.round(RNG.uniform(10, 600, (5, 2, 2)), 3)
@@ -142,6 +144,7 @@ def test_labels_of_sleap_are_read(version: float, tmp_path: Path) -> None:
     read = read_tracks(tmp_path / "bar.slp")
     assert read.names == NAMES
     np.testing.assert_allclose(read.pixels, PIXELS)
+    assert read.likelihood is not None
     np.testing.assert_allclose(read.likelihood, [*SCORES[:-1], np.ones(count)])
 
 
@@ -263,3 +266,70 @@ def test_calibrations_with_wrong_values_are_refused(tag: str, tmp_path: Path) ->
     text = f"K: [{tag}, 0, 1, 0, 1, 1, 0, 0, 1]\n"
     with pytest.raises(cs.InputError, match="expected"):
         read_calibration(write(tmp_path, "c.yaml", text))
+
+
+# Topics of logs -----------------------------------------------------------------------------------
+
+
+def point_of_own_message(name: str, u: float, v: float, score: float) -> dict[str, Any]:
+    return {"name": name, "u": u, "v": v, "likelihood": score}
+
+
+def april_tag(name: str, u: float, v: float, score: float) -> dict[str, Any]:
+    return {"id": NAMES.index(name), "centre": {"x": u, "y": v}, "decision_margin": 60.0}
+
+
+def detection(name: str, u: float, v: float, score: float) -> dict[str, Any]:
+    centre = {"position": {"x": u, "y": v}, "theta": 0.0}
+    return {
+        "id": name,
+        "bbox": {"center": centre, "size_x": 9.0},
+        "results": [{"hypothesis": {"class_id": "dot", "score": score}}],
+    }
+
+
+@pytest.mark.parametrize("item", [point_of_own_message, april_tag, detection])
+def test_topics_of_logs_are_tracks(tmp_path: Path, item: Any) -> None:
+    messages: list[tuple[float, dict]] = []
+    for t, pixels, scores in zip(T_S, PIXELS, SCORES, strict=True):
+        seen = zip(NAMES, pixels.tolist(), scores.tolist(), strict=True)
+        # A tracker omits what it does not find.
+        items = [item(name, u, v, s) for name, (u, v), s in seen if name != "hook" or t > 0]
+        messages.append(
+            (float(t), {"points" if item is point_of_own_message else "detections": items})
+        )
+    log = json_mcap(tmp_path / "run.mcap", {"/camera/points": ("points", messages)})
+    names = ("0", "1") if item is april_tag else NAMES
+    (topic,) = list_topics(log)
+    assert topic.serves == f"image tracks: {', '.join(sorted(names))}"
+    found = read_tracks(f"{log}#/camera/points")
+    assert found.names == names
+    assert found.t_s is not None
+    np.testing.assert_allclose(found.t_s, T_S, atol=1e-9)
+    np.testing.assert_allclose(found.pixels[:, 0], PIXELS[:, 0])
+    np.testing.assert_allclose(found.pixels[1:, 1], PIXELS[1:, 1])
+    assert np.isnan(found.pixels[0, 1]).all()
+    if item is april_tag:
+        assert found.likelihood is None
+    else:
+        assert found.likelihood is not None
+        np.testing.assert_allclose(found.likelihood[:, 0], SCORES[:, 0])
+
+
+@pytest.mark.parametrize("capital", [False, True])
+def test_calibrations_are_read_from_topics(tmp_path: Path, capital: bool) -> None:
+    matrix = [900.0, 0, 640, 0, 905, 360, 0, 0, 1]
+    numbers = {"k": matrix, "d": [-0.1, 0.02, 0, 0, 0], "p": [0.0] * 12}
+    content = {name.upper() if capital else name: each for name, each in numbers.items()}
+    content |= {"width": 1280, "height": 720, "distortion_model": "plumb_bob"}
+    topics = {
+        "/camera/camera_info": ("CameraInfo", [(0.0, content)]),
+        "/x": ("n", [(0.0, {"data": 1.0})]),
+    }
+    log = json_mcap(tmp_path / "run.mcap", topics)
+    found = read_calibration(f"{log}#/camera/camera_info")
+    np.testing.assert_allclose(found.matrix.ravel(), matrix)
+    np.testing.assert_allclose(found.distortion[:2], [-0.1, 0.02])
+    assert (found.size_px, found.model) == ((1280, 720), "pinhole")
+    with pytest.raises(cs.InputError, match=r"/x has no camera model"):
+        read_calibration(f"{log}#/x")

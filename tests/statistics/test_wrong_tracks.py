@@ -216,3 +216,51 @@ def test_good_tracks_are_not_doubted() -> None:
     (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
     true = projected(filming("front"), motion_m())
     assert [*track_hypotheses(residual, true, "'front'")] == []
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_images_in_reverse_order_are_named_where_a_delay_of_half_a_period_is_as_near(
+    known: bool,
+) -> None:
+    experiment = swinging()
+    tracks = carried_tracks(experiment)
+    tracks = replace(tracks, places_m=tracks.places_m if known else None)
+    assert not [*hypotheses(replace(experiment, readings=[tracks]))]
+    backwards = with_pixels(tracks, pixels_of(tracks)[::-1])
+    (found,) = hypotheses(replace(experiment, readings=[backwards]))
+    assert str(found.data["mistake"]).startswith("the images are in reverse order")
+
+
+def swinging() -> cs.Experiment:
+    """The bar, whose held end moves to and fro."""
+    experiment = swung()
+    poses = np.tile(np.eye(4), (len(T_S), 1, 1))
+    poses[:, 2, 3] = 0.05 * np.sin(2 * np.pi * 5 * T_S) * np.clip(T_S / 0.05, 0, 1)
+    held = replace(experiment.grasps[0], poses=cs.PoseSequence.from_matrices(T_S, poses))
+    return replace(experiment, grasps=[held])
+
+
+def carried_tracks(experiment: cs.Experiment) -> cs.ImageTracks:
+    """Tracks of a rigid body in its grasp."""
+    points = experiment.markers.predict_positions(experiment.rigid_positions(T_S))
+    rng = np.random.default_rng(2)
+    pixels = projected(filming("front"), points)
+    return with_pixels(tracks_of("front"), pixels + NOISE_PX * rng.normal(size=pixels.shape))
+
+
+@pytest.mark.parametrize("wrong", ["u points to the left", "u and v are exchanged", ""])
+def test_tracks_of_a_camera_with_an_unknown_pose_are_checked(wrong: str) -> None:
+    tracks = tracks_of("front", np.random.default_rng(2), has_known_pose=False)
+    changes: dict[str, Change] = {
+        "u points to the left": MISTAKES["mirrored"][0],
+        "u and v are exchanged": MISTAKES["row and column"][0],
+        "": lambda t: t,
+    }
+    found = [*hypotheses(swung([changes[wrong](tracks)]))]
+    if not wrong:
+        assert not found
+        return
+    (named,) = found
+    # Images mirrored about any axis differ by a rotation, which the pose takes up.
+    mirrored = ("u points", "v points", "u and v are")
+    assert any(f"but sees them if {text}" in str(named.data["remedy"]) for text in mirrored)

@@ -36,34 +36,34 @@ def cross(a: Array, b: Array) -> Array:
 def ray_hits(
     origins: Array, directions: Array, triangles: Array
 ) -> tuple[NDArray[np.bool_], Array, Array]:
-    """Intersect P rays with F triangles.
+    """Intersect P rays with F triangles, also for several shapes at once.
 
     Parameters
     ----------
-    origins, directions : (P, 3) arrays
-    triangles : (F, 3, 3) array
+    origins, directions : (..., P, 3) arrays
+    triangles : (..., F, 3, 3) array
         Corners.
 
     Returns
     -------
-    (P, F) bool, (P, F) array, (P, F, 3) array
+    (..., P, F) bool, (..., P, F) array, (..., P, F, 3) array
         Whether a ray hits a triangle in front of its origin, the distance in lengths of the
         direction, and the barycentric coordinates of the hit.
     """
-    first = triangles[:, 0]
-    ab, ac = triangles[:, 1] - first, triangles[:, 2] - first
-    across = cross(directions[:, None], ac)
-    determinant = np.einsum("pfi,fi->pf", across, ab)
+    first = triangles[..., 0, :]
+    ab, ac = triangles[..., 1, :] - first, triangles[..., 2, :] - first
+    across = cross(directions[..., None, :], ac[..., None, :, :])
+    determinant = np.einsum("...pfi,...fi->...pf", across, ab)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = 1 / determinant
-        away = origins[:, None] - first
-        in_b = np.einsum("pfi,pfi->pf", away, across) * inverse
-        other = cross(away, ab)
-        in_c = np.einsum("pi,pfi->pf", directions, other) * inverse
-        distance = np.einsum("fi,pfi->pf", ac, other) * inverse
+        away = origins[..., None, :] - first[..., None, :, :]
+        in_b = np.einsum("...pfi,...pfi->...pf", away, across) * inverse
+        other = cross(away, ab[..., None, :, :])
+        in_c = np.einsum("...pi,...pfi->...pf", directions, other) * inverse
+        distance = np.einsum("...fi,...pfi->...pf", ac, other) * inverse
         least = np.minimum(np.minimum(in_b, in_c), 1 - in_b - in_c)
         is_hit = (least >= -EDGE_TOLERANCE) & (distance > 0) & np.isfinite(inverse)
-        return is_hit, distance, np.stack([1 - in_b - in_c, in_b, in_c], axis=2)
+        return is_hit, distance, np.stack([1 - in_b - in_c, in_b, in_c], axis=-1)
 
 
 def points_on_surface(
@@ -107,18 +107,19 @@ def points_on_surface(
 def is_occluded(
     points_m: Array, eyes_m: Array, triangles: Array, margin_m: float
 ) -> NDArray[np.bool_]:
-    """Return which points (P, 3) on a surface are hidden from eyes (P, 3) by triangles (F, 3, 3)
-    that are at least `margin_m` in front of them.
+    """Return which points (S, P, 3) on surfaces are hidden from eyes (S, 3) by the triangles (S, F,
+    3, 3) of the same shape that are at least `margin_m` in front of them.
     """
-    hidden = np.zeros(len(points_m), dtype=bool)
-    batch = max(1, MOST_PAIRS // max(1, len(triangles)))
-    for first in range(0, len(points_m), batch):
+    shapes, count = points_m.shape[:2]
+    hidden = np.zeros((shapes, count), dtype=bool)
+    batch = max(1, MOST_PAIRS // max(1, triangles.shape[1] * count))
+    for first in range(0, shapes, batch):
         part = slice(first, first + batch)
-        to_eye = eyes_m[part] - points_m[part]
-        length = np.linalg.norm(to_eye, axis=1)
-        is_hit, distance, _ = ray_hits(points_m[part], to_eye, triangles)
-        is_between = (distance < 1) & (distance * length[:, None] > margin_m)
-        hidden[part] = (is_hit & is_between).any(axis=1)
+        to_eye = eyes_m[part, None] - points_m[part]
+        length = np.linalg.norm(to_eye, axis=2)
+        is_hit, distance, _ = ray_hits(points_m[part], to_eye, triangles[part])
+        is_between = (distance < 1) & (distance * length[..., None] > margin_m)
+        hidden[part] = (is_hit & is_between).any(axis=2)
     return hidden
 
 

@@ -20,6 +20,7 @@ from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 from .rays import points_on_surface
+from .tracked_places import poses_of_tracks
 from .tracks import ImageTracks, stated_places
 
 # Images in which places, and in which motions are compared.
@@ -56,8 +57,10 @@ WELL_ALIKE = 0.25
 SIMILAR = 1.3
 ALIKE_ENOUGH = 0.1
 MOST_NAMED = 2
-# Share of the images in which a correction of the times must show the motion.
+# Share of the images in which a correction of the times must show the motion, and of the samples that
+# must be seen for images in reverse order.
 COVERED = 0.6
+MOSTLY_SEEN = 0.9
 # Sizes of images over those of the calibration that are tried.
 SCALES = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
 # Frame rates over the stated ones that are tried: films of other standards, and slow motion.
@@ -81,7 +84,7 @@ MESSAGES = {
     "description/image-tracks/likely": "the points are not where the body appears ({distance_px:.3g} "
     "pixels off, median), but {nearer:.2g} times nearer if {mistake}",
     "description/image-tracks/hidden": "{hidden} of {count} points with places_m are on sides of the "
-    "body that the camera does not see: check the axes of places_m and camera.pose",
+    "body that the camera does not see{remedy}",
     "description/image-tracks/motion": "near the grasp the points do not move as the grasp does "
     "(deviation {unlike:.2g} of its motion), but {nearer:.2g} times more alike if {mistake}",
 }
@@ -99,10 +102,10 @@ class _Described:
 
 def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield a hypothesis for each camera whose tracks are not where the body appears, or near the
-    grasp do not move as the grasp does.
+    grasp do not move as the grasp does; an unknown pose is that which fits one image best.
     """
     for tracks in experiment.readings:
-        if isinstance(tracks, ImageTracks) and tracks.pixels is not None and tracks.has_known_pose:
+        if isinstance(tracks, ImageTracks) and tracks.pixels is not None:
             yield from _camera_hypotheses(experiment, tracks)
 
 
@@ -112,12 +115,15 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
     trial = _Trial(experiment, tracks)
     if not len(trial.samples):
         return
+    if not tracks.has_known_pose:
+        stated = trial.with_fitted_pose(stated)
+        tracks = trial.tracks = replace(tracks, camera=stated.camera)
     of = f"'{tracks.name}' of '{experiment.name}'"
     stated_px, size_px = trial.distance_px(stated), trial.size_px(stated.camera)
     usual_px = max(OF_DEFORMATION * size_px, OF_POSE * trial.pose_px)
     if stated_px > OF_DEFORMATION * size_px or stated_px >= FAR_PX:
-        corrections = [*trial.corrections(stated)]
-        if stated_px > usual_px:
+        corrections = [*trial.corrections(stated), *trial.reversed_order(stated)]
+        if stated_px > usual_px and tracks.has_known_pose:
             corrections += trial.corrected_pixels(stated)
         tried = [(trial.distance_px(other), other) for other in corrections]
         best_px = min(distance for distance, _ in tried)
@@ -138,9 +144,17 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
             strength = stated_px / min(size_px, FAR_PX)
             yield Hypothesis("image-tracks", of, data=data, strength=strength)
             return
-    hidden = trial.hidden_count()
+    hidden = trial.hidden_count(stated.camera)
     if hidden > HIDDEN * len(trial.known):
-        data = {"hidden": hidden, "count": len(trial.known)}
+        remedy = ": check the axes of places_m and camera.pose"
+        if not tracks.has_known_pose:
+            # A pose that is found shows mirrored images of the body from behind.
+            tried = [(trial.distance_px(each), each) for each in trial.corrections(stated)]
+            tried.sort(key=lambda each: each[0])
+            most = HIDDEN * len(trial.known)
+            seen = [each for _, each in tried if trial.hidden_count(each.camera) <= most]
+            remedy = f", but sees them if {_alternatives(seen)}" if seen else remedy
+        data = {"hidden": hidden, "count": len(trial.known), "remedy": remedy}
         strength = hidden / (HIDDEN * len(trial.known))
         yield Hypothesis("image-tracks/hidden", of, data=data, strength=strength)
         return
@@ -156,10 +170,13 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
         if trial.distance_px(each[1]) <= max(2 * stated_px, usual_px)
     ]
     if possible:
-        least, best = possible[0]
+        least = possible[0][0]
         similar = [other for each, other in possible if each <= SIMILAR * least + ALIKE_ENOUGH]
+        # A correction that leaves images outside of the experiment explains less.
+        similar.sort(key=lambda other: -trial.image_count(other))
         # Neighbouring delays are no alternatives.
-        similar = [other for other in similar if other is best or other.t_s is stated.t_s]
+        moved = [other for other in similar if other.t_s is not stated.t_s]
+        similar = [other for other in similar if other not in moved[1:]]
         ratio = unlike / max(least, ALIKE_ENOUGH)
         named = {"unlike": unlike, "mistake": _alternatives(similar), "nearer": ratio}
         yield Hypothesis("image-tracks/motion", of, data=named, strength=ratio)
@@ -184,12 +201,12 @@ class _Trial:
         self.is_seen = tracks.is_seen
         self.within = self._within(tracks.sample_times_s)
         self.samples = _spread(self.within, MOST_IMAGES)
-        stated = stated_places(experiment)
-        rest = LocatedBody(self.body.nodes_m, self.body)
+        self.stated = {name: place for name, (place, _) in stated_places(experiment).items()}
+        self.rest = LocatedBody(self.body.nodes_m, self.body)
         self.known = {
-            k: rest.weights_at_nearest_point(stated[name][0])
+            k: self.rest.weights_at_nearest_point(self.stated[name])
             for k, name in enumerate(tracks.names)
-            if name in stated
+            if name in self.stated
         }
         held = [grasp.nodes for grasp in experiment.grasps]
         self.reach_m = np.zeros(len(self.body.nodes_m))
@@ -293,14 +310,14 @@ class _Trial:
             distances.append(off[seen[:, k]])
         return float(np.median(np.concatenate(distances)))
 
-    def hidden_count(self) -> int:
-        """Return how many points with known places are on faces that look away from the camera in
-        all compared images.
+    def hidden_count(self, camera: Camera) -> int:
+        """Return how many points with known places are on faces that look away from a camera in all
+        compared images.
         """
         surface = self.body.mesh.surface
         corners = self.body.nodes_m[surface]
         t_s = self.tracks.sample_times_s[self.samples]
-        eyes_m = self.tracks.camera.pose_at(t_s)[1]
+        eyes_m = camera.pose_at(t_s)[1]
         count = 0
         for nodes, weights in self.known.values():
             place = weights @ self.body.nodes_m[nodes]
@@ -353,10 +370,19 @@ class _Trial:
 
     def corrections(self, stated: _Described, with_times: bool = False) -> Iterator[_Described]:
         """Yield the description with one mistake corrected, also of the times if stated."""
-        yield from self._corrected_images(stated)
-        yield from _corrected_poses(stated)
+        if self.tracks.has_known_pose:
+            yield from self._corrected_images(stated)
+            yield from _corrected_poses(stated)
+        else:
+            yield from map(self.with_fitted_pose, self._corrected_images(stated))
         if with_times:
             yield from self._corrected_times(stated)
+
+    def with_fitted_pose(self, described: _Described) -> _Described:
+        """Return the description with the pose that shows the known points in one image best."""
+        shown = replace(self.tracks, camera=described.camera, pixels=described.pixels)
+        pose = poses_of_tracks(shown, self.stated, self.rest, self._rigid_m)[0][0]
+        return replace(described, camera=replace(described.camera, pose=pose))
 
     def _corrected_images(self, stated: _Described) -> Iterator[_Described]:
         matrix = stated.camera.require_matrix()
@@ -422,13 +448,22 @@ class _Trial:
         tracked = stated.pixels[sample, known or self.is_seen[sample]]
         return np.asarray(_middle(shown) - _middle(tracked))
 
-    def _corrected_times(self, stated: _Described) -> Iterator[_Described]:
-        t_s, within = stated.t_s, self.within
-        reversed_px = stated.pixels.copy()
-        reversed_px[within] = stated.pixels[within[::-1]]
-        if (np.diff(t_s) > 0).all() and self.is_seen.all():
+    def reversed_order(self, stated: _Described) -> Iterator[_Described]:
+        """Yield the description with the images in reverse order, if nearly all points are seen."""
+        within = self.within
+        if self.is_seen[within].mean() >= MOSTLY_SEEN:
+            pixels = stated.pixels.copy()
+            pixels[within] = stated.pixels[within[::-1]]
             mistake = "the images are in reverse order: sort them by time"
-            yield replace(stated, pixels=reversed_px, mistake=mistake)
+            yield replace(stated, pixels=pixels, mistake=mistake)
+
+    def image_count(self, described: _Described) -> int:
+        """Return how many images are within the experiment."""
+        return len(self._within(described.t_s))
+
+    def _corrected_times(self, stated: _Described) -> Iterator[_Described]:
+        t_s = stated.t_s
+        yield from self.reversed_order(stated)
         for rate in RATES:
             mistake = f"their rate is {rate:.3g} times the stated one: correct frame_rate_hz or t_s"
             other_s = t_s[0] + (t_s - t_s[0]) / rate

@@ -133,15 +133,16 @@ class ImageTrackResidual(CameraImagesResidual):
         if only_pose:
             return places
 
-        def shape_at(t_s: float) -> Array:
+        def shapes_at(t_s: Array) -> Array:
             last_s = self.observable_s[len(x) - 1]
-            if t_s > last_s and self.t_s[0] <= last_s:
-                return experiment.rigid_positions(np.array([t_s]))[0]
-            late = np.abs(self.observable_s[: len(x)] - t_s)
-            return x[int(late.argmin())].reshape(-1, 3)
+            late = np.abs(self.observable_s[: len(x)] - t_s[:, None])
+            shapes = x[late.argmin(axis=1)].reshape(len(t_s), -1, 3)
+            if self.t_s[0] <= last_s and (t_s > last_s).any():
+                shapes[t_s > last_s] = experiment.rigid_positions(t_s[t_s > last_s])
+            return shapes
 
         return TrackedPlaces.from_shapes(
-            experiment, tracks, shape_at, places.coordinate_parameters, places.pose_parameters
+            experiment, tracks, shapes_at, places.coordinate_parameters, places.pose_parameters
         )
 
     def correspondences_of(self, measured: ImageTracks, x: Array, phi: Array) -> TrackedPlaces:
@@ -189,14 +190,13 @@ class ImageTracksModel(CorrespondenceModel):
         """Return the correspondences with the undeformed body in its grasps."""
         experiment = self.grid.experiment
 
-        def shape_at(t_s: float) -> Array:
-            at_s = np.clip([t_s], *experiment.t_s[[0, -1]])
-            return experiment.rigid_positions(at_s)[0]
+        def shapes_at(t_s: Array) -> Array:
+            return experiment.rigid_positions(np.clip(t_s, *experiment.t_s[[0, -1]]))
 
         return TrackedPlaces.from_shapes(
             experiment,
             self.measurement,
-            shape_at,
+            shapes_at,
             self._coordinate_parameters,
             self._pose_parameters,
         )

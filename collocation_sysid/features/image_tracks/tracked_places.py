@@ -36,9 +36,12 @@ MISSES = 3.0
 # a visible one becomes hidden: trackers follow points at grazing angles.
 TURNS_VISIBLE = 0.05
 TURNS_HIDDEN = -0.1
-# Cosine of the angle between two faces up to which a place may move from one to the other: beyond it,
-# the edge is a crease, and places stay in the plane of their face.
+# Cosine of the angle between two faces up to which a place may move freely from one to the other:
+# beyond it, the edge is a crease.
 SMOOTH = 0.7
+# Creases that an unknown place may cross: its first ray may meet the wrong side of an edge, because
+# the first shape is that of the guess.
+MOST_CREASES = 4
 # Distance of a stated place from the body over its diagonal from which on it is a mistake.
 FAR_OFF = 0.25
 # Iterations that align a camera with the first image.
@@ -51,18 +54,18 @@ OCCLUSION_EDGES = 0.3
 # Distance in mean edges by which another face must be nearer to a place than its own.
 SAME_FACE = 1e-3
 
-ShapeAt = Callable[[float], Array]
+ShapesAt = Callable[[Array], Array]
 
 
 def find_places(
-    experiment: Experiment, shape_at: ShapeAt
+    experiment: Experiment, shapes_at: ShapesAt
 ) -> tuple[dict[str, Array], dict[str, float], dict[str, Array]]:
     """Return the poses of the cameras and the places of the points of an experiment.
 
     Parameters
     ----------
-    shape_at : callable
-        ``shape_at(t_s)``, nodes (n, 3) of the body at a time [m].
+    shapes_at : callable
+        ``shapes_at(t_s)``, nodes (k, n, 3) of the body at times (k,) [m].
 
     Returns
     -------
@@ -87,12 +90,12 @@ def find_places(
     for tracks in cameras:
         poses[tracks.name] = tracks.camera.pose
         if not tracks.has_known_pose and tracks.pixels is not None:
-            found = _poses_of(tracks, stated, rest, shape_at)
+            found = poses_of_tracks(tracks, stated, rest, shapes_at)
             poses[tracks.name] = found[0][0]
             mirrored[tracks.name] = found[1][1] / found[0][1] if len(found) > 1 else np.inf
     places = dict(stated)
     for tracks in cameras:
-        _add_places(places, tracks, poses[tracks.name], experiment.body, shape_at)
+        _add_places(places, tracks, poses[tracks.name], experiment.body, shapes_at)
     return poses, mirrored, places
 
 
@@ -109,10 +112,12 @@ def _require_on_body(places: Mapping[str, Array], rest: LocatedBody) -> None:
             )
 
 
-def _poses_of(
-    tracks: ImageTracks, stated: Mapping[str, Array], rest: LocatedBody, shape_at: ShapeAt
+def poses_of_tracks(
+    tracks: ImageTracks, stated: Mapping[str, Array], rest: LocatedBody, shapes_at: ShapesAt
 ) -> list[tuple[Array, float]]:
-    """Return the possible poses of a camera in the first image with the most known points."""
+    """Return the possible poses of a camera in the first image with the most known points, best
+    first, and their errors at unit depth.
+    """
     known = np.array([name in stated for name in tracks.names])
     counts = (tracks.is_seen & known).sum(axis=1)
     sample = int(counts.argmax())
@@ -124,7 +129,7 @@ def _poses_of(
         )
     assert tracks.pixels is not None
     used = np.flatnonzero(tracks.is_seen[sample] & known)
-    nodes_m = shape_at(float(tracks.sample_times_s[sample]))
+    nodes_m = shapes_at(tracks.sample_times_s[[sample]])[0]
     points = [_moved(stated[tracks.names[k]], rest, nodes_m) for k in used.tolist()]
     rays = tracks.camera.points_at_unit_depth(np.asarray(tracks.pixels)[sample, used])
     found = poses_from_points(np.array(points), rays)
@@ -148,7 +153,7 @@ def _moved(place_m: Array, rest: LocatedBody, nodes_m: Array) -> Array:
 
 
 def _add_places(
-    places: dict[str, Array], tracks: ImageTracks, pose: Array, body: Body, shape_at: ShapeAt
+    places: dict[str, Array], tracks: ImageTracks, pose: Array, body: Body, shapes_at: ShapesAt
 ) -> None:
     """Add the places of the points that have none and are seen by this camera, in place."""
     seen = tracks.is_seen
@@ -172,7 +177,7 @@ def _add_places(
         rotations, translations = camera.pose_at(t_s)
         rays = camera.points_at_unit_depth(pixels[sample, chosen])
         origins = np.tile(translations[0], (len(chosen), 1))
-        nodes_m = shape_at(t_s)
+        nodes_m = shapes_at(np.array([t_s]))[0]
         faces, shares, missed = points_on_surface(
             origins, rays @ rotations[0].T, nodes_m, body.mesh.surface
         )
@@ -190,8 +195,14 @@ def _add_places(
 class TrackedPlaces(Correspondences):
     """Places of the points of one camera, its pose, and which points are compared."""
 
+    is_labelled = True
+
     tracks: ImageTracks
     association: MarkerAssociation  # places of the points, which move on the surface
+    faces: Index  # (N,): surface triangles of the places
+    # (N, F): faces that an unknown place may enter across a crease, those that look at the cameras in
+    # the first images of the point; none for stated places.
+    enterable: NDArray[np.bool_]
     # (S, 3, 3) and (S, 3): pose of the camera at each image, from its frame to the world.
     rotations: Array
     translations: Array
@@ -206,18 +217,19 @@ class TrackedPlaces(Correspondences):
     # (p,): their values with which the first image fits best, in prior standard deviations.
     start_pose: Array = field(default_factory=lambda: np.zeros(0))
     obstacles: Sequence[Obstacle] = ()  # obstacles, which may hide points
+    crossings: Index | int = 0  # (N,): how many creases each place has crossed
 
     @classmethod
     def from_shapes(
         cls,
         experiment: Experiment,
         tracks: ImageTracks,
-        shape_at: ShapeAt,
+        shapes_at: ShapesAt,
         coordinate_parameters: Index,
         pose_parameters: Index,
     ) -> TrackedPlaces:
         """Find places and pose with the shapes of the body, see `find_places`."""
-        poses, mirrored, places_m = find_places(experiment, shape_at)
+        poses, mirrored, places_m = find_places(experiment, shapes_at)
         body = experiment.body
         places = np.array([places_m[name] for name in tracks.names])
         is_placed = np.asarray(np.isfinite(places).all(axis=1))
@@ -225,10 +237,14 @@ class TrackedPlaces(Correspondences):
         sigmas = np.where(is_placed, tracks.place_sigmas_m(experiment), 0.0)
         camera = replace(tracks.camera, pose=poses[tracks.name])
         rotations, translations = camera.pose_at(tracks.sample_times_s)
-        shapes = np.array([shape_at(float(t)) for t in tracks.sample_times_s])
+        shapes = shapes_at(tracks.sample_times_s)
+        enterable = _enterable_faces(experiment, tracks.names, poses, shapes_at)
+        faces = _nearest_faces(body, places, enterable)
         correspondences = cls(
             tracks,
-            surface_association(body, places, sigmas),
+            surface_association(body, places, sigmas, faces),
+            faces,
+            enterable,
             rotations,
             translations,
             is_placed,
@@ -277,31 +293,22 @@ class TrackedPlaces(Correspondences):
     # Visibility -------------------------------------------------------------------------------
 
     @cached_property
-    def _faces(self) -> tuple[Index, Array]:
-        """Surface triangles (N,) of the places at the centre of the association, and barycentric
-        coordinates (N, 3) in them.
-        """
-        body = self.association.body
-        corners = body.nodes_m[body.mesh.surface]
-        ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        normals = cross(ab, ac)
-        squares = np.einsum("fi,fi->f", normals, normals)
-        faces, shares = [], []
-        for place in self.association.centre_places_m:
-            away = place - corners[:, 0]
-            in_c = np.einsum("fi,fi->f", cross(ab, away), normals) / squares
-            in_b = np.einsum("fi,fi->f", cross(away, ac), normals) / squares
-            off = np.einsum("fi,fi->f", away, normals) / np.sqrt(squares)
-            least = np.minimum(np.minimum(in_b, in_c), 1 - in_b - in_c)
-            face = int(np.argmin(np.abs(off) / np.sqrt(np.sqrt(squares)) - np.minimum(least, 0.0)))
-            share = np.clip([1 - in_b[face] - in_c[face], in_b[face], in_c[face]], 0.0, None)
-            faces.append(face)
-            shares.append(share / share.sum())
-        return np.array(faces, dtype=np.int64), np.array(shares)
+    def _shares(self) -> Array:
+        """Barycentric coordinates (N, 3) in the faces of the places at the centre of the association."""
+        corners = self._corners[self.faces]
+        shares = _barycentric(self.association.centre_places_m, corners).clip(0.0)
+        return shares / shares.sum(axis=1, keepdims=True)
 
-    def with_visibility(self, shapes_m: Array) -> TrackedPlaces:
+    @cached_property
+    def _corners(self) -> Array:
+        """Corners (F, 3, 3) of the surface triangles of the undeformed body [m]."""
+        body = self.association.body
+        return body.nodes_m[body.mesh.surface]
+
+    def with_visibility(self, shapes_m: Array, *, is_settled: bool = True) -> TrackedPlaces:
         """Return the correspondences with the points that are visible in the first s shapes (s, n,
-        3) [m]; self if hardly any sample changes, so that the loss does not jump for ever.
+        3) [m]; self if `is_settled` and hardly any sample changes, so that the loss does not jump
+        for ever.
 
         A point is hidden if its face looks away from the camera, or if another part of the body or
         an obstacle is in front of it.
@@ -310,28 +317,24 @@ class TrackedPlaces(Correspondences):
         if not count:
             return self
         body = self.association.body
-        surface = body.mesh.surface
-        faces, shares = self._faces
-        corners = shapes_m[:, surface[faces]]
-        points = np.einsum("nc,snci->sni", shares, corners)
-        normals = cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
-        to_eye = self.translations[:count, None] - points
-        to_eye /= np.maximum(np.linalg.norm(to_eye, axis=2, keepdims=True), 1e-30)
-        cosines = np.einsum("sni,sni->sn", normals, to_eye)
+        triangles = shapes_m[:, body.mesh.surface]
+        corners = triangles[:, self.faces]
+        points = np.einsum("nc,snci->sni", self._shares, corners)
+        eyes = self.translations[:count]
+        cosines = _facing(corners, points, eyes[:, None])
         before = self.is_visible[:count]
         visible = np.where(before, cosines > TURNS_HIDDEN, cosines > TURNS_VISIBLE)
         margin_m = OCCLUSION_EDGES * self._mean_edge_m
-        for k in range(count):
-            candidates = np.flatnonzero(visible[k] & self.tracks.is_seen[k] & self.is_placed)
-            eyes = np.tile(self.translations[k], (len(candidates), 1))
-            triangles = shapes_m[k][surface]
-            hidden = is_occluded(points[k, candidates], eyes, triangles, margin_m)
+        used = np.flatnonzero((visible & self.tracks.is_seen[:count]).any(axis=0) & self.is_placed)
+        hidden = is_occluded(points[:, used], eyes, triangles, margin_m)
+        for k in range(count if self.obstacles else 0):
+            eye = np.tile(eyes[k], (len(used), 1))
             for obstacle in self.obstacles:
                 distance = obstacle_distance(obstacle, body, shapes_m[k])
-                hidden |= is_behind(points[k, candidates], eyes, distance, margin_m)
-            visible[k, candidates[hidden]] = False
-        if np.sum(visible != before) <= SETTLED * np.sum(before & self.tracks.is_seen[:count]):
+                hidden[k] |= is_behind(points[k, used], eye, distance, margin_m)
+        visible[:, used] &= ~hidden
+        changes = np.sum(visible != before)
+        if is_settled and changes <= SETTLED * np.sum(before & self.tracks.is_seen[:count]):
             return self
         return replace(self, is_visible=np.concatenate([visible, self.is_visible[count:]]))
 
@@ -376,55 +379,134 @@ class TrackedPlaces(Correspondences):
     @cached_property
     def _corner_weights(self) -> tuple[Index, Array]:
         """Corners (N, 3) of the faces of the places, and their weights (N, 3)."""
-        faces, shares = self._faces
-        return self.association.body.mesh.surface[faces], shares
+        return self.association.body.mesh.surface[self.faces], self._shares
 
     def followed(self, phi: Array, shapes_m: Array) -> TrackedPlaces:
         """Return the correspondences at other estimates φ (k,) with the first s shapes (s, n, 3)
         [m]; self if nothing has changed.
         """
-        association = self._followed_association(self.places_m(phi))
-        other = self
-        if association is not self.association:
-            other = replace(self, association=association)
-        return other.with_visibility(shapes_m)
+        other = self._with_faces_of(self.places_m(phi))
+        return other.with_visibility(shapes_m, is_settled=other is self)
 
-    def _followed_association(self, points_m: Array) -> MarkerAssociation:
-        """Return the association with places at points (N, 3) [m] in the planes of their faces; the
-        present one if each is on its face, or beyond a crease.
+    def _with_faces_of(self, points_m: Array) -> TrackedPlaces:
+        """Return the correspondences with places at points (N, 3) [m] in the planes of their faces;
+        self if each is on its face, or cannot leave it.
         """
         association = self.association
-        body = association.body
-        corners = body.nodes_m[body.mesh.surface]
+        corners = self._corners
+        least = _barycentric(points_m, corners[self.faces]).min(axis=1)
+        estimated = np.isin(np.arange(len(points_m)), association.estimated)
         normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        faces, _ = self._faces
-        centres = association.centre_places_m.copy()
-        axes = association.axes.copy()
-        cells = association.cells.copy()
-        has_left = False
-        for m in association.estimated:
-            point = points_m[m]
-            smooth = np.flatnonzero(normals @ normals[faces[m]] > SMOOTH)
-            nearest = nearest_points_of_triangles(point, corners[smooth])
+        centres = np.where(estimated[:, None], points_m, association.centre_places_m)
+        faces = self.faces.copy()
+        crossings = np.broadcast_to(self.crossings, faces.shape).copy()
+        near_m = SAME_FACE * self._mean_edge_m
+        for m in np.flatnonzero(estimated & (least < 0)).tolist():
+            point, own = points_m[m], int(faces[m])
+            nearest = nearest_points_of_triangles(point, corners)
             away = np.linalg.norm(nearest - point, axis=1)
-            k = int(away.argmin())
-            own = int(np.flatnonzero(smooth == faces[m])[0])
-            if away[own] <= away[k] + SAME_FACE * self._mean_edge_m:
-                centres[m] = point
-                continue
-            face = int(smooth[k])
-            off = nearest[k] - point
-            # Beyond the end of the smooth part, the place stays in the plane of its last face.
-            along = off - normals[face] * (off @ normals[face])
-            centres[m] = nearest[k] - along
-            sides = corners[face, 1:] - corners[face, 0]
-            axes[m] = np.linalg.qr(sides.T)[0]
-            cells[m] = body.mesh.surface_cells[face]
-            has_left = True
-        if not has_left:
-            return association
-        return replace(association, centre_places_m=centres, axes=axes, cells=cells)
+            is_smooth = normals @ normals[own] > SMOOTH
+            face = int(np.where(is_smooth, away, np.inf).argmin())
+            if away[face] > near_m:
+                beside = self.enterable[m] & ~is_smooth & (crossings[m] < MOST_CREASES)
+                beside &= np.linalg.norm(nearest - nearest[face], axis=1) < near_m
+                if beside.any():
+                    faces[m] = int(beside.argmax())
+                    centres[m] = nearest[faces[m]]
+                    crossings[m] += 1
+                    continue
+            if away[own] > away[face] + near_m:
+                faces[m] = face
+                off = nearest[face] - point
+                # Beyond the end of the smooth part, the place stays in the plane of its last face.
+                along = off - normals[face] * (off @ normals[face])
+                centres[m] = nearest[face] - along
+        if (faces == self.faces).all():
+            return self
+        moved = _on_faces(association, centres, faces, np.flatnonzero(faces != self.faces))
+        return replace(self, association=moved, faces=faces, crossings=crossings)
+
+
+def _barycentric(points_m: Array, corners: Array) -> Array:
+    """Return the barycentric coordinates (..., 3) of points (..., 3) in the planes of triangles
+    (..., 3, 3).
+    """
+    ab, ac = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    away = points_m - corners[..., 0, :]
+    normals = cross(ab, ac)
+    squares = np.einsum("...i,...i->...", normals, normals)
+    in_c = np.einsum("...i,...i->...", cross(ab, away), normals) / squares
+    in_b = np.einsum("...i,...i->...", cross(away, ac), normals) / squares
+    return np.stack([1 - in_b - in_c, in_b, in_c], axis=-1)
+
+
+def _facing(corners: Array, points_m: Array, eyes_m: Array) -> Array:
+    """Return the cosines (...) between the normals of triangles (..., 3, 3) and the directions from
+    points (..., 3) on them to eyes (..., 3).
+    """
+    normals = cross(
+        corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    )
+    to_eye = eyes_m - points_m
+    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(to_eye, axis=-1)
+    return np.einsum("...i,...i->...", normals, to_eye) / np.maximum(lengths, 1e-30)
+
+
+def _enterable_faces(
+    experiment: Experiment, names: Sequence[str], poses: Mapping[str, Array], shapes_at: ShapesAt
+) -> NDArray[np.bool_]:
+    """Return the faces (N, F) that look at every camera in its first image of each point; none for
+    points with a stated place.
+    """
+    surface = experiment.body.mesh.surface
+    stated = stated_places(experiment)
+    faces = np.array([np.full(len(surface), name not in stated) for name in names])
+    for tracks in experiment.readings:
+        if not isinstance(tracks, ImageTracks) or tracks.pixels is None:
+            continue
+        camera = replace(tracks.camera, pose=poses[tracks.name])
+        firsts = dict(zip(tracks.names, tracks.is_seen.argmax(axis=0).tolist(), strict=True))
+        samples = sorted({firsts[name] for name in names if name in firsts})
+        t_s = tracks.sample_times_s[samples]
+        corners = shapes_at(t_s)[:, surface]
+        eyes = camera.pose_at(t_s)[1]
+        look = _facing(corners, corners.mean(axis=2), eyes[:, None]) > 0
+        for k, name in enumerate(names):
+            if name in firsts:
+                faces[k] &= look[samples.index(firsts[name])]
+    return faces
+
+
+def _nearest_faces(body: Body, places_m: Array, enterable: NDArray[np.bool_]) -> Index:
+    """Return the surface triangle (N,) of each place (N, 3); of those that meet there, one that
+    looks at the cameras.
+    """
+    corners = body.nodes_m[body.mesh.surface]
+    near_m = SAME_FACE * float(body.mesh.quality().edge_mean_m)
+    faces = []
+    for place, may_enter in zip(places_m, enterable, strict=True):
+        away = np.linalg.norm(nearest_points_of_triangles(place, corners) - place, axis=1)
+        is_near = away <= away.min() + near_m
+        faces.append(
+            int((is_near & may_enter if (is_near & may_enter).any() else is_near).argmax())
+        )
+    return np.array(faces, dtype=np.int64)
+
+
+def _on_faces(
+    association: MarkerAssociation, centres_m: Array, faces: Index, moved: Index
+) -> MarkerAssociation:
+    """Return the association centred at places (N, 3) [m], with the planes and elements of the faces
+    (N,) for the places with the indices `moved`.
+    """
+    mesh = association.body.mesh
+    corners = association.body.nodes_m[mesh.surface[faces]]
+    axes, cells = association.axes.copy(), association.cells.copy()
+    for m in moved:
+        axes[m] = np.linalg.qr((corners[m, 1:] - corners[m, 0]).T)[0]
+        cells[m] = mesh.surface_cells[faces[m]]
+    return replace(association, centre_places_m=centres_m, axes=axes, cells=cells)
 
 
 def obstacle_distance(obstacle: Obstacle, body: Body, nodes_m: Array) -> Callable[[Array], Array]:
@@ -438,9 +520,11 @@ def obstacle_distance(obstacle: Obstacle, body: Body, nodes_m: Array) -> Callabl
     return lambda points_m: distances_m((points_m - origin) @ axes + body.frame_nodes_m[0])
 
 
-def surface_association(body: Body, places_m: Array, sigmas_m: Array) -> MarkerAssociation:
-    """Return the association of points whose places (N, 3) [m] move on the surface with prior
-    standard deviations (N,) [m], zero for exact ones.
+def surface_association(
+    body: Body, places_m: Array, sigmas_m: Array, faces: Index
+) -> MarkerAssociation:
+    """Return the association of points whose places (N, 3) [m] move on the surface, from their faces
+    (N,), with prior standard deviations (N,) [m], zero for exact ones.
     """
     located = LocatedBody(body.nodes_m, body)
     attached: Sequence[tuple[Index, Array]] = [
@@ -461,4 +545,8 @@ def surface_association(body: Body, places_m: Array, sigmas_m: Array) -> MarkerA
         crossed_edges=np.full((count, 2, 3), np.nan),
         crossing_counts=none,
     )
-    return association.centred_at(places_m)
+    on_faces = [
+        nearest_points_of_triangles(place, body.nodes_m[body.mesh.surface[[face]]])[0]
+        for place, face in zip(places_m, faces, strict=True)
+    ]
+    return _on_faces(association, np.array(on_faces), faces, association.estimated)

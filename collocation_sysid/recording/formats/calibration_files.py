@@ -4,6 +4,7 @@
 |---|---|---|
 | OpenCV | YAML with `%YAML:1.0`, JSON | `camera_matrix`, `distortion_coefficients`, `image_width` |
 | ROS `camera_info` | YAML | `camera_matrix`, `distortion_model`; messages `k`, `d`, `width` |
+| a log | `LOG#TOPIC` | messages `k`, `d`, `width` of CameraInfo or Foxglove's CameraCalibration |
 | Kalibr | YAML | `cam0`: `intrinsics`, `distortion_model`, `resolution` |
 | Anipose | TOML | `[cam_0]`: `name`, `matrix`, `distortions`, `rotation`, `translation` |
 | COLMAP | text `cameras.txt` | `CAMERA_ID MODEL WIDTH HEIGHT PARAMS` |
@@ -28,8 +29,10 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...common.files import DAMAGE, require_size
-from ...errors import InputError, listed
+from ...errors import InputError, listed, located
 from ..camera import Lens
+from .camera_messages import is_camera_model, message_field
+from .logs import TopicAddress, open_log, require_topic
 
 # Largest size of a file [bytes]: far more than the cameras of a laboratory need.
 LARGEST_BYTES = 1_000_000
@@ -104,6 +107,8 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
         cameras and none is chosen. The message names file and key.
     """
     file = Path(path)
+    if (address := TopicAddress.from_path(path)) is not None:
+        return _camera_of_topic(address, file)
     require_size(file, LARGEST_BYTES)
     try:
         text = file.read_text(encoding="utf-8")
@@ -122,6 +127,23 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
     names = listed([c.name or str(k) for k, c in enumerate(cameras)])
     found = "several cameras" if camera is None else f"no camera {camera!r}"
     raise InputError(f"found {found}; expected the name of one of {names}", where=str(file))
+
+
+def _camera_of_topic(address: TopicAddress, file: Path) -> Calibration:
+    """Return the camera of the first message of a topic."""
+    with located(where=str(file)), open_log(address.log, address.episode) as log:
+        require_topic(log, address.topic)
+        message = next((each for _, each in log.messages(address.topic)), None)
+        if not is_camera_model(message):
+            raise InputError(
+                f"the topic {address.topic} has no camera model; expected messages with k, d, width "
+                "and height, such as CameraInfo"
+            )
+        names = ("k", "d", "distortion_model", "width", "height")
+        content = {name: message_field(message, name) for name in names}
+    for name in ("k", "d"):
+        content[name] = np.asarray(content[name], dtype=float).tolist()
+    return _opencv_camera(content, file)
 
 
 def _cameras_of(text: str, file: Path) -> list[Calibration]:

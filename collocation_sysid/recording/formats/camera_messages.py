@@ -46,7 +46,7 @@ def use_of_camera_message(message: Any) -> str:
     if kind := camera_data_kind(message):
         return f"{kind}: [[experiment.depth]]"
     if is_camera_model(message):
-        return "matrix of the camera, for depth images in the same namespace"
+        return "calibration of a camera; its matrix is used for depth images in the same namespace"
     return ""
 
 
@@ -55,7 +55,8 @@ def is_camera_model(message: Any) -> bool:
     None.
     """
     return (
-        all(_field(message, name) is not None for name in "kpd") and len(_field(message, "k")) == 9
+        all(message_field(message, name) is not None for name in "kpd")
+        and len(message_field(message, "k")) == 9
     )
 
 
@@ -87,10 +88,10 @@ def camera_matrix(message: Any, rectified: bool, shape: tuple[int, int]) -> Arra
             f"{shape[0]} pixels; expected a camera info for complete images of this size: state "
             "camera.matrix instead"
         )
-    projection = np.asarray(_field(message, "p"), dtype=float)
+    projection = np.asarray(message_field(message, "p"), dtype=float)
     if rectified and projection.size == 12 and projection.any():
         return projection.reshape(3, 4)[:, :3]
-    return np.asarray(_field(message, "k"), dtype=float).reshape(3, 3)
+    return np.asarray(message_field(message, "k"), dtype=float).reshape(3, 3)
 
 
 def distortion_coefficients(message: Any, rectified: bool) -> Array:
@@ -102,7 +103,7 @@ def distortion_coefficients(message: Any, rectified: bool) -> Array:
     InputError
         If the lens model is not that of Brown and Conrady with at most eight coefficients.
     """
-    coefficients = np.asarray(_field(message, "d"), dtype=float)
+    coefficients = np.asarray(message_field(message, "d"), dtype=float)
     if rectified or not coefficients.any():
         return np.zeros(0)
     kind = getattr(message, "distortion_model", "plumb_bob")
@@ -116,7 +117,7 @@ def distortion_coefficients(message: Any, rectified: bool) -> Array:
     return coefficients
 
 
-def _field(message: Any, name: str) -> Any:
+def message_field(message: Any, name: str) -> Any:
     """Return a field of a message, None without it; ROS 1 and Foxglove use capitals for ROS 2's
     names.
     """

@@ -41,7 +41,29 @@ _NUMBER_FIELDS = {
     "data": "data",
     "value": "value",
 }
-_LISTS = ("transforms", "markers", "poses", "points", "objects", "rigidbodies")
+_LISTS = (
+    "transforms",
+    "markers",
+    "poses",
+    "points",
+    "objects",
+    "rigidbodies",
+    "detections",
+    "tracks",
+)
+# Where items of a list hold a pixel, and how sure the tracker is of it; "" is the item itself.
+_PIXELS = (
+    "pixel",
+    "centre",
+    "center",
+    "bbox.center.position",
+    "bbox.center",
+    "position",
+    "point",
+    "",
+)
+_LIKELIHOODS = ("likelihood", "confidence", "score", "visibility")
+PIXEL_COLUMNS = ("u", "v", "likelihood")
 # Largest difference of stamp and recording time on one clock [ns], a day: otherwise the stamp is of
 # another clock, such as a simulation's.
 SAME_CLOCK_NS = 86_400 * 10**9
@@ -239,6 +261,9 @@ def _possible_uses(columns: set[str], message: Any) -> str:
         return "wrench of a grasp, force of an obstacle"
     if hasattr(message, "name") and hasattr(message, "position"):
         return "positions of joints; poses with the robot's URDF"
+    if all(column.rpartition("_")[2] in PIXEL_COLUMNS for column in columns):
+        tracked = sorted({column.rpartition("_")[0] for column in columns})
+        return "image tracks: " + ", ".join(tracked)
     if all(column[-2:] in ("_x", "_y", "_z") for column in columns):
         markers = sorted({column[:-2] for column in columns})
         spaces = groupby(markers, key=lambda marker: marker.rpartition("/")[0])
@@ -323,6 +348,8 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
     points = _points_of_message(message, by_namespace=by_namespace)
     if points:
         return {f"{name}_{axis}": p[k] for name, p in points.items() for k, axis in enumerate(AXES)}
+    if pixels := _pixels_of_message(message, by_namespace=by_namespace):
+        return pixels
     for name, column in _NUMBER_FIELDS.items():
         if isinstance(value := nested_field(message, name), (int, float)):
             return {column: float(value)}
@@ -354,6 +381,35 @@ def _points_of_message(message: Any, *, by_namespace: bool) -> dict[str, tuple[f
         _item_name(item, k, by_namespace=by_namespace): _position_of_item(item) for k, item in items
     }
     return {key: place for key, place in places.items() if place is not None}
+
+
+def _pixels_of_message(message: Any, *, by_namespace: bool) -> Row:
+    """Return the pixels of the items of the first list, and how sure the tracker is of them, by
+    column; empty if they have none.
+    """
+    row: Row = {}
+    for k, item in enumerate(first_list(message)):
+        places = (nested_field(item, path) if path else item for path in _PIXELS)
+        pixel = next((found for each in places if (found := _pixel(each)) is not None), None)
+        if pixel is None:
+            continue
+        name = _item_name(item, k, by_namespace=by_namespace)
+        row |= {f"{name}_u": pixel[0], f"{name}_v": pixel[1]}
+        results = nested_field(item, "results")
+        held = [item, *(results if results is not None else ())]
+        held += [nested_field(each, "hypothesis") for each in held[1:]]
+        found = (getattr(each, key, None) for each in held for key in _LIKELIHOODS)
+        if (likelihood := next((each for each in found if each is not None), None)) is not None:
+            row[f"{name}_likelihood"] = float(likelihood)
+    return row
+
+
+def _pixel(value: Any) -> tuple[float, float] | None:
+    """Return the fields u and v of a value, or x and y of one without z; None without."""
+    for axes in ("uv", "xy"):
+        if all(hasattr(value, axis) for axis in axes) and not hasattr(value, "z"):
+            return float(getattr(value, axes[0])), float(getattr(value, axes[1]))
+    return None
 
 
 def point_of_message(message: Any) -> tuple[float, ...] | None:
