@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .extras import live
     from .extras.design.hand_limits import Limits
     from .extras.planning.motion_plan import MotionPlan, plan_motion
+    from .extras.planning.plan_folder import write_plan
     from .extras.planning.task import Task
     from .extras.studies.model_comparison import ModelComparison, compare_models
     from .features.image_tracks.tracks import ImageTracks, PoseSigma
@@ -183,6 +184,7 @@ __all__ = [
     "with_markers",
     "with_readings",
     "with_wrenches",
+    "write_plan",
 ]
 
 

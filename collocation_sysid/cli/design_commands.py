@@ -122,8 +122,9 @@ def plan(
     ],
     task: Annotated[Path, typer.Argument(metavar="TASK.toml", help="The task file.")],
     limits: Annotated[
-        Path, option("TOML file with the limits of the robot, as of design.", "FILE")
-    ],
+        Path | None,
+        option("TOML file with the limits of the robot, as of design; if the hand moves.", "FILE"),
+    ] = None,
     solver: Annotated[
         Literal["reduced-space", "interior-point"],
         option(
@@ -157,7 +158,7 @@ def plan(
             f"found {rate:g}; expected a number of hertz above 0", None, where="--rate"
         )
     folder = out or Path("runs") / f"{run_name(source)}-plan"
-    followed, allowed = Task.read(task), Limits.read(limits)
+    followed, allowed = Task.read(task), None if limits is None else Limits.read(limits)
     require_possible(folder)
     require_replaceable(folder, marker_file=PLAN_FILE, content_word="plan")
     with SolveProgress(error_console, quiet=output.quiet, activity="preparing") as progress:
@@ -180,7 +181,8 @@ def plan(
                 raise
             of_limits = error.where in Limits.model_fields
             of_options = (error.where or "").startswith("--")
-            raise (error if of_options else error.located(limits if of_limits else task)) from error
+            file = limits if of_limits and limits is not None else task
+            raise (error if of_options else error.located(file)) from error
         write_plan(
             answer, folder, rate_hz=rate, with_film=film, with_mcap=mcap, say=progress.announce
         )
@@ -188,5 +190,6 @@ def plan(
     if answer.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
     exceeds = answer.exceeds_error or answer.exceeds_body_limits
+    exceeds = exceeds or answer.fine.branch_change is not None
     if answer.answer.status not in ("converged", "flat") or exceeds:
         raise typer.Exit(EXIT_NOT_CONVERGED)

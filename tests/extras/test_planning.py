@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.design.hand_limits import Limits
-from collocation_sysid.extras.planning import durations, reduced_solver
+from collocation_sysid.extras.planning import durations, motion_plan, reduced_solver
 from collocation_sysid.extras.planning.full_program import (
     FullProgram,
     iteration_monitor,
@@ -36,10 +37,16 @@ from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
 from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced
 from collocation_sysid.extras.planning.spline_motion import rotation_expression
-from collocation_sysid.extras.planning.task import AvoidSection, Task, sampled_references
+from collocation_sysid.extras.planning.task import (
+    AvoidSection,
+    EndSection,
+    Task,
+    sampled_references,
+)
 from collocation_sysid.extras.planning.trajectory_log import write_trajectory_mcap
 from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.recording.pose_files import read_poses
+from collocation_sysid.recording.time_tables import read_pressure
 
 LIMITS = Limits.model_validate(
     {
@@ -53,6 +60,7 @@ LIMITS = Limits.model_validate(
 )
 TRUTH = {"young_pa": 2e4, "poisson": 0.4, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}
 TIGHT = ReducedTolerances(progress=0.0)
+PROBLEMS = Path(__file__).parents[2] / "problems"
 
 
 @cache
@@ -468,7 +476,7 @@ WALL = cs.Obstacle(shape=cs.Plane((-1.0, 0.0, 0.0), (0.074, 0.0, 0.0)), name="wa
 
 
 def test_derivatives_of_limits_of_the_body_are_their_differences():
-    wanted = task(avoid={"largest_stretch": 1.02, "clearance_m": 0.06},
+    wanted = task(avoid={"largest_stretch": 1.05, "clearance_m": 0.05},
                   hand={"intervals": 8, "free": SIX_AXES})  # fmt: skip
     planned = PlannedProgram.from_task(PlannedBody.read(hung_bar(WALL)), wanted, LIMITS)
     limits = planned.body_limits
@@ -514,6 +522,87 @@ def test_the_body_keeps_its_limits(avoid, obstacles):
     assert kept.answer.status in ("converged", "flat")
     assert kept.answer.history[-1] > free.answer.history[-1]
     assert kept.tracking_error(kept.program.references[0]).largest_m < 4e-3
+
+
+@pytest.mark.parametrize(
+    ("avoid", "message"),
+    [
+        ({"clearance_m": 0.06}, r"avoid.clearance_m: found 0.06, but it is 0.05\d+ before .*below"),
+        (
+            {"largest_stretch": 1.01},
+            r"largest_stretch: found 1.01, but it is 1.0\d+ before .*above",
+        ),
+    ],
+)
+def test_limits_that_the_body_exceeds_before_the_motion_are_refused(avoid, message):
+    with pytest.raises(InputError, match=message):
+        PlannedProgram.from_task(PlannedBody.read(hung_bar(WALL)), task(avoid=avoid), LIMITS)
+
+
+# Contact ------------------------------------------------------------------------------------------
+
+
+def rod(gap_m: float) -> cs.Obstacle:
+    """A rod along y beside the lower end of the bar."""
+    x_m = 0.04 + gap_m
+    ends_m = [(x_m, -0.05, 0.02), (x_m, 0.07, 0.02)]
+    return cs.Obstacle(shape=cs.Capsule(0.02, ends_m), name="rod")
+
+
+def pressed(program: PlannedProgram, way_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Unknowns of a hand that moves along x, and the motion of the body that they cause."""
+    matrix, constant = program.space.affine(program.grid_since_s)
+    share = np.clip(program.grid_since_s / program.task.duration_s, 0, 1)
+    wanted = np.zeros(constant.shape)
+    wanted[:, 0] = way_m * share**3 * (10 - 15 * share + 6 * share**2)
+    columns = matrix.reshape(-1, program.space.size)
+    c = np.linalg.lstsq(columns, (wanted - constant).ravel(), rcond=None)[0]
+    return c, program.simulate(c)
+
+
+@pytest.mark.long
+def test_derivatives_of_a_motion_in_contact_are_differences():
+    planned = PlannedProgram.from_task(
+        PlannedBody.read(hung_bar(rod(0.005))),
+        task(hand={"intervals": 8}, duration_s=0.3, reference=[{"point": "tip", "hold": True}]),
+        LIMITS,
+    )
+    c, x = pressed(planned, 0.03)
+    free = PlannedProgram.from_task(PlannedBody.read(hung_bar()), planned.task, LIMITS)
+    tip = planned.point_weights("tip")
+    without = free.simulate(c) @ free.point_weights("tip").T
+    assert np.abs(x @ tip.T - without).max() > 0.005  # it is in contact
+    way, h = np.random.default_rng(0).normal(size=len(c)), 1e-5
+    found = planned.driven.respond(planned.drive(c), x) @ way
+    ends = [planned.simulate(c + sign * h * way) for sign in (1, -1)]
+    differences = (ends[0] - ends[1]) @ tip.T / (2 * h)
+    assert np.abs(found @ tip.T - differences).max() < 1e-3 * np.abs(differences).max()
+
+
+@pytest.mark.long
+def test_a_body_is_planned_in_contact():
+    """The tip of a bar that a hand presses slowly on a rod, which it touches already, is the
+    reference.
+    """
+    (moving,) = hung_bar(rod(-0.003)).experiments
+    t_s = np.zeros(1)
+    markers = replace(moving.markers, t_s=t_s, positions_m=moving.markers.positions_m[:1])
+    still = replace(moving, kind="static", t_s=t_s, markers=markers)
+    problem = cs.Problem([still], hung_bar().parameters)
+    changes = {"duration_s": 1.0, "sample_s": 0.05, "hand": {"intervals": 8, "free": ["x"]}}
+    held = task(**changes, reference=[{"point": "tip", "hold": True}])
+    twin = PlannedProgram.from_task(PlannedBody.read(problem), held, LIMITS)
+    c, x = pressed(twin, 0.01)
+    places = x @ twin.point_weights("tip").toarray().T
+    hand_m = twin.coordinates(c, twin.grid_since_s)[:, 0]
+    assert np.ptp(places[:, 0]) < hand_m[-1] - 0.004  # the rod holds the tip back
+    reference = {"point": "tip", "t_s": twin.grid_since_s.tolist(), "sigma_m": 1e-4,
+                 "position_m": [tuple(each) for each in places.tolist()]}  # fmt: skip
+    plan = plan_motion(problem, task(**changes, reference=[reference]), LIMITS)
+    assert plan.answer.status in ("converged", "flat")
+    assert plan.largest_error_m < 1e-4
+    planned_m = plan.motion.derivatives(twin.grid_since_s).value[:, 0]
+    assert planned_m == pytest.approx(hand_m, abs=5e-4)
 
 
 # The full program ---------------------------------------------------------------------------------
@@ -564,6 +653,27 @@ def require_exact_derivatives(full: FullProgram, c: np.ndarray, x: np.ndarray) -
     for part in (slice(full.position_count), slice(full.position_count, None)):
         error = np.abs(product - differences)[part].max()
         assert error < 1e-6 * np.abs(differences[part]).max()
+
+
+@pytest.mark.parametrize(
+    ("prony", "avoid", "message"),
+    [
+        ((), {"largest_stretch": 2.0}, r"cannot plan this: the task has \[avoid\]"),
+        (("slow",), {}, "has memory, whose history variables"),
+    ],
+)
+def test_what_interior_point_cannot_plan_is_refused_before_the_search(
+    monkeypatch, prony, avoid, message
+):
+    monkeypatch.setattr(motion_plan, "solve_reduced", None)  # it must not be reached
+    (hung,) = hung_bar().experiments
+    body = cs.Body(hung.body.mesh, density_kg_m3=800.0, prony=prony)
+    constants = TRUTH | ({"slow.share": 0.3, "slow.tau_s": 0.5} if prony else {})
+    problem = cs.Problem(
+        [replace(hung, body=body)], {n: cs.Unknown(v) for n, v in constants.items()}, substeps=1
+    )
+    with pytest.raises(InputError, match=message):
+        plan_motion(problem, task(avoid=avoid), LIMITS, solver="interior-point")
 
 
 @pytest.mark.long
@@ -728,6 +838,113 @@ def test_tendons_and_pressures_keep_their_values_before_the_motion():
     standing = body.experiment(None, 0.02 * np.arange(50), TIP)
     assert standing.tendons[0].energy_amplitude_at(np.array([0.9])) == pytest.approx(0.35)
     assert standing.pressures[0].energy_amplitude_at(np.array([0.9])) == pytest.approx(270.0)
+
+
+# Equilibria ---------------------------------------------------------------------------------------
+
+
+@cache
+def still_bar() -> cs.Problem:
+    """The bar with cable and pressure, of whose equilibrium there is one sample."""
+    (moving,) = actuated_bar().experiments
+    t_s = np.zeros(1)
+    markers = replace(moving.markers, t_s=t_s, positions_m=moving.markers.positions_m[:1])
+    still = replace(moving, kind="static", t_s=t_s, markers=markers)
+    return cs.Problem([still], actuated_bar().parameters)
+
+
+EQUILIBRIA = {
+    "duration_s": 2.0,
+    "sample_s": None,
+    "hand": {"intervals": 8, "free": []},
+    "tendon": [CABLE["tendon"][0] | {"jerk_weight": 1e-6}],
+}
+
+
+@pytest.mark.long
+def test_a_recording_at_rest_is_planned_as_equilibria():
+    """The tip of equilibria with a known tension is the reference."""
+    body = PlannedBody.read(still_bar())
+    t_s = np.linspace(0.0, 2.0, 41)
+    share = t_s / 2.0
+    known_n = 0.05 + 0.5 * share**3 * (10 - 15 * share + 6 * share**2)
+    twin = body.experiment(None, t_s, TIP, {"cable": (t_s, known_n)})
+    places = cs.simulate(twin, TRUTH).markers_m[:, 0]
+    wanted = task(
+        **EQUILIBRIA,
+        reference=[{"point": "tip", "t_s": t_s.tolist(), "sigma_m": 1e-5,
+                    "position_m": [tuple(each) for each in places.tolist()]}],
+    )  # fmt: skip
+    plan = plan_motion(still_bar(), wanted, LIMITS)
+    assert plan.answer.status in ("converged", "flat")
+    assert len(plan.t_s) == 41
+    assert plan.commands(t_s)["cable"] == pytest.approx(known_n, abs=0.005)
+    assert plan.points_m["tip"] == pytest.approx(places, abs=2e-5)
+    assert plan.residual_vibration_m is None
+    assert plan.fine.branch_change is None
+    assert "each sample is an equilibrium" in "\n".join(map(str, plan_summary(plan, Path("out"))))
+    with pytest.raises(InputError, match="--limits: missing; expected the limits of the hand"):
+        plan_motion(still_bar(), task())
+    with pytest.raises(InputError, match=r"end.window_s: found 0.2, but the recording is static"):
+        plan_motion(
+            still_bar(), wanted.model_copy(update={"end": EndSection(window_s=0.2)}), LIMITS
+        )
+
+
+def test_derivatives_of_equilibria_are_differences():
+    reference = [{"point": "tip", "t_s": [1.0], "velocity_m_s": [(0.01, 0.0, 0.0)]}]
+    hand = {"intervals": 7, "free": ["x", "ry"]}
+    planned = PlannedProgram.from_task(
+        PlannedBody.read(still_bar()),
+        task(**EQUILIBRIA | CHAMBER | {"hand": hand, "sample_s": 0.2}, reference=reference),
+        LIMITS,
+    )
+    c = 0.05 * np.abs(np.random.default_rng(0).normal(size=planned.space.size))
+    x = planned.simulate(c)
+    way, h = np.random.default_rng(1).normal(size=len(c)), 1e-4
+    found = planned.driven.respond(planned.drive(c), x) @ way
+    differences = (planned.simulate(c + h * way) - planned.simulate(c - h * way)) / (2 * h)
+    assert np.abs(found - differences).max() < 1e-5 * np.abs(differences).max()
+    # A command without lag: the rate does not change the amplitude.
+    assert planned.signals[1].lag_s == 0.0
+    require_exact_derivatives(FullProgram(planned), c, x)
+
+
+def shipped(name: str, tmp_path: Path, markers: dict[str, list[str]], t_s: np.ndarray) -> Path:
+    """A copy of a shipped problem, with files in place of its recordings."""
+    folder = tmp_path / name
+    shutil.copytree(PROBLEMS / name, folder)
+    for file, names in markers.items():
+        write_markers_csv(folder / file, t_s, names, np.zeros((len(t_s), len(names), 3)))
+    return folder / "problem.toml"
+
+
+@pytest.mark.slow
+def test_a_pressure_moves_the_shipped_pneumatic_arm(tmp_path: Path):
+    tips = ["tip_1", "tip_2", "tip_3"]
+    files = {f"{pressure}mbar.csv": tips for pressure in (100, 150, 200, 300, 350)}
+    problem = shipped("pneumatic_arm", tmp_path, files, 0.01 * np.arange(121))
+    plan = plan_motion(problem, problem.parent / "task.toml", allow_code=True)
+    assert plan.answer.status in ("converged", "flat")
+    assert plan.largest_error_m < 1e-4
+    assert plan.residual_vibration_m < 2e-4
+    command = plan.commands(plan.t_s)["chamber"]
+    assert command.min() >= 0.0
+    assert 1e4 < command.max() < 3e4
+
+
+@pytest.mark.long
+def test_a_tendon_bends_the_shipped_tentacle(tmp_path: Path):
+    sticks = [f"M{k}" for k in range(1, 5)]
+    tensions = ("u01", "u015", "u02", "u025")
+    files = {f"m{k}_{each}_markers.csv": sticks for k in (1, 2) for each in tensions}
+    problem = shipped("soft_tentacle", tmp_path, files, np.zeros(1))
+    plan = plan_motion(problem, problem.parent / "task.toml")
+    assert plan.answer.status in ("converged", "flat")
+    assert plan.largest_error_m < 1e-5
+    command = plan.commands(plan.t_s)["tendon_1"]
+    assert command[0] == pytest.approx(3.077)
+    assert 4.5 < command[-1] < 6.0  # more tension bends it further
 
 
 # Reliability --------------------------------------------------------------------------------------
@@ -1157,6 +1374,29 @@ def test_the_trajectory_in_an_mcap_file_is_that_of_the_plan(tmp_path: Path):
         assert components(growth.linear) == pytest.approx(acceleration, abs=1e-3)
         rates = [(turns[j + 1] * turns[j].inv()).as_rotvec() / h for j in (0, 1)]
         assert components(growth.angular) == pytest.approx((rates[1] - rates[0]) / h, abs=1e-3)
+
+
+def test_tensions_and_pressures_are_in_the_mcap_file(tmp_path: Path):
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    planned = actuated(**SHORT, **CABLE, **CHAMBER, hand={"intervals": 7, "free": ["x"]},
+                       reference=[{"point": "tip", "hold": True}])  # fmt: skip
+    c = 0.05 * np.abs(np.random.default_rng(0).normal(size=planned.space.size))
+    plan = replace(bar_plan(), program=planned, answer=replace(bar_plan().answer, c=c))
+    t_s = np.linspace(0.0, 0.3, 16)
+    file = tmp_path / "plan.mcap"
+    write_trajectory_mcap(plan, file, t_s)
+    commands = plan.commands(t_s)
+    assert min(map(np.ptp, commands.values())) > 0
+    # A recorded pressure is read like this.
+    times, pressure = read_pressure(f"{file}#/command_chamber")
+    assert times - times[0] == pytest.approx(t_s, abs=1e-9)
+    assert pressure == pytest.approx(commands["chamber"])
+    with open(file, "rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = [each for *_, each in reader.iter_decoded_messages(topics=["/command_cable"])]
+    assert [each.data for each in found] == pytest.approx(commands["cable"])
 
 
 def components(vector) -> list[float]:

@@ -46,19 +46,13 @@ class FullProgram:
     Raises
     ------
     InputError
-        If the body or a force has history variables, or the body has limits.
+        See `require_full_program`.
     """
 
     def __init__(self, program: PlannedProgram) -> None:
         self.program = program
         self.driven = program.driven
-        if self.driven.collocation.has_eliminated_histories or program.body_limits is not None:
-            raise InputError(
-                "interior-point supports neither memory of a body or force, nor limits of [avoid]; "
-                "expected reduced-space",
-                None,
-                where="--solver",
-            )
+        require_full_program(program)
         self.transcription = self.driven.transcription
         self.length_m = self.transcription.length_m
         self.position_count = self.transcription.variable_count
@@ -269,6 +263,23 @@ class FullProgram:
         return ca.Function("limits", [data], [hessian]).map(len(self.program.hand_limits.t_s))
 
 
+def require_full_program(program: PlannedProgram) -> None:
+    """Raise an `InputError` if the body or a force has history variables, or the body has limits."""
+    reasons = {
+        "the body or a force has memory, whose history variables are no variables of its program":
+            program.driven.collocation.has_eliminated_histories,
+        "the task has [avoid], and principal stretches and distances have no second derivatives "
+        "where the largest or nearest one changes": program.body_limits is not None,
+    }  # fmt: skip
+    for reason, applies in reasons.items():
+        if applies:
+            raise InputError(
+                f"interior-point cannot plan this: {reason}; expected reduced-space",
+                None,
+                where="--solver",
+            )
+
+
 def solve_full(
     program: PlannedProgram, start: PlanAnswer, watch: Watch | None = None
 ) -> PlanAnswer:
@@ -286,7 +297,7 @@ def solve_full(
     Raises
     ------
     InputError
-        If the body or a force has history variables, or the body has limits.
+        See `require_full_program`.
     """
     full = FullProgram(program)
     errors: list[BaseException] = []

@@ -25,7 +25,7 @@ from ...runs.solved_problem import SolvedProblem
 from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
 from .durations import shortest, shortest_of_hand
-from .full_program import solve_full
+from .full_program import require_full_program, solve_full
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
 from .reduced_solver import (
@@ -44,6 +44,17 @@ Solver = Literal["reduced-space", "interior-point"]
 BINDING = 1 - 1e-4
 # Sources of the band beside those of a budget.
 DESCRIPTION, UNKNOWN = "description", "all sources"
+# Limits of a hand that does not move.
+STANDING = Limits.model_validate(
+    {
+        "workspace_m": ((-1e3,) * 3, (1e3,) * 3),
+        "speed_m_s": 1.0,
+        "acceleration_m_s2": 1.0,
+        "rotation_deg": 90.0,
+        "angular_speed_deg_s": 90.0,
+        "angular_acceleration_deg_s2": 90.0,
+    }
+)
 # Time steps of the simulation that checks a plan, for each of the plan's.
 FINER = 4
 
@@ -412,7 +423,7 @@ class MotionPlan:
 def plan_motion(
     source: str | Path | Problem | SolvedProblem,
     task: Task | str | Path,
-    limits: Limits | str | Path,
+    limits: Limits | str | Path | None = None,
     *,
     experiment: str | None = None,
     allow_code: bool = False,
@@ -433,8 +444,9 @@ def plan_motion(
         Run folder or run, whose estimates are used, or problem (file), whose guesses are used.
     task : Task or path
         What the points shall do; task.toml.
-    limits : Limits or path
-        What the hand may do; limits.toml, as of a designed motion.
+    limits : Limits or path, optional
+        What the hand may do; limits.toml, as of a designed motion. Only a hand that does not move,
+        ``free = []``, needs none.
     experiment : str, optional
         Name of the recording whose grasp, loads and surroundings the plan keeps; by default the
         first that moves.
@@ -468,8 +480,15 @@ def plan_motion(
     body = PlannedBody.read(source, experiment, allow_code=allow_code)
     if not isinstance(task, Task):
         task = Task.read(task)
+    if limits is None and task.hand.free:
+        raise InputError(
+            "missing; expected the limits of the hand, or free = [] in [hand] of the task, with which "
+            "only tendons and pressures act",
+            None,
+            where="--limits",
+        )
     if not isinstance(limits, Limits):
-        limits = Limits.read(limits)
+        limits = STANDING if limits is None else Limits.read(limits)
     if task.hand.joint_limits is not None and pose_limits is None:
         code = task.hand.joint_limits
         loader = CodeLoader(Path(), is_allowed=allow_code)
@@ -487,6 +506,8 @@ def plan_motion(
         say(f"searching for a motion of {duration_s:.3g} s")
         of_duration = task if duration_s == task.duration_s else task.stretched(duration_s)
         program = PlannedProgram.from_task(body, of_duration, limits, pose_limits)
+        if solver == "interior-point":
+            require_full_program(program)
         scenarios = program.scenarios() if robust else ()
         answer = solve_reduced(program, scenarios=scenarios, tolerances=tolerances, watch=watch)
         if robust:

@@ -170,7 +170,9 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         if limiting is None
         else {"name": limiting[0], "share": limiting[1]},
         "band_contributions": [each._asdict() for each in plan.band_contributions],
-        "limits": {
+        "limits": {}
+        if not program.task.hand.free
+        else {
             name: {"limit": getattr(program.limits, name), "share_used": float(share)}
             for name, share in plan.shares.items()
         },
@@ -298,7 +300,18 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
             "if this motion is recorded with the same markers, and identified from too, the band "
             f"becomes ± {1e3 * plan.half_width_after_recording_m:.3g} mm"
         )
-    shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")
+    if plan.fine.experiment.is_static:
+        shown.append("static: each sample is an equilibrium")
+    else:
+        shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")
+    if (change := plan.fine.branch_change) is not None:
+        shown.append(
+            Line(
+                f"the body does not reach the equilibrium at {change.time_s:.4g} s along a path of "
+                f"stable ones; expected a shorter sample_s, or a task with less load",
+                "check",
+            )
+        )
     shown += _limit_lines(plan)
     shown.append(f"written to {folder}")
     return shown

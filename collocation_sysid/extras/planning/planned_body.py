@@ -12,7 +12,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.files import RESULT_FILE, require_run_folder
-from ...errors import InputError, located
+from ...errors import InputError, hint_at, located
 from ...problem import Problem
 from ...recording import Experiment, Markers, Nuisance, Obstacle, PoseSequence
 from ...result.replay import damaged_run_refused
@@ -65,15 +65,16 @@ class PlannedBody:
         source : path, Problem or SolvedProblem
             Problem, whose guesses are used, or run, whose estimates are used.
         experiment : str, optional
-            Name of the recording whose grasp is planned; the first that moves by default.
+            Name of the recording whose grasp is planned; the first that is not static by default,
+            or the first.
         allow_code : bool
             Whether Python files that a problem file names may run.
 
         Raises
         ------
         InputError
-            For a damaged run, a parameter without a guess, an experiment that does not exist, is
-            static, or has no grasp that holds all axes throughout.
+            For a damaged run, a parameter without a guess, an experiment that does not exist, or
+            has no grasp that holds all axes throughout.
         """
         if isinstance(source, Problem):
             return cls._from_problem(source, experiment)
@@ -208,8 +209,15 @@ class PlannedBody:
             moved = poses if is_planned else _standing(grasp.poses, template.t_s)
             grasps.append(replace(grasp, poses=moved, wrench=None))
         changes: dict[str, Any] = {
-            "tendons": commanded(template.tendons, template.t_s[0], commands or {}),
-            "pressures": commanded(template.pressures, template.t_s[0], commands or {}),
+            **{
+                kind: commanded(
+                    getattr(template, kind),
+                    template.t_s[0],
+                    commands or {},
+                    is_static=template.is_static,
+                )
+                for kind in ("tendons", "pressures")
+            },
             "start_positions_m": None,
             "start_velocities_m_s": None,
             "start_velocity_m_s": None,
@@ -247,21 +255,20 @@ class PlannedBody:
 
 
 def _select(problem: Problem, experiments: Any, name: str | None) -> Experiment:
-    """Return the experiment with a name, or the first that is not static if `name` is None."""
-    moving = {each.name: each for each in experiments if not each.is_static}
-    if not moving:
-        raise InputError(
-            "every experiment is static; expected at least one that moves", problem.path
-        )
+    """Return the experiment with a name; if `name` is None, the first that is not static, or the
+    first.
+    """
+    known = {each.name: each for each in experiments}
     if name is None:
-        return next(iter(moving.values()))
-    if name not in moving:
+        return next((e for e in known.values() if not e.is_static), next(iter(known.values())))
+    if name not in known:
         raise InputError(
-            f"found {name!r}; expected one of the experiments that move: {', '.join(moving)}",
+            f"found {name!r}{hint_at(name, known)}; expected one of the experiments: "
+            f"{', '.join(known)}",
             problem.path,
             where="--experiment",
         )
-    return moving[name]
+    return known[name]
 
 
 def _is_held(grasp: Any) -> bool:
@@ -274,8 +281,6 @@ def _is_held(grasp: Any) -> bool:
 
 def _require_plannable(template: Experiment) -> None:
     """Raise an `InputError` if no grasp holds all axes throughout."""
-    if template.is_static:
-        raise InputError("the experiment is static; expected one that moves, to plan a motion for")
     if not any(_is_held(each) for each in template.grasps):
         raise InputError(
             "no grasp holds the body along all axes throughout; expected one, whose motion is "

@@ -11,6 +11,8 @@ is the mean kinetic energy in the window after the motion, in units of that of a
 amplitude σ_rest at the lowest natural frequency ω₁. The unit j₀ of the jerk is ten times the largest
 acceleration over the duration; for tensions and pressures it is the largest third derivative of the
 smoothest change over the whole range.
+
+For a static recording, each sample is an equilibrium, and the second term is omitted.
 """
 
 from __future__ import annotations
@@ -41,6 +43,8 @@ from .task import AXES, Reference, Task, point_names, point_places, sampled_refe
 
 # Fewest and largest numbers of samples of a plan.
 FEWEST_SAMPLES, MOST_SAMPLES = 10, 20_000
+# Samples of a motion of equilibria, where the task does not state the time between them.
+EQUILIBRIA = 40
 # Fewest samples of the window after the motion.
 FEWEST_AT_REST = 4
 # Jerk in units of the limit of the acceleration over the duration: that of a motion which changes
@@ -172,7 +176,8 @@ class PlannedProgram:
                 None,
                 where="avoid.clearance_m",
             )
-        sample_s = task.sample_s or template.timestep_s
+        usual_s = task.duration_s / EQUILIBRIA if template.is_static else template.timestep_s
+        sample_s = task.sample_s or usual_s
         count = round(task.duration_s / sample_s)
         if not FEWEST_SAMPLES <= count <= MOST_SAMPLES:
             raise InputError(
@@ -207,7 +212,15 @@ class PlannedProgram:
         _, brief = standing(3)
         goals = brief.stated_goals_m
         start = brief.simulate(Drive(goals, np.zeros((*goals.shape, 0))))[0]
-        lowest_hz = _lowest_frequency_hz(brief, start)
+        lowest_hz = np.nan if template.is_static else _lowest_frequency_hz(brief, start)
+        if template.is_static and task.end.window_s is not None:
+            raise InputError(
+                f"found {task.end.window_s:g}, but the recording is static: each sample of the plan "
+                "is an equilibrium; expected no window_s",
+                None,
+                where="end.window_s",
+            )
+        task = task.without_rest if template.is_static else task
         window = _window_samples(task, sample_s, lowest_hz)
         experiment, driven = standing(count + 1 + window)
         since_s = np.asarray(sample_s * np.arange(count + 1 + window), dtype=np.float64)
@@ -216,7 +229,25 @@ class PlannedProgram:
         first = started[[index[name] for name in names]] if names else np.zeros((0, 3))
         references = sampled_references(task, since_s, places, first)
         hand = experiment, driven, space, start, references, lowest_hz, signals
-        return cls(body, task, limits, *hand, pose_limits)
+        program = cls(body, task, limits, *hand, pose_limits)
+        program.require_start_within_limits()
+        return program
+
+    def require_start_within_limits(self) -> None:
+        """Raise an `InputError` if the body exceeds its limits before the motion."""
+        if self.body_limits is None:
+            return
+        avoid = self.task.avoid
+        for key, value in self.body_limits.extremes(self.start[None]).items():
+            limit = getattr(avoid, key)
+            if value > limit if key == "largest_stretch" else value < limit:
+                side = "above" if key == "largest_stretch" else "below"
+                raise InputError(
+                    f"found {limit:g}, but it is {value:.4g} before the motion; expected a value "
+                    f"{side} this",
+                    None,
+                    where=f"avoid.{key}",
+                )
 
     def with_duration(self, duration_s: float) -> PlannedProgram:
         """Return the program with another duration [s] of the hand's motion, for the limits of the
@@ -415,7 +446,7 @@ class PlannedProgram:
         at_point = self.point_weights(reference.name)
         rows = self.sample_rows
         last = len(self.grid_since_s) - 1
-        step_s = self.driven.transcription.dynamics.step_s
+        step_s = self.grid_since_s[1]
         blocks, targets = [], []
         for values, unit, is_velocity in (
             (reference.position_m, reference.sigma_m, False),

@@ -115,7 +115,8 @@ def task_signals(task: Task, template: Experiment) -> tuple[Signal, ...]:
                 None,
                 where=f"{where}: {section.range_key}",
             )
-        lag_s = actuator.lag_s if isinstance(actuator, Pressure) else 0.0
+        has_lag = isinstance(actuator, Pressure) and not template.is_static
+        lag_s = actuator.lag_s if has_lag else 0.0
         found.append(
             Signal(
                 section, names.index(section.name), slope, offset, lag_s, initial, lowest, highest
@@ -140,17 +141,20 @@ def _amplitude_line(actuator: Tendon | Pressure) -> tuple[float, float]:
 
 
 def commanded(
-    actuators: tuple[Any, ...], start_s: float, commands: Commands
+    actuators: tuple[Any, ...], start_s: float, commands: Commands, *, is_static: bool = False
 ) -> tuple[Tendon | Pressure, ...]:
-    """Return tendons or pressures with commands; the others keep their values at `start_s`."""
+    """Return tendons or pressures with commands; the others keep their values at `start_s`. In
+    equilibria, nothing lags.
+    """
     changed = []
     for each in actuators:
         key = "tension_n" if isinstance(each, Tendon) else "pressure_pa"
+        without = {"lag_s": 0.0} if isinstance(each, Pressure) else {}
         if each.name in commands:
             t_s, values = commands[each.name]
-            changed.append(replace(each, **{key: values, "t_s": t_s}))
+            lag = without if is_static else {}
+            changed.append(replace(each, **{key: values, "t_s": t_s}, **lag))
         else:
-            lag = {"lag_s": 0.0} if isinstance(each, Pressure) else {}
             value = standing_value(each, start_s)
-            changed.append(replace(each, **{key: np.array([value]), "t_s": None}, **lag))
+            changed.append(replace(each, **{key: np.array([value]), "t_s": None}, **without))
     return tuple(changed)

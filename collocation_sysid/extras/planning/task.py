@@ -381,6 +381,11 @@ class Task(Section):
                 )
         return self
 
+    @property
+    def without_rest(self) -> Task:
+        """The task of a body that is in equilibrium throughout."""
+        return self.model_copy(update={"end": self.end.model_copy(update={"at_rest": False})})
+
     def stretched(self, duration_s: float) -> Task:
         """Return the task with another duration [s]: all times of its references are multiplied by
         the ratio of the durations, and velocities divided by it.

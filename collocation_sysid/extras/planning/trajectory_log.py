@@ -1,7 +1,10 @@
-"""A plan as messages of ROS 2 in an MCAP file: a trajectory for a controller, and poses."""
+"""A plan as messages of ROS 2 in an MCAP file: a trajectory for a controller, poses, tensions and
+pressures.
+"""
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,13 +16,15 @@ from ...recording.formats.logs import require_packages
 from ..design.hand_motion import angular_motion
 from .motion_plan import MotionPlan
 
-TRAJECTORY_TOPIC, POSE_TOPIC = "/hand_trajectory", "/hand_pose"
+TRAJECTORY_TOPIC, POSE_TOPIC, COMMAND_TOPIC = "/hand_trajectory", "/hand_pose", "/command_{}"
 FRAME, JOINT = "world", "hand"
 
 
 def write_trajectory_mcap(plan: MotionPlan, path: str | Path, t_s: Array) -> None:
     """Write a file with one trajectory_msgs/MultiDOFJointTrajectory on /hand_trajectory, at time 0,
-    and a geometry_msgs/PoseStamped on /hand_pose at each of the times (P,) since the start [s].
+    and at each of the times (P,) since the start [s] a geometry_msgs/PoseStamped on /hand_pose and
+    on /command_<name> a std_msgs/Float64 of each planned tendon [N], and a sensor_msgs/FluidPressure
+    of each planned pressure [Pa].
 
     Poses, velocities and accelerations are those of the frame whose poses poses.csv has, in axes of
     the frame of the poses.
@@ -63,6 +68,7 @@ def write_trajectory_mcap(plan: MotionPlan, path: str | Path, t_s: Array) -> Non
             )
         )
     kind, pose_kind = "trajectory_msgs/msg/MultiDOFJointTrajectory", "geometry_msgs/msg/PoseStamped"
+    tension_kind, pressure_kind = "std_msgs/msg/Float64", "sensor_msgs/msg/FluidPressure"
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -72,6 +78,15 @@ def write_trajectory_mcap(plan: MotionPlan, path: str | Path, t_s: Array) -> Non
             connection = writer.add_connection(POSE_TOPIC, pose_kind, typestore=store)
             for time_s, each in zip(t_s, stamped, strict=True):
                 writer.write(connection, round(1e9 * time_s), store.serialize_cdr(each, pose_kind))
+            for each, values in zip(plan.program.signals, plan.commands(t_s).values(), strict=True):
+                topic = COMMAND_TOPIC.format(re.sub(r"\W", "_", each.name, flags=re.ASCII))
+                is_tension = each.unit == "N"
+                name = tension_kind if is_tension else pressure_kind
+                connection = writer.add_connection(topic, name, typestore=store)
+                for time_s, value in zip(t_s, values.tolist(), strict=True):
+                    content = (value,) if is_tension else (header(time_s), value, 0.0)
+                    message = store.serialize_cdr(made(name, *content), name)
+                    writer.write(connection, round(1e9 * time_s), message)
         (found,) = bag.glob("*.mcap")
         Path(path).write_bytes(found.read_bytes())
 
