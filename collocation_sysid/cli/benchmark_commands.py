@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..common.display import Table
-from ..common.serialisation import as_json as json_text
 from ..errors import InputError
-from .command_options import AsJson, Quiet, command, option
-from .common import error_console, print_result
+from .command_options import OutputOptions, command, option
+from .common import error_console, shown_progress
 
 if TYPE_CHECKING:
     from ..extras.benchmark import Score
@@ -50,8 +49,7 @@ def benchmark(
             "NAME",
         ),
     ] = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    output: OutputOptions,
 ) -> None:
     """List, write or score the bodies of a benchmark of simulators.
 
@@ -65,22 +63,19 @@ def benchmark(
     The exit code is 0, and 2 if the folder is no benchmark or a prediction is missing or invalid.
     """
     from ..extras.benchmark import score_benchmark
-    from ..result.solve_progress import SolveProgress
 
     if folder is None:
-        _list_bodies(as_json, "--write" if write else "--body" if body else None)
+        _list_bodies(output, "--write" if write else "--body" if body else None)
     elif write:
-        _write_bodies(folder, body, as_json=as_json, quiet=quiet)
+        _write_bodies(folder, body, output)
     else:
-        with SolveProgress(error_console, quiet=quiet, activity="computing the scores"):
+        with shown_progress("computing the scores", quiet=output.quiet):
             scores = score_benchmark(folder, body)
-        if as_json:
-            typer.echo(json_text([asdict(each) for each in scores]))
-        else:
-            print_result([*score_tables(scores), *score_warnings(scores)])
+        tables = [*score_tables(scores), *score_warnings(scores)]
+        output.print_result([asdict(each) for each in scores], tables)
 
 
-def _list_bodies(as_json: bool, where: str | None) -> None:
+def _list_bodies(output: OutputOptions, where: str | None) -> None:
     """Print the bodies; refuse the option `where`, which needs a folder."""
     from ..extras.benchmark import BODIES
 
@@ -103,9 +98,6 @@ def _list_bodies(as_json: bool, where: str | None) -> None:
                 "licence": entry["licence"],
             }
         )
-    if as_json:
-        typer.echo(json_text(listed))
-        return
     rows = tuple(
         (
             each["body"],
@@ -118,10 +110,10 @@ def _list_bodies(as_json: bool, where: str | None) -> None:
         for each in listed
     )
     heads = ("body", "data", "recording", "available", "licence", "specimen")
-    print_result(Table("", heads, rows=rows, names=5, texts=1))
+    output.print_result(listed, Table("", heads, rows=rows, names=5, texts=1))
 
 
-def _write_bodies(folder: Path, body: str | None, as_json: bool, quiet: bool) -> None:
+def _write_bodies(folder: Path, body: str | None, output: OutputOptions) -> None:
     """Write the benchmark folder, and print its path.
 
     Bodies that were left out because their data are not on this computer are named on stderr. With
@@ -130,27 +122,23 @@ def _write_bodies(folder: Path, body: str | None, as_json: bool, quiet: bool) ->
     """
     from ..extras.benchmark import BODIES, write_benchmark
     from ..extras.benchmark.benchmark_bodies import chosen_bodies
-    from ..result.solve_progress import SolveProgress
 
     chosen = chosen_bodies(body)
-    with SolveProgress(error_console, quiet=quiet, activity="simulating the bodies") as progress:
+    with shown_progress("simulating the bodies", quiet=output.quiet) as progress:
         write_benchmark(chosen, folder, progress=progress.share)
     left_out = [each for each in BODIES.values() if body is None and each not in chosen]
-    if as_json:
-        report = {
-            "folder": str(folder),
-            "bodies": [each.name for each in chosen],
-            "left_out": [each.name for each in left_out],
-        }
-        typer.echo(json_text(report))
-        return
-    for each in left_out:
+    for each in () if output.as_json else left_out:
         error_console.print(
             f"{each.name} is left out: its data are not on this computer; python scripts {each.script} "
             "fetches them",
             soft_wrap=True,
         )
-    typer.echo(folder)
+    report = {
+        "folder": str(folder),
+        "bodies": [each.name for each in chosen],
+        "left_out": [each.name for each in left_out],
+    }
+    output.print_result(report, str(folder))
 
 
 def score_tables(scores: Sequence[Score]) -> list[Table]:

@@ -37,7 +37,7 @@ from ..common.files import require_run_folder
 from ..common.serialisation import as_json
 from ..common.validated_classes import validated
 from ..errors import InputError
-from .common import error_console, print_result
+from .common import print_result, shown_progress
 
 if TYPE_CHECKING:
     from ..problem import Problem  # which takes a second to import
@@ -64,6 +64,10 @@ OneExperiment = Annotated[
     typer.Option(
         "--experiment", metavar="NAME", help="Name of the experiment; by default the first one."
     ),
+]
+OneMethod = Annotated[
+    str | None,
+    typer.Option("--method", help="The method to use instead of that in the problem file."),
 ]
 OutputFolder = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Output folder.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -221,11 +225,8 @@ class ProblemOptions:
             If a file or a key is not usable.
         """
         from ..problem import Problem
-        from ..result.solve_progress import SolveProgress
 
-        with SolveProgress(
-            error_console, quiet=quiet, activity=f"reading {self.problem}"
-        ) as progress:
+        with shown_progress(f"reading {self.problem}", quiet=quiet) as progress:
             return Problem.read(
                 self.problem,
                 self.set_ or (),

@@ -5,12 +5,17 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import typer
 from rich.text import Text
 
 from ..common.console import PlainConsole
 from ..common.display import Shown, on_terminal, plain_text
+
+if TYPE_CHECKING:
+    from ..problem import Problem
+    from ..result.solve_progress import SolveProgress
 
 error_console = PlainConsole(stderr=True)
 
@@ -35,6 +40,19 @@ def interruption_exit(saved_results: str, *, continues: bool = True) -> typer.Ex
         Text(f"{text}; continue with: {again}" if continues else text), soft_wrap=True
     )
     return typer.Exit(EXIT_INTERRUPTED)
+
+
+def shown_progress(
+    activity: str = "searching for an initial guess",
+    problem: Problem | None = None,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+) -> SolveProgress:
+    """Return the display of the progress on stderr, see `SolveProgress`."""
+    from ..result.solve_progress import SolveProgress  # which takes a while to import
+
+    return SolveProgress(error_console, problem, verbose, quiet, activity)
 
 
 def print_result(content: Shown | Iterable[Shown]) -> None:

@@ -5,7 +5,7 @@ which finds the motion with which points of the body follow references.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal
 
 import typer
 
@@ -24,7 +24,7 @@ from .command_options import (
     command,
     option,
 )
-from .common import EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
+from .common import EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console, shown_progress
 
 commands = typer.Typer()
 
@@ -42,7 +42,7 @@ def design(
         Path, option("TOML file with the limits of the robot and the views of the cameras.", "FILE")
     ],
     criterion: Annotated[
-        str,
+        Kind,
         option(
             "Criterion that is minimised: worst, the largest error bar; A, the mean square of the "
             "error bars; D, the volume of the confidence ellipsoid."
@@ -53,7 +53,7 @@ def design(
         option("Parameters and moduli whose error bars are minimised; all by default.", "A,B,…"),
     ] = None,
     over: Annotated[
-        str,
+        Over,
         option(
             "How the values of the criterion at the draws are combined: mean, their geometric mean, "
             "or worst, the largest."
@@ -84,7 +84,7 @@ def design(
 
     folder = out or Path("runs") / f"{run_name(source.problem)}-design"
     names = () if for_ is None else tuple(n.strip() for n in for_.split(","))
-    minimised = DesignCriterion(cast("Kind", criterion), names, over=cast("Over", over))
+    minimised = DesignCriterion(criterion, names, over=over)
     allowed = Limits.read(limits)
     problem = source.read_problem(output.quiet, simulation=not add)
     require_possible(folder)
@@ -151,7 +151,6 @@ def plan(
     """
     from ..extras.planning import Task, plan_motion
     from ..extras.planning.plan_folder import PLAN_FILE, plan_json, plan_summary, write_plan
-    from ..result.solve_progress import SolveProgress
 
     if rate is not None and not 0 < rate < float("inf"):
         raise InputError(
@@ -161,7 +160,7 @@ def plan(
     followed, allowed = Task.read(task), None if limits is None else Limits.read(limits)
     require_possible(folder)
     require_replaceable(folder, marker_file=PLAN_FILE, content_word="plan")
-    with SolveProgress(error_console, quiet=output.quiet, activity="preparing") as progress:
+    with shown_progress("preparing", quiet=output.quiet) as progress:
         try:
             answer = plan_motion(
                 source,

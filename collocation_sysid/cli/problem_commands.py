@@ -23,7 +23,7 @@ from ..result.run_record import draw_run
 from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
-from .command_options import OutputFolder, OutputOptions, ProblemOptions, command, option
+from .command_options import OneMethod, OutputFolder, OutputOptions, ProblemOptions, command, option
 from .common import (
     EXIT_DOUBTFUL,
     EXIT_INTERRUPTED,
@@ -31,6 +31,7 @@ from .common import (
     error_console,
     interruption_exit,
     print_result,
+    shown_progress,
 )
 
 if TYPE_CHECKING:
@@ -48,9 +49,7 @@ commands = typer.Typer()
 )
 def solve(
     *,
-    method: Annotated[
-        str | None, option("The method to use instead of that in the problem file.")
-    ] = None,
+    method: OneMethod = None,
     out: OutputFolder = None,
     start: Annotated[
         Path | None, option("Start from the result in this run folder.", "RUN")
@@ -96,7 +95,6 @@ def solve(
     --strict, 2 for bad input, 130 after Ctrl-C, and 143 after SIGTERM.
     """
     from ..result.run_summary import next_step, run_summary
-    from ..result.solve_progress import SolveProgress
 
     if method is not None:
         require_method(method, "--method")
@@ -106,7 +104,7 @@ def solve(
     require_replaceable(folder)
     no_output = None
     with ExitStack() as until_saved:
-        with SolveProgress(error_console, problem, verbose=verbose, quiet=output.quiet) as progress:
+        with shown_progress(problem=problem, quiet=output.quiet, verbose=verbose) as progress:
             try:
                 finished = run(
                     problem,
@@ -128,13 +126,7 @@ def solve(
             except OSError as error:  # a standard output that is closed or full loses no run
                 no_output = error
         # Notes of the problem were shown before.
-        with SolveProgress(
-            error_console,
-            None,
-            verbose=verbose,
-            quiet=output.quiet,
-            activity="writing the run folder",
-        ):
+        with shown_progress("writing the run folder", quiet=output.quiet, verbose=verbose):
             try:
                 finished.save(folder, pictures=False)
             except InputError:
@@ -149,7 +141,7 @@ def solve(
         try:
             until_saved.close()
             if pictures:
-                with SolveProgress(error_console, verbose=verbose, quiet=output.quiet) as progress:
+                with shown_progress(quiet=output.quiet, verbose=verbose) as progress:
                     drawn = draw_run(finished, folder, report=progress.say)
         except KeyboardInterrupt:
             drawn = None
@@ -194,14 +186,10 @@ def simulate(
     written, unless it is the folder of the problem; data files of the problem are never replaced.
     If the body loses its stability, instability.png shows how.
     """
-    from ..result.solve_progress import SolveProgress
-
     problem = source.read_problem(output.quiet, simulation=True)
     require_possible(out)
     notes: list[str] = []
-    with SolveProgress(
-        error_console, problem, quiet=output.quiet, activity="simulating"
-    ) as progress:
+    with shown_progress("simulating", problem, quiet=output.quiet) as progress:
         try:
             written = write_data(
                 problem, out, recipe=recipe, progress=progress.share, report=notes.append
@@ -274,21 +262,16 @@ def check(
     bad input.
     """
     from ..result.check_sections import full_check_tables, quick_check_tables
-    from ..result.solve_progress import SolveProgress
 
     problem = source.read_problem(output.quiet)
     if not output.as_json:
-        with SolveProgress(
-            error_console, quiet=output.quiet, activity="checking bodies, recordings and grasps"
-        ):
+        with shown_progress("checking bodies, recordings and grasps", quiet=output.quiet):
             findings_at_once = quick_check(problem)
         print_result(quick_check_tables(findings_at_once, details))
         _write_camera_overlays(
             problem, out or Path("runs") / f"{run_name(source.problem)}_check", quiet=output.quiet
         )
-    with SolveProgress(
-        error_console, quiet=output.quiet, activity="preparing the complete program"
-    ) as progress:
+    with shown_progress("preparing the complete program", quiet=output.quiet) as progress:
         findings = check_problem(problem, progress.say, full=full)
     output.print_result(findings.as_dict(), full_check_tables(findings, details))
     good = findings.derivatives_agree and not findings.causes
@@ -302,11 +285,10 @@ def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
     if not any(each.camera_names for each in problem.experiments):
         return
     from ..result.camera_overlays import OVERLAY_TEXT, save_overlays
-    from ..result.solve_progress import SolveProgress
 
     require_possible(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    with SolveProgress(error_console, quiet=quiet, activity="drawing the views of the cameras"):
+    with shown_progress("drawing the views of the cameras", quiet=quiet):
         files = save_overlays(problem.experiments, folder)
     for file in files:
         typer.echo(f"{OVERLAY_TEXT}: {file}")

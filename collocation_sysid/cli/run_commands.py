@@ -26,7 +26,7 @@ from .command_options import (
     command,
     option,
 )
-from .common import error_console, interruption_exit, print_result
+from .common import interruption_exit, print_result, shown_progress
 
 if TYPE_CHECKING:
     from ..extras.export import ExportDestination  # which takes a second to import
@@ -56,12 +56,9 @@ def refine(
     """
     from ..result.run_refinement import refine_run
     from ..result.run_sections import refinement_table, verdict_section
-    from ..result.solve_progress import SolveProgress
 
     try:
-        with SolveProgress(
-            error_console, quiet=output.quiet, activity=f"reading {run.run_folder}"
-        ) as progress:
+        with shown_progress(f"reading {run.run_folder}", quiet=output.quiet) as progress:
             refinement, result = refine_run(
                 run.run_folder,
                 levels,
@@ -139,7 +136,6 @@ def export(
         write_export,
     )
     from ..extras.export.rerun_recording import TARGET as RECORDING
-    from ..result.solve_progress import SolveProgress
 
     destination = parse_destination(to, MAIN_FILES, run_folder=run.run_folder, out=out)
     name = destination.format_name
@@ -163,9 +159,7 @@ def export(
     target = TARGETS[name]
     destination.require_possible()
     compared = []
-    with SolveProgress(
-        error_console, quiet=quiet, activity=f"reading {run.run_folder}"
-    ) as progress:
+    with shown_progress(f"reading {run.run_folder}", quiet=quiet) as progress:
         body = IdentifiedBody.read(run.run_folder, experiment, allow_code=allow_code)
         progress.say(f"writing the body for {target.name}")
         with destination.export_folder() as folder:
@@ -208,11 +202,10 @@ def _export_recording(
 ) -> Sequence[str]:
     """Write the recording of a run for the Rerun viewer, and return what is missing in it."""
     from ..extras.export.rerun_recording import RECORDING_FILE, write_rerun
-    from ..result.solve_progress import SolveProgress
 
     destination.require_possible()
     with (
-        SolveProgress(error_console, quiet=quiet, activity="writing the recording"),
+        shown_progress("writing the recording", quiet=quiet),
         destination.export_folder() as folder,
     ):
         missing = write_rerun(run_folder, folder, experiment=experiment)
@@ -228,11 +221,10 @@ def plot(*, out: OutputFolder = None, quiet: Quiet = False, run: RunFolderOption
     names are printed. The picture of the Jacobian is not drawn again.
     """
     from ..result.pictures.album import redraw_pictures
-    from ..result.solve_progress import SolveProgress
 
     folder = out or run.run_folder
     require_possible(folder)
-    with SolveProgress(error_console, quiet=quiet) as progress:
+    with shown_progress("drawing pictures", quiet=quiet) as progress:
         files = redraw_pictures(run.run_folder, folder, say=progress.say)
     for file in files:
         typer.echo(file)
@@ -260,11 +252,10 @@ def report(
     """
     from ..result.report import comparison_report, report_text
     from ..result.run_sections import run_report
-    from ..result.solve_progress import SolveProgress
 
     file = to or folder / "report.html"
     study = (folder / "summary.json").is_file()
-    with SolveProgress(error_console, quiet=quiet, activity="writing the report"):
+    with shown_progress("writing the report", quiet=quiet):
         page = comparison_report(folder) if study else run_report(folder)
         require_possible(file.parent)
         write_text_file(file, report_text(page, file))
@@ -292,9 +283,8 @@ def animate(
 ) -> None:
     """Make a film of a run: the fitted body beside its forward simulation."""
     from ..result.animation import animate as film
-    from ..result.solve_progress import SolveProgress
 
     require_possible(run.run_folder if to is None else to.parent)
-    with SolveProgress(error_console, quiet=quiet, activity="making the film"):
+    with shown_progress("making the film", quiet=quiet):
         file = film(run.run_folder, to, fps=fps, slowdown=slow, experiment=experiment)
     typer.echo(file)

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..extras.live import LiveEstimator, LiveOptions, LiveUpdate
 from ..extras.live.sources import read_problem
 from .command_options import AllowCode, OutputOptions, Overrides, ProblemPath, command, option
-from .common import EXIT_BAD_INPUT, error_console, print_result
+from .common import EXIT_BAD_INPUT, error_console, print_result, shown_progress
 
 if TYPE_CHECKING:
     from ..extras.live.frames import Frame
@@ -61,10 +61,9 @@ class LiveEstimationOptions:
             from ..extras.live.live_recording import require_recordable
 
             require_recordable(self.rerun)
-        from ..result.solve_progress import SolveProgress
 
         budget_s = None if self.budget_ms is None else 1e-3 * self.budget_ms
-        with SolveProgress(error_console, quiet=quiet, activity=f"reading {recording}") as progress:
+        with shown_progress(f"reading {recording}", quiet=quiet) as progress:
             problem = read_problem(recording, self.set_ or (), allow_code=self.allow_code)
             progress.say("preparing the estimator")
             return LiveEstimator(problem, LiveOptions(budget_s, self.window_s))
@@ -205,7 +204,6 @@ def replay(
     from ..extras.live import live_display
     from ..extras.live.sources import frames_of_recording, paced_frames, without_garbage_of_startup
     from ..extras.live.sources import update_as_json as json_line
-    from ..result.solve_progress import SolveProgress
 
     if film is not None:
         require_possible(film.parent)
@@ -231,6 +229,6 @@ def replay(
     else:
         print_result(live_display.final_display(updates, settled))
     if film is not None:
-        with SolveProgress(error_console, quiet=output.quiet, activity="making the film"):
+        with shown_progress("making the film", quiet=output.quiet):
             live_display.write_film(updates, film)
         typer.echo(film)

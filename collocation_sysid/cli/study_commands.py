@@ -34,8 +34,8 @@ from ..extras.studies.study_planning import METHOD_STUDY, MODEL_STUDY, STUDY_TIT
 from ..extras.studies.study_rows import SuccessCriterion
 from ..fem.kernels import available_threads
 from ..problem import Problem
-from .command_options import OutputFolder, OutputOptions, ProblemOptions, command, option
-from .common import error_console, interruption_exit, print_result
+from .command_options import OneMethod, OutputFolder, OutputOptions, ProblemOptions, command, option
+from .common import error_console, interruption_exit, print_result, shown_progress
 
 commands = typer.Typer()
 
@@ -132,9 +132,7 @@ def compare_models(
             "Another problem file with the same recordings, which is compared as a model.", "FILE"
         ),
     ] = None,
-    method: Annotated[
-        str | None, option("The method that fits every model, instead of that in the problem file.")
-    ] = None,
+    method: OneMethod = None,
     study: StudyOptions,
     source: ProblemOptions,
     output: OutputOptions,
@@ -152,7 +150,6 @@ def compare_models(
     if not with_ and {materials, damping, prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
     from ..extras.studies.study_progress import STUDY_FACTOR, expected_study_s
-    from ..result.solve_progress import SolveProgress
     from ..runs.check import expected_search_s
 
     is_announced = not (output.quiet or study.dry_run)
@@ -168,7 +165,7 @@ def compare_models(
         dampings=parse_dampings(damping) if damping is not None else (),
     )
     with (
-        SolveProgress(error_console, quiet=output.quiet, activity="reading the models"),
+        shown_progress("reading the models", quiet=output.quiet),
         counted_phase(StepUnit.PROBLEM, len(variants)),
     ):
         began_s, used_s = perf_counter(), sum(os.times()[:4])
@@ -214,9 +211,7 @@ def sweep(
             "KEY=VALUES",
         ),
     ],
-    method: Annotated[
-        str | None, option("The method to use instead of that in the problem file.")
-    ] = None,
+    method: OneMethod = None,
     study: StudyOptions,
     source: ProblemOptions,
     output: OutputOptions,
@@ -225,8 +220,6 @@ def sweep(
 
     Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
-    from ..result.solve_progress import SolveProgress
-
     chosen = _single_method(method)
     planned = plan_sweep(
         source.problem,
@@ -236,7 +229,7 @@ def sweep(
         allow_code=source.allow_code,
     )
     # A missing file would fail every run.
-    with SolveProgress(error_console, quiet=output.quiet, activity=f"reading {source.problem}"):
+    with shown_progress(f"reading {source.problem}", quiet=output.quiet):
         Problem.read(source.problem, planned[0].overrides, allow_code=source.allow_code)
     _run_study(SWEEP_STUDY, planned, study, source, output)
 

@@ -20,7 +20,7 @@ from ..common.pages import glossary_terms, page_files, page_text, page_title
 from ..common.serialisation import as_json as json_text
 from ..errors import InputError, hint_at, located
 from .command_options import AsJson, command, option
-from .common import error_console, print_result
+from .common import error_console, print_result, shown_progress
 
 
 class UnbrokenCode(CodeBlock):
@@ -208,9 +208,8 @@ def log(
 ) -> None:
     """List the topics in a robot's log, their uses, and how a problem file names them."""
     from ..recording.formats.topics import list_topics
-    from ..result.solve_progress import SolveProgress
 
-    with SolveProgress(error_console, activity=f"reading {log}"), located(log):
+    with shown_progress(f"reading {log}"), located(log):
         listed = list_topics(log)
     if as_json:
         typer.echo(json_text(listed))

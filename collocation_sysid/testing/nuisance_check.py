@@ -181,7 +181,7 @@ def _check_predicted_reading(
     """
     residual = _marker_residual(collocation)
     data = residual.nuisance
-    x = _smooth_motion(check, collocation)
+    x = _smooth_motion(collocation)
     phi = np.zeros(data.size)
     plain = residual.predict_positions(x, phi)
     for marker in range(plain.shape[1]):
@@ -212,14 +212,14 @@ def _check_clock(check: PropertyCheck, row: Deviation, collocation: Collocation)
     indices = np.array([k for k, entry in enumerate(data.entries) if entry.row == row])
     phi = np.zeros(data.size)
     phi[indices] = LARGEST_DEVIATION
-    x = _smooth_motion(check, collocation)
+    x = _smooth_motion(collocation)
     predicted = residual.predict_positions(x, phi)
     own = residual.own_parameters[0]
     values = (phi * data.scales)[[k for k in own if k in indices]]
     for sample in range(FIRST_INNER_SAMPLE, len(residual.t_s)):
         t_s = float(residual.t_s[sample])
         delay = _read(row, np.zeros(3), values=values, t_s=t_s, data=data)[0]
-        later = _smooth_motion(check, collocation, shift_s=float(delay))
+        later = _smooth_motion(collocation, shift_s=float(delay))
         check.require_equal(
             predicted[sample, 0],
             residual.predict_positions(later, np.zeros(data.size))[sample, 0],
@@ -232,7 +232,7 @@ def _check_clock(check: PropertyCheck, row: Deviation, collocation: Collocation)
         )
 
 
-def _smooth_motion(check: PropertyCheck, collocation: Collocation, shift_s: float = 0.0) -> Array:
+def _smooth_motion(collocation: Collocation, shift_s: float = 0.0) -> Array:
     """Return grid positions (N, 3n) of a motion that is affine in space and quadratic in time."""
     (transcription,) = collocation.transcriptions
     nodes_m = transcription.body.nodes_m

@@ -826,7 +826,7 @@ def test_a_run_from_python_is_written_like_any_other(tiny):
 def test_a_terminal_shows_the_current_phase_before_heavy_imports(monkeypatch, tiny):
     screen = io.StringIO()
     terminal = PlainConsole(file=screen, force_terminal=True, width=100)
-    for module in (cli, command_options):
+    for module in (cli, common):
         monkeypatch.setattr(module, "error_console", terminal)
     assert cli.LazyCommands().get_command(None, "check") is not None
     assert "starting" in screen.getvalue()
