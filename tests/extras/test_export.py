@@ -155,6 +155,7 @@ def test_an_ensemble_has_an_export_for_each_draw(run_folder, tmp_path):
             for name in run.uncertainty.names:
                 assert values["parameters"][name]["value"] == samples[name].iloc[k]
                 assert table[name][k] == samples[name].iloc[k]
+            assert table["sample"][k] == k + 1
             (region,) = values["regions"]
             assert region["young_pa"] == pytest.approx(samples["young_pa"].iloc[k])
         write_ensemble(run, target, folder, 2)  # replaces the earlier one

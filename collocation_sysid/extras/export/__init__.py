@@ -136,7 +136,9 @@ def write_draws(
     digits = max(3, len(str(len(rows))))
     with replaced_folder(folder, marker_file=SAMPLES_FILE, content_word="ensemble") as place:
         lines = [",".join(("sample", *draws))]
-        lines += [f"{k},{values_as_text([*row.values()], ',')}" for k, row in enumerate(rows)]
+        lines += [
+            f"{k},{values_as_text([*row.values()], ',')}" for k, row in enumerate(rows, start=1)
+        ]
         (place / SAMPLES_FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
         for k, row in enumerate(rows, start=1):
             draw = body.with_values({name: float(row[name]) for name in names})
