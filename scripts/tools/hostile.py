@@ -54,7 +54,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
-from kit import logs, problem_files
+from kit import logs, problem_files, silhouettes
 from studies import markdown
 
 from collocation_sysid import cli
@@ -836,6 +836,39 @@ def _sleap(file: Path, tracks: TrackFile) -> None:
         content["track_names"] = np.array(["bar"], dtype="S")
 
 
+def _sleap_labels(file: Path, tracks: TrackFile) -> None:
+    import h5py
+
+    count = len(tracks.names)
+    images = range(len(tracks.pixels))
+    numbers = [("x", "f8"), ("y", "f8"), ("visible", "?"), ("complete", "?"), ("score", "f8")]
+    points = [(*xy, True, False, 1.0) for row in tracks.pixels for xy in row]
+    owner = ["instance_id", "instance_type", "frame_id", "track", "point_id_start", "point_id_end"]
+    frame = ["frame_id", "video", "frame_idx", "instance_id_start", "instance_id_end"]
+    nodes = [{"name": name} for name in tracks.names]
+    stated = {"nodes": nodes, "skeletons": [{"nodes": [{"id": k} for k in range(count)]}]}
+    with h5py.File(file, "w") as content:
+        content.create_group("metadata").attrs["format_id"] = 1.3
+        content["metadata"].attrs["json"] = np.bytes_(json.dumps(stated))
+        content["pred_points"] = np.array(points, dtype=numbers)
+        content["points"] = np.array([], dtype=numbers[:4])
+        content["instances"] = np.array(
+            [(k, 1, k, -1, count * k, count * (k + 1)) for k in images],
+            dtype=[(name, "u1" if name == "instance_type" else "i8") for name in owner],
+        )
+        content["frames"] = np.array(
+            [(k, 0, k, k, k + 1) for k in images], dtype=[(name, "i8") for name in frame]
+        )
+
+
+def _with_masks(folder: Path) -> None:
+    """Make the problem that of a hanging bar in one photograph, with its mask in a file."""
+    from PIL import Image
+
+    Image.fromarray(np.uint8(255) * silhouettes.photograph()).save(folder / "front.png")
+    silhouettes.folder_with(folder, "front.png")
+
+
 def _cotracker(file: Path, tracks: TrackFile) -> None:
     seen = np.asarray(np.isfinite(tracks.pixels).all(axis=2))[None]
     assert tracks.t_s is not None
@@ -919,7 +952,7 @@ FILES += (
         "run, changed JSON",
         _with_run,
         "run/result.json",
-        (("report", "run"), ("export", "run", "--to", "json")),
+        (("report", "run"), ("plot", "run"), ("export", "run", "--to", "json")),
         change=changed_json,
     ),
     FileKind(
@@ -950,6 +983,9 @@ FILES += (
     ),
     FileKind("DeepLabCut, HDF5", _with_tracks("d.h5", _deeplabcut), "d.h5", words=COUNTS),
     FileKind("SLEAP, HDF5", _with_tracks("s.h5", _sleap), "s.h5", words=COUNTS),
+    FileKind("SLEAP, labels", _with_tracks("s.slp", _sleap_labels), "s.slp", words=COUNTS),
+    FileKind("mask, PNG", _with_masks, "front.png", words=(b"IHDR", b"IDAT", b"PLTE", *COUNTS)),
+    FileKind("mask, changed .toml", _with_masks, "*.toml", change=changed_toml),
     FileKind(
         "CoTracker, NPZ", _with_tracks("c.npz", _cotracker), "c.npz", words=(b"'|O'", *COUNTS)
     ),

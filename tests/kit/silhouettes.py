@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -68,3 +69,38 @@ def outlines_of(mask: np.ndarray | None = None, **changes: Any) -> cs.Outlines:
     arguments: dict[str, Any] = {"pose_sigma": KNOWN, "sigma_px": 0.5}
     masks = [photograph() if mask is None else mask]
     return cs.Outlines("front", camera(), [0.0], masks, **arguments | changes)
+
+
+PROBLEM = """
+[object]
+mesh = "bar.vtu"
+density_kg_m3 = 1070.0
+[parameters]
+young_pa = { guess = 2e5 }
+poisson = 0.45
+gamma_r_s = 1e-3
+gamma_m_1_s = 0.1
+[[experiment]]
+name = "hung"
+kind = "static"
+[experiment.grasp]
+nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
+[[experiment.outlines]]
+name = "front"
+file = "FILE"
+[experiment.outlines.camera]
+matrix = MATRIX
+distortion = DISTORTION
+size_px = [640, 480]
+pose = POSE
+"""
+
+
+def folder_with(folder: Path, file: str) -> Path:
+    """Write the mesh, and the problem of a photograph whose mask is in a file; return the latter."""
+    text = PROBLEM.replace("FILE", file).replace("POSE", str(camera().pose.tolist()))
+    text = text.replace("MATRIX", str(np.asarray(camera().matrix).tolist()))
+    text = text.replace("DISTORTION", str(camera().distortion.tolist()))
+    bar().mesh.write(folder / "bar.vtu")
+    (folder / "problem.toml").write_text(text)
+    return folder / "problem.toml"

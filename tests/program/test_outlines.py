@@ -16,6 +16,7 @@ from kit.silhouettes import (
     TRUTH,
     bar,
     camera,
+    folder_with,
     hanging,
     hanging_m,
     outlines_of,
@@ -183,40 +184,6 @@ def test_run_lengths_are_those_of_coco() -> None:
     np.testing.assert_array_equal(decoded({"size": [3, 4], "counts": "435"}), mask)
     long = decoded({"size": [10, 11], "counts": "T373"}).T.ravel()
     assert np.flatnonzero(long).tolist() == [*range(100, 107)]
-
-
-PROBLEM = """
-[object]
-mesh = "bar.vtu"
-density_kg_m3 = 1070.0
-[parameters]
-young_pa = { guess = 2e5 }
-poisson = 0.45
-gamma_r_s = 1e-3
-gamma_m_1_s = 0.1
-[[experiment]]
-name = "hung"
-kind = "static"
-[experiment.grasp]
-nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
-[[experiment.outlines]]
-name = "front"
-file = "FILE"
-[experiment.outlines.camera]
-matrix = MATRIX
-distortion = DISTORTION
-size_px = [640, 480]
-pose = POSE
-"""
-
-
-def folder_with(folder: Path, file: str) -> Path:
-    text = PROBLEM.replace("FILE", file).replace("POSE", str(camera().pose.tolist()))
-    text = text.replace("MATRIX", str(np.asarray(camera().matrix).tolist()))
-    text = text.replace("DISTORTION", str(camera().distortion.tolist()))
-    bar().mesh.write(folder / "bar.vtu")
-    (folder / "problem.toml").write_text(text)
-    return folder / "problem.toml"
 
 
 def test_masks_of_a_problem_file_are_read_in_all_formats(tmp_path: Path) -> None:
