@@ -25,6 +25,7 @@ from ..methods.horizon import Horizon
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import Recorder
+from ..methods.starts.initial_trajectories import simulate_trajectories
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..recording.experiment import Experiment
@@ -145,6 +146,19 @@ class CoarseStart:
         rows = [each.grid_times for each in collocation.transcriptions]
         return collocation.pack(p, self.interpolated(coarse_positions, rows))
 
+    def simulated_variables(self, collocation: Collocation, solution: Solution) -> Array:
+        """Return variables z (variables,) as `variables`, with a simulated motion in place of one
+        that is interpolated in time; the latter where the simulation fails, and on coarser meshes.
+
+        The search needs several times as long to find a motion from interpolated samples.
+        """
+        z = self.variables(collocation, solution)
+        if self.relations:
+            return z
+        p, _ = collocation.unpack(z)
+        positions, failure = simulate_trajectories(collocation, p)
+        return z if failure is not None else collocation.pack(p, positions)
+
     def interpolated(self, coarse_positions: Sequence[Array], rows: Sequence[int]) -> list[Array]:
         """Return positions (N, 3n) [m] of each fitted experiment on the given bodies and at the
         given times from those of the coarse problem, (M, 3m).
@@ -204,7 +218,7 @@ def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | N
         for each in fitted
         if each.specimen is None and len(each.body.nodes.points_m) > method.coarse_start_nodes
     }
-    distances = {each.name: n for each in fitted if (n := _sample_distance(each)) > 1}
+    distances = {each.name: n for each in fitted if (n := sample_distance(each)) > 1}
     if not large and not distances:
         return None
     if problem.find_two_phase_fields():
@@ -229,7 +243,7 @@ def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | N
     return CoarseStart(moved, relations, distances, samples)
 
 
-def _sample_distance(experiment: Experiment) -> int:
+def sample_distance(experiment: Experiment) -> int:
     """Return the distance of the samples of a recording with which the search starts."""
     most = len(experiment.t_s) // FEWEST_SAMPLES
     if len(experiment.t_s) < MANY_SAMPLES:

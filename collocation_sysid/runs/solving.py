@@ -304,7 +304,10 @@ def _solve_from_coarse(
     tolerance = max(solver.tolerance, solver.coarse_start_tolerance)
     method = with_workers(replace(solver, tolerance=tolerance), workers)
     solution = solve_with_renewed_correspondences(
-        method, collocation, watch=watch, start=coarse_start.variables(collocation, coarse)
+        method,
+        collocation,
+        watch=watch,
+        start=coarse_start.simulated_variables(collocation, coarse),
     )
     if solution.status in FAILED_STATUSES:
         raise NoCoarseStartError(

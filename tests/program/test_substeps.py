@@ -207,6 +207,10 @@ def test_there_are_no_more_than_the_most():
     for half, order, needed in ((100.01, 2, 1), (100.14, 2, 2), (100.14, 1, 6), (110.0, 2, 8)):
         error = discretisation_error("mu_pa", estimates["mu_pa"], [half], [], order)
         assert Refinement({"mu_pa": error}).suggested_substeps(estimates, order) == needed
+    precise = {"mu_pa": replace(estimates["mu_pa"], statistical_std_error=1e-3)}
+    for half, needed in ((100.07, 1), (100.08, MOST_SUBSTEPS)):  # corrections of 0.093 and 0.107 %
+        error = discretisation_error("mu_pa", precise["mu_pa"], [half], [], 2)
+        assert Refinement({"mu_pa": error}).suggested_substeps(precise, 2) == needed
     nothing = {"mu_pa": replace(estimates["mu_pa"], statistical_std_error=None)}
     assert Refinement({"mu_pa": error}).suggested_substeps(nothing, order) == 1
 

@@ -30,6 +30,7 @@ from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.experiment_coarsening import coarse_experiment, node_sets
 from collocation_sysid.runs import coarse_start
 from collocation_sysid.runs.coarse_start import plan_coarse_start
+from collocation_sysid.runs.forward_simulation import simulate_experiments
 from collocation_sysid.runs.solving import solve
 
 DIVISIONS = (5, 5, 5)
@@ -233,14 +234,16 @@ def finely_sampled() -> Problem:
 def test_a_search_with_many_samples_starts_with_some_of_them(monkeypatch):
     problem = finely_sampled()
     direct = solve(problem, DIRECT)
-    assert coarse_note(solve(problem)) == ""
+    assert coarse_note(direct) == ""
+    simulated = simulate_experiments(problem, direct)["hung cube"]
+    assert simulated.trajectory.steps_per_sample == 4
     monkeypatch.setattr(coarse_start, "MANY_SAMPLES", 60)
-    monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 25)
+    monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 12)
     start = plan_coarse_start(problem, ReducedSpace())
     assert start is not None
     (some,) = start.problem.experiments
     (given,) = problem.experiments
-    assert 25 <= len(some.t_s) < 60
+    assert 12 <= len(some.t_s) < 16
     assert some.t_s[0] == given.t_s[0]
     solution = solve(problem)
     assert f"solved on {len(some.t_s)} of {len(given.t_s)} samples first" in coarse_note(solution)
@@ -248,6 +251,8 @@ def test_a_search_with_many_samples_starts_with_some_of_them(monkeypatch):
     assert len(solution.collocation.transcriptions[0].experiment.t_s) == len(given.t_s)
     for name, value in direct.parameters.items():
         assert solution.parameters[name] == pytest.approx(value, rel=1e-5), name
+    simulated = simulate_experiments(problem, solution)["hung cube"]
+    assert simulated.trajectory.steps_per_sample == 2
 
 
 def test_all_samples_of_fast_motions_and_of_other_sensors_are_the_start(monkeypatch):

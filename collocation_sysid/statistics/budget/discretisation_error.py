@@ -50,6 +50,9 @@ FIRST_ORDER = 1.0
 # Largest change of an estimate due to the step, in standard errors, where the number of steps is
 # chosen.
 LITTLE = 0.5
+# Change of an estimate over its value that needs no more steps, although many precise samples make it
+# larger than that: systematic effects of a percent are usual, and estimates are corrected for it.
+NEGLIGIBLE = 1e-3
 # Largest number of steps per sample that is chosen.
 MOST_SUBSTEPS = 8
 
@@ -197,11 +200,23 @@ class Refinement:
 
         Notes
         -----
-        Small means at most `LITTLE` statistical standard errors. Without a correction the number is
-        1.
+        Small means at most `LITTLE` statistical standard errors, or `NEGLIGIBLE`. Without a
+        correction the number is 1.
         """
-        many = self.largest_correction(estimates)[1]
+        many = self.largest_correction(estimates, self._errors_of_notable(estimates))[1]
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
+
+    def _errors_of_notable(self, estimates: Mapping[str, Estimate]) -> dict[str, float | None]:
+        """Return the standard errors of the estimates whose correction is not negligible."""
+        changes = {
+            name: abs(estimates[name].value - error.extrapolated)
+            for name, error in self.errors.items()
+        }
+        return {
+            name: estimates[name].statistical_std_error
+            for name, change in changes.items()
+            if change > NEGLIGIBLE * abs(estimates[name].value)
+        }
 
 
 @dataclass(frozen=True)
