@@ -247,6 +247,9 @@ class MeasurementResidual(ABC):
         Whether error bars never use a noise below σ, and the residuals are not used to estimate the
         noise of other measurements. Set it for measurements with rounding errors, which may happen
         to be small.
+    errs_slowly : bool
+        Whether errors of the instrument within σ may change slowly from sample to sample, so that
+        correlated residuals within σ are no evidence against the model.
     is_compiled : bool
         Whether to compile the expression to native code; worthwhile with many entities.
     """
@@ -266,6 +269,7 @@ class MeasurementResidual(ABC):
     has_offsets: ClassVar[bool] = False
     has_fixed_stencils: ClassVar[bool] = True
     has_noise_floor: ClassVar[bool] = False
+    errs_slowly: ClassVar[bool] = False
     is_compiled: ClassVar[bool] = False
 
     @property

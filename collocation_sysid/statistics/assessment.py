@@ -33,7 +33,7 @@ from .instrument_misfit import InstrumentMisfit
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
 from .probes.routine_probes import is_alarming, is_routine_assumption
-from .residuals.autocorrelation import PERSISTENT
+from .residuals.autocorrelation import PERSISTENT, Dependence
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD
 from .thresholds import (
@@ -167,7 +167,8 @@ def fit_concerns(uncertainty: Uncertainty, budgeted: ErrorBasis | None = None) -
     Those of `WITHIN_BUDGET` are the ones of the residuals that deviations within the budget leave,
     if these are given.
 
-    Correlation counts only if the error bars use autocorrelated errors: "residuals/persist" in time
+    Correlation counts only if the error bars use autocorrelated errors and slow errors within σ do
+    not explain it (`ErrorBasis.unexplained`): "residuals/persist" in time
     ("doubtful" if the residuals are also more than `GROSS_MISFIT` times σ), else
     "residuals/shared". Residuals more than `MISFIT` times σ are "doubtful" above `GROSS_MISFIT` if
     they are also correlated, or if nothing is known about their correlation in time. Residuals less
@@ -192,12 +193,10 @@ def fit_concerns(uncertainty: Uncertainty, budgeted: ErrorBasis | None = None) -
 
 def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     level = uncertainty.level
-    dependence = uncertainty.dependence
+    dependence = uncertainty.unexplained
     factor = float(np.sqrt(level.pooled))
-    limit = float(normal_isf(RARE / 2)) * dependence.lag1_deviation
-    persistent = abs(dependence.lag1) > max(PERSISTENT, limit)
-    shared = dependence.shared_p < RARE
-    is_used = uncertainty.errors == "autocorrelated" and (persistent or shared)
+    persistent, shared = _correlations(dependence)
+    is_used = uncertainty.errors == "autocorrelated"
     larger = factor > MISFIT and level.larger_p < RARE
     # Of single samples nothing tells that it is noise; of a few, only a clear correlation tells
     # that it is not.
@@ -209,7 +208,7 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     )
     # Residuals of exactly zero are those of no measurement at all. Dependent residuals scatter less
     # by chance, too, and their error bars do not follow from sigma.
-    least = GROSS_MISFIT if is_used else MISFIT
+    least = GROSS_MISFIT if is_used and any(_correlations(uncertainty.dependence)) else MISFIT
     smaller = not larger and 0 < factor < 1 / least and level.smaller_p < RARE
     sigma_key = level.sigma_key
     return [
@@ -220,7 +219,7 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
             code="residuals/persist",
             autocorrelation=dependence.lag1,
         ),
-        *concern_if(is_used and not persistent, False, code="residuals/shared"),
+        *concern_if(is_used and shared and not persistent, False, code="residuals/shared"),
         *concern_if(
             larger,
             factor > GROSS_MISFIT and no_noise,
@@ -233,6 +232,12 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
         ),
         *_noisy_marker_concerns(level),
     ]
+
+
+def _correlations(dependence: Dependence) -> tuple[bool, bool]:
+    """Return whether residuals are correlated in time, and among channels, so that it counts."""
+    limit = float(normal_isf(RARE / 2)) * dependence.lag1_deviation
+    return abs(dependence.lag1) > max(PERSISTENT, limit), dependence.shared_p < RARE
 
 
 def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:

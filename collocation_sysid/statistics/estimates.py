@@ -527,7 +527,9 @@ def noise_notes(requested: str, kind: Noise, level: NoiseLevel, errors: str) -> 
     return [f"the residuals are {size}; {so}"]
 
 
-def correlation_notes(requested: str, errors: str, dependence: Dependence) -> list[str]:
+def correlation_notes(
+    requested: str, errors: str, dependence: Dependence, *, unexplained: Dependence
+) -> list[str]:
     """Return one note, as a list, on correlated residuals and how the error bars account for that;
     else empty.
 
@@ -540,8 +542,8 @@ def correlation_notes(requested: str, errors: str, dependence: Dependence) -> li
         Errors that the user requested.
     errors : {"independent", "autocorrelated"}
         Errors that were used.
-    dependence : Dependence
-        Tests of the residuals.
+    dependence, unexplained : Dependence
+        Tests of all residuals, and of those that cannot be slow errors of instruments.
     """
     if not dependence.is_correlated() or (
         errors != "autocorrelated" and requested != "independent"
@@ -571,6 +573,8 @@ def correlation_notes(requested: str, errors: str, dependence: Dependence) -> li
             ": the model or the description of the experiment may lack a small effect, such as the "
             "mass of markers or the memory of the material"
         )
+    if not unexplained.is_correlated():
+        lacking = ", as errors of tracked pixels are, and are within sigma"
     return [
         f"the residuals {pattern}{lacking}. The error bars are widened by a model of autocorrelated "
         "errors, but do not cover a bias"

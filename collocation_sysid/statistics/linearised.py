@@ -143,6 +143,7 @@ class ResidualBlock:
     disturbances: Array | None = None
     has_noise_floor: bool = False  # see `MeasurementResidual`
     sigma_ratios: Array | float = 1.0  # (T, M, 3) or float: σ of each number over `sigma_m`
+    errs_slowly: bool = False  # see `MeasurementResidual`
 
     @cached_property
     def is_measured(self) -> Mask:
@@ -170,6 +171,10 @@ class ResidualBlock:
         long, short = (np.linalg.norm(r, axis=2) for r in (self.misfit, self.residual))
         share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
         return np.sqrt(share)[..., None]
+
+    def may_be_slow_errors(self) -> bool:
+        """Return whether the instrument may err slowly, and the residuals are within its σ."""
+        return self.errs_slowly and np.sum(self.residual**2) <= self.count_measurements()
 
     def count_measurements(self) -> int:
         """Return the number of coordinates that exist: of scalar measurements in this block."""
@@ -339,6 +344,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                     places_m=reading.pooled_groups.places_m,
                     has_noise_floor=reading.has_noise_floor,
                     sigma_ratios=reading.sigma_ratios,
+                    errs_slowly=reading.errs_slowly,
                 )
             )
     prior_residual, prior_slope = collocation.prior_residuals(p)

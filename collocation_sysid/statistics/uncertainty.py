@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -116,6 +117,9 @@ class ErrorBasis:
     errors: Errors  # correlation of the errors
     level: NoiseLevel  # size of the residuals of each marker
     dependence: Dependence  # tests of the residuals for correlation
+    # The same without the measurements whose instruments may err slowly, as trackers of videos do,
+    # and whose residuals are within their σ.
+    unexplained: Dependence
     # Single samples that dominate the residuals of their marker; `analyse_dependence` leaves them
     # out.
     outliers: tuple[Outlier, ...]
@@ -297,7 +301,9 @@ def uncertainty_from_fit(
             *parameter_notes(parameters, estimates),
             *memory_notes(estimates, longest_s),
             *noise_notes(error_model.noise, basis.noise, level=basis.level, errors=basis.errors),
-            *correlation_notes(error_model.errors, basis.errors, dependence=basis.dependence),
+            *correlation_notes(
+                error_model.errors, basis.errors, basis.dependence, unexplained=basis.unexplained
+            ),
             *disagreement_notes(parameters, scatter),
         ),
         scatter=scatter,
@@ -319,6 +325,7 @@ def _error_bars(
     level = estimate_noise_level(fit, factored)
     without_outliers, outliers = remove_outliers(fit)
     dependence, dependent = _dependence(without_outliers)
+    unexplained = _unexplained_dependence(without_outliers, dependence)
     correlated = requested.errors == "autocorrelated" or (requested.errors == "auto" and dependent)
     kind: Noise = level.suggest_noise() if requested.noise == "auto" else requested.noise
     if requested.noise == "auto" and correlated and level.pooled < 1:
@@ -344,7 +351,7 @@ def _error_bars(
         covariance = covariance.copy()
         covariance[shared, shared] += fit.phase_covariance
         determined[shared, shared] += fit.phase_covariance
-    basis = ErrorBasis(kind, used, level=level, dependence=dependence, outliers=outliers)
+    basis = ErrorBasis(kind, used, level, dependence, unexplained, outliers)
     return covariance, determined, student_ppf(0.975, freedom), basis
 
 
@@ -454,6 +461,21 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     return tested, tested.is_correlated() and not _is_explained(
         fit, factored, level=level, result=tested
     )
+
+
+def _unexplained_dependence(fit: LinearisedFit, dependence: Dependence) -> Dependence:
+    """Return the tests of the residuals without those that may be slow errors of instruments;
+    `dependence` has the tests of all.
+    """
+    kept = [not block.may_be_slow_errors() for block in fit.blocks]
+    if all(kept):
+        return dependence
+    if not any(kept):
+        return Dependence(0.0, np.inf, shared_p=1.0)
+    factored = factorise_information(fit)
+    slopes = tuple(compress(factored.scaled_jacobians, kept))
+    rest = replace(fit, blocks=tuple(compress(fit.blocks, kept)))
+    return analyse_dependence(rest, replace(factored, scaled_jacobians=slopes))
 
 
 def _is_explained(

@@ -43,6 +43,9 @@ SWING_SEED = 109
 BENCH_SEED = 1
 # Rendered video: images, their rate, tracked points, and seed of the errors of the camera.
 VIDEO_IMAGES, VIDEO_HZ, VIDEO_POINTS, VIDEO_SEED = 84, 60, 16, 5
+# Noise that is added to the tracked pixels, because rendered images are tracked more precisely than
+# those of cameras.
+VIDEO_NOISE_PX = 0.1
 
 
 def swing(folder: Path) -> None:
@@ -144,6 +147,7 @@ def video(folder: Path) -> None:
     shape = rendered_video.motion(rendered_video.surface()[0])
     t_s = np.arange(VIDEO_IMAGES) / VIDEO_HZ
     described = rendered_video.film(folder, "front", shape, t_s, VIDEO_SEED, VIDEO_POINTS)
+    add_noise(folder / "front.csv")
     for name in ("front.mp4", "mask.png"):
         (folder / name).unlink()
     file = folder / "problem.toml"
@@ -152,6 +156,17 @@ def video(folder: Path) -> None:
     _, _, comment = lines[k].partition("#")
     lines[k] = f"pose = {rendered_video.pose_text(described.pose)}   #{comment}"
     write_text_file(file, "\n".join([*lines, ""]))
+
+
+def add_noise(file: Path) -> None:
+    """Add noise to the pixels of a table of tracks."""
+    rng = np.random.default_rng(VIDEO_SEED)
+    head, *rows = (line.split(",") for line in file.read_text(encoding="utf-8").splitlines())
+    for row in rows:
+        for k, name in enumerate(head):
+            if name.endswith(("_u", "_v")):
+                row[k] = f"{float(row[k]) + VIDEO_NOISE_PX * rng.normal():.3f}"
+    write_text_file(file, "\n".join([*map(",".join, [head, *rows]), ""]))
 
 
 KINDS = {"swing": swing, "compression": compression, "tension": tension, "specimen": specimen}

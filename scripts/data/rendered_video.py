@@ -44,8 +44,9 @@ TURN_RAD, SHIFT_M, FOCAL, CENTRE_SIGMA_PX, CLOCK_S = np.deg2rad(1.0), 5e-3, 5e-3
 SQUARE_M = 2.5e-3
 # Standard deviation of the noise of the grey values.
 NOISE_GREY = 2.0
-# Width of the edge that masks leave out [pixels].
-EDGE_PX = 25
+# Size of the surroundings by which trackers recognise a point [pixels]: masks leave out points whose
+# surroundings contain an edge of the bar, because faces beside an edge change differently.
+SURROUNDINGS_PX = 31
 
 
 def hand_positions(t_s: Array) -> Array:
@@ -211,15 +212,25 @@ def render(shape: CubicSpline, pose: Array, t_s: Array, seed: int) -> Iterator[N
 
 
 def mask_of(shape: CubicSpline, pose: Array, t_s: float) -> NDArray[np.uint8]:
-    """Return an image that is white where the bar is at a time, without its edge."""
+    """Return an image that is white where the camera sees a face of the bar at a time, without the
+    edges of the faces.
+    """
     import cv2
 
-    own = (shape(t_s) - pose[:3, 3]) @ pose[:3, :3]
-    pixels = own[:, :2] / own[:, 2:] * FOCAL_PX + CENTRE_PX
+    rest, now = surface()[0], shape(t_s)
+    own = (now - pose[:3, 3]) @ pose[:3, :3]
+    pixels = np.round(own[:, :2] / own[:, 2:] * FOCAL_PX + CENTRE_PX).astype(np.int32)
     mask = np.zeros(IMAGE_PX[::-1], dtype=np.uint8)
-    cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 255)
-    eroded = cv2.erode(mask, np.ones((EDGE_PX, EDGE_PX), dtype=np.uint8))
-    return np.asarray(eroded, dtype=np.uint8)
+    for axis in range(3):
+        for end in (0.0, SIZE_M[axis]):
+            on_face = rest[:, axis] == end
+            middle = now[on_face].mean(axis=0)
+            if (pose[:3, 3] - middle) @ (middle - now.mean(axis=0)) > 0:
+                face = np.zeros_like(mask)
+                cv2.fillConvexPoly(face, cv2.convexHull(pixels[on_face]), 255)
+                square = np.ones((SURROUNDINGS_PX, SURROUNDINGS_PX), dtype=np.uint8)
+                mask |= np.asarray(cv2.erode(face, square), dtype=np.uint8)
+    return mask
 
 
 def film(

@@ -189,6 +189,7 @@ def codes(kind, errors, second=None):
             sigma_key=key,
             components=np.broadcast_to(is_number, each.residual.shape),
             is_static=kind == "specimen",
+            errs_slowly=kind == "image tracks",
         )
         for each in fit.blocks
     ]
@@ -222,8 +223,16 @@ def small_but_persistent(kind):
     slow = autoregressive(np.random.default_rng(3), SAMPLES, BLOCKS[kind][1][0], 0.99)
     found = codes(kind, slow / 4)
     assert named(kind, "noise/smaller") in found
-    if kind != "specimen":
+    if kind not in ("specimen", "image tracks"):
         assert "residuals/persist" in found
+
+
+def test_slow_errors_of_trackers_within_sigma_are_no_reason():
+    """Those of other instruments are, and so are larger ones of trackers."""
+    slow = autoregressive(np.random.default_rng(3), SAMPLES, 5, 0.95)
+    assert codes("image tracks", 0.5 * slow) == set()
+    assert "residuals/persist" in codes("image tracks", 2 * slow)
+    assert "residuals/persist" in codes("markers", 0.5 * slow[:, :3])
 
 
 def one_is_noisier(kind):

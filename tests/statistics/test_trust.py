@@ -166,7 +166,7 @@ def test_gross_residuals_of_few_samples_are_doubtful_if_clearly_correlated(lag1,
     few_samples = Dependence(lag1, lag1_deviation=0.4, shared_p=1.0)
     (larger,) = (
         each
-        for each in fit_concerns(replace(found, dependence=few_samples))
+        for each in fit_concerns(replace(found, dependence=few_samples, unexplained=few_samples))
         if each.code == "noise/larger"
     )
     assert larger.grade == grade
@@ -174,14 +174,14 @@ def test_gross_residuals_of_few_samples_are_doubtful_if_clearly_correlated(lag1,
 
 def test_the_note_on_a_slight_correlation_does_not_contradict_a_good_verdict():
     slight, strong = (Dependence(lag1, lag1_deviation=0.01, shared_p=1.0) for lag1 in (0.08, 0.4))
-    (note,) = correlation_notes("auto", "autocorrelated", slight)
+    (note,) = correlation_notes("auto", "autocorrelated", slight, unexplained=slight)
     assert "slightly correlated" in note
     assert "may lack a small effect" in note
-    (note,) = correlation_notes("auto", "autocorrelated", strong)
+    (note,) = correlation_notes("auto", "autocorrelated", strong, unexplained=strong)
     assert "lacks an effect" in note
     fit, _ = OF.fit([RNG(0).normal(size=(80, 3, 3))], np.zeros(len(OF.names)))
     found = uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
-    assert not fit_concerns(replace(found, dependence=slight))
+    assert not fit_concerns(replace(found, dependence=slight, unexplained=slight))
 
 
 def test_the_remedy_of_an_unknown_of_a_specimen_is_on_the_page_of_specimens():

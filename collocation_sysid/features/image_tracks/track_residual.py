@@ -45,6 +45,7 @@ class ImageTrackResidual(CameraImagesResidual):
 
     sigma_key = "sigma_px"
     is_compiled = True
+    errs_slowly = True
 
     @cached_property
     def _stencil(self) -> RowStencil:
