@@ -7,7 +7,7 @@ capture of the same points with 0.5 mm of noise and places of the same accuracy.
 projected here, without the package's model of tracks.
 
     python scripts study_image_tracks [--twins 24] [--first 0] [--places known|unknown]
-        [--turn-deg 1] [--shift-m 0.005] [--outliers 0] [--cameras 1,2,3,0]
+        [--turn-deg 1] [--shift-m 0.005] [--outliers 0] [--rate-hz 100] [--cameras 1,2,3,0]
 """
 
 from __future__ import annotations
@@ -105,7 +105,8 @@ def film(
     """Return what a camera with drawn errors records, as its description states it."""
     pose = looking(np.array(EYES_M[name]))
     late_s = DELAY_S * rng.normal()
-    own = (motion(T_S + late_s) - pose[:3, 3]) @ pose[:3, :3]
+    taken_s = T_S if options.rate_hz is None else np.arange(0.0, T_S[-1], 1 / options.rate_hz)
+    own = (motion(taken_s + late_s) - pose[:3, 3]) @ pose[:3, :3]
     turn = Rotation.from_rotvec(np.deg2rad(options.turn_deg) * rng.normal(size=3))
     own = turn.apply(own.reshape(-1, 3)).reshape(own.shape) + options.shift_m * rng.normal(size=3)
     matrix = MATRIX.copy()
@@ -119,7 +120,7 @@ def film(
     return cs.ImageTracks(
         name,
         cs.Camera(MATRIX, DISTORTION, pose, size_px=(1280, 720)),
-        T_S,
+        taken_s,
         pixels[:, seen],
         [NAMES[k] for k in seen],
         places_m=STATED_M[seen] if options.places == "known" else None,
@@ -161,6 +162,7 @@ def main() -> None:
     parser.add_argument("--places", choices=("known", "unknown"), default="known")
     parser.add_argument("--turn-deg", type=float, default=1.0)
     parser.add_argument("--shift-m", type=float, default=5e-3)
+    parser.add_argument("--rate-hz", type=float)
     parser.add_argument("--outliers", type=float, default=0.0)
     parser.add_argument("--cameras", default="1,2,3,0")
     options = parser.parse_args()

@@ -94,6 +94,8 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
         "none",
     )
     yield ("depth cameras, because frames do not contain their images", experiment.depths, "none")
+    filmed = [each for each in experiment.readings if each.counts_pixels]
+    yield "image tracks and outlines, which follow the estimates", filmed, "markers"
     following = [each for each in experiment.readings if isinstance(each, FollowingSensor)]
     yield "sensors whose nodes follow the estimates", following, "sensors of fixed points"
     delayed = experiment.obstacles and nuisance.obstacle_time_s
