@@ -133,11 +133,12 @@ def validate_arguments(
     stated_fields = fields(called) if is_dataclass(called) else ()
     made = {each.name for each in stated_fields if each.default_factory is not MISSING}
 
-    @cache
-    def validators() -> list[tuple[str, Any, Any]]:
+    def made_validators() -> list[tuple[str, Any, Any]]:
         """Return name, default and validator of each argument that has a form."""
         stated = {n: f for n, f in forms().items() if n in signature.parameters and f is not None}
         return [(n, signature.parameters[n].default, _validator(f)) for n, f in stated.items()]
+
+    validators = _Kept(made_validators)
 
     @wraps(function)
     def call(*arguments: Any, **by_name: Any) -> Any:
@@ -162,6 +163,24 @@ def validate_arguments(
     if is_class:
         called.__init__ = call
     return called if is_class else call
+
+
+class _Kept:
+    """Function without arguments that keeps its value. The value is made anew in another process,
+    so that classes of a user's script can be pickled.
+    """
+
+    def __init__(self, compute: Callable[[], Any]) -> None:
+        self._compute = compute
+        self._value: Any = None
+
+    def __call__(self) -> Any:
+        if self._value is None:
+            self._value = self._compute()
+        return self._value
+
+    def __reduce__(self) -> Any:
+        return _Kept, (self._compute,)
 
 
 def _title(called: Any) -> str:
