@@ -2,11 +2,11 @@
 
 A cylinder of MuJoCo (energy of St. Venant and Kirchhoff, damping of MuJoCo, a fine mesh) is recorded
 once. A body of this package with a coarser mesh and default damping law is identified from six noisy
-markers. Four motions are planned and executed in MuJoCo: the tip moves along a circle, moves by
-200 mm from rest to rest along a path of least jerk or on any path, and stays where it is while the
-hand moves by 50 mm. The tip is compared with its reference for the plan, for a plan with the
-estimates of the penalty method, and for hands that move as if the body were rigid, with and without a
-zero-vibration shaper.
+markers. Five motions are planned and executed in MuJoCo: the tip moves along a circle, moves by
+200 mm from rest to rest along a path of least jerk, by a hand that keeps its orientation or turns, or
+on any path, and stays where it is while the hand moves by 50 mm. The tip is compared with its
+reference for the plan, for a plan with the estimates of the penalty method, and for hands that move
+as if the body were rigid, with and without a zero-vibration shaper.
 
     python scripts study_planning
     python scripts study_planning --tasks circle --no-penalty
@@ -320,6 +320,13 @@ def straight() -> Wanted:
     return Wanted(_task(0.5, tip), tip, lambda share: np.pad(tip(share), ((0, 0), (0, 3))))
 
 
+def turning() -> Wanted:
+    """The same by a hand that may turn."""
+    wanted = straight()
+    free = wanted.task.hand.model_copy(update={"free": ["x", "z", "ry"], "jerk_weight": 1e-5})
+    return replace(wanted, task=wanted.task.model_copy(update={"hand": free}))
+
+
 def arrival() -> Wanted:
     """The tip arrives 200 mm away after 0.5 s, on any path, and rests."""
     wanted = straight()
@@ -347,7 +354,13 @@ def still() -> Wanted:
     return Wanted(task, tip, hand)
 
 
-TASKS = {"circle": circle, "straight": straight, "arrival": arrival, "still": still}
+TASKS = {
+    "circle": circle,
+    "straight": straight,
+    "turning": turning,
+    "arrival": arrival,
+    "still": still,
+}
 
 
 @dataclass(frozen=True)

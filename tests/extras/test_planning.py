@@ -1107,6 +1107,15 @@ def test_a_robust_plan_is_better_on_average_over_the_constants():
         plan_motion(hung_bar(), task(), LIMITS, robust=True)
 
 
+def test_a_body_without_guesses_needs_a_run():
+    (hung,) = hung_bar().experiments
+    problem = cs.Problem([hung], {name: cs.Unknown() for name in TRUTH})
+    with pytest.raises(
+        InputError, match=r"young_pa: this parameter has no guess.* that identified"
+    ):
+        PlannedBody.read(problem)
+
+
 def test_without_a_run_the_uncertainty_is_unknown():
     assert bar_plan().limiting_constant is None
     assert bar_plan().tracking_error(bar_plan().program.references[0]).band_m is None
@@ -1414,7 +1423,10 @@ def test_the_command_writes_the_plan(tmp_path: Path):
     assert outcome.code == 0, outcome.err
     content = json.loads((tmp_path / "out" / "plan.json").read_text())
     assert content["references"][0]["rms_m"] < 1e-4
-    pictures = "hand.png", "tracking.png"
+    pictures = "hand.png", "tracking.png", "report.html"
+    assert (tmp_path / "out" / "report.html").read_text().count("<img") == 2
+    assert "next: execute the plan" in outcome.out
+    assert len(outcome.out.splitlines()) <= 16
     for name in ("poses.csv", "hand.csv", "predicted_points.csv", "trajectory.mcap", *pictures):
         assert (tmp_path / "out" / name).stat().st_size
     (tmp_path / "task.toml").write_text(GOOD.replace("low", "lowest"))

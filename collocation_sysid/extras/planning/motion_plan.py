@@ -476,8 +476,6 @@ def plan_motion(
     SimulationError
         If the body has no initial equilibrium, or the motion cannot be simulated.
     """
-    say("reading the body")
-    body = PlannedBody.read(source, experiment, allow_code=allow_code)
     if not isinstance(task, Task):
         task = Task.read(task)
     if limits is None and task.hand.free:
@@ -489,6 +487,8 @@ def plan_motion(
         )
     if not isinstance(limits, Limits):
         limits = STANDING if limits is None else Limits.read(limits)
+    say("reading the body")
+    body = PlannedBody.read(source, experiment, allow_code=allow_code)
     if task.hand.joint_limits is not None and pose_limits is None:
         code = task.hand.joint_limits
         loader = CodeLoader(Path(), is_allowed=allow_code)

@@ -1,4 +1,4 @@
-"""Folder of a plan: poses for the robot, tensions and pressures, prediction, pictures and
+"""Folder of a plan: poses for the robot, tensions and pressures, prediction, pictures, report and
 plan.json.
 """
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.display import Line, Shown, Table
+from ...common.display import Line, Picture, Shown, Table, TitledParts
 from ...common.serialisation import as_json
 from ...fem.laws.constants import symbol_of
 from ...recording import write_markers_csv, write_poses_csv
@@ -19,10 +19,17 @@ from ...recording.recording_writers import write_columns_csv
 from ...result.animation import film
 from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
+from ...result.report import report_html
 from ...result.run_writers import replaced_folder
 from ...statistics.remedies import remedy_for
 from ..design.hand_motion import angular_motion
-from .execution_problems import POSES_FILE, execution_problems, problem_text, write_commands
+from .execution_problems import (
+    CHECK_FILE,
+    POSES_FILE,
+    execution_problems,
+    problem_text,
+    write_commands,
+)
 from .motion_plan import UNKNOWN, BandContribution, MotionPlan
 from .plan_pictures import plan_figures
 from .trajectory_log import write_trajectory_mcap
@@ -32,6 +39,12 @@ HAND_FILE = "hand.csv"
 PREDICTION_FILE = "predicted_points.csv"
 FILM_FILE = "motion.gif"
 TRAJECTORY_FILE = "trajectory.mcap"
+REPORT_FILE = "report.html"
+CAPTIONS = {
+    "hand": "The hand over time",
+    "commands": "Tensions and pressures, with their limits",
+    "tracking": "Displacements of the points with their 95 % bands, and their references, dashed",
+}
 # Form of plan.json.
 SCHEMA = 1
 FRAMES_PER_SECOND = 25.0
@@ -49,7 +62,7 @@ def write_plan(
 
     It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
     acceleration), command_<name>.csv of each planned tendon and pressure, predicted_points.csv,
-    pictures, plan.json, with `with_film` motion.gif, and, if the problem was read from a file,
+    pictures, report.html, plan.json, with `with_film` motion.gif, and, if the problem was read from a file,
     check.toml and identify.toml for a recorded execution.
 
     Parameters
@@ -88,7 +101,12 @@ def write_plan(
                 names=[*plan.points_m],
                 positions_m=np.stack([*plan.points_m.values()], axis=1),
             )
-        save_pictures(place, plan_figures(plan))
+        figures = plan_figures(plan)
+        save_pictures(place, figures)
+        pictures = (Picture(place / f"{name}.png", CAPTIONS[name]) for name in figures)
+        title = f"Plan for {plan.program.body.template.name!r}"
+        report = TitledParts(title, (*plan_summary(plan, target), *pictures), level=1)
+        (place / REPORT_FILE).write_text(report_html(report), encoding="utf-8")
         if with_film:
             say("rendering the film of the motion")
             replay = MotionRecord.from_experiment(
@@ -313,5 +331,10 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
             )
         )
     shown += _limit_lines(plan)
-    shown.append(f"written to {folder}")
+    shown.append(f"written to {folder}; the page is {REPORT_FILE}")
+    if (folder / CHECK_FILE).is_file():
+        shown.append(
+            "next: execute the plan, replace poses.csv and predicted_markers.csv with the recorded "
+            f"files, and run collocation-sysid solve {folder / CHECK_FILE}"
+        )
     return shown
