@@ -9,6 +9,7 @@ import pytest
 from kit.problem_files import run_command, write_problem
 
 import collocation_sysid as cs
+from collocation_sysid.result.pictures.stress_strain import harmonic_picture, is_harmonic
 
 YOUNG_PA, SHARES, TAU_S = 2e5, np.array([0.5, 2.0]), np.array([10.0, 0.1])
 MEMORY = {"a.share": 0.5, "a.tau_s": 10.0, "b.share": 2.0, "b.tau_s": 0.1}
@@ -306,3 +307,18 @@ def test_a_table_and_a_swing_of_one_body_are_one_problem(tmp_path):
         assert lower < MIXED_TRUTH[name] < upper
         assert found[name]["value"] == pytest.approx(MIXED_TRUTH[name], rel=relative)
     assert found["lambda_pa"]["value"] == pytest.approx(MIXED_TRUTH["lambda_pa"], rel=0.2)
+
+
+def test_the_picture_of_a_harmonic_test_has_its_moduli_over_frequency():
+    storage, loss = complex_modulus_pa(FREQUENCY_HZ)
+    specimen = cs.Specimen.harmonic(FREQUENCY_HZ, storage, loss, 0.01)
+    assert is_harmonic(specimen.strain)
+    assert not is_harmonic(cs.Specimen.relaxation([1.0, 2.0], [2.0, 1.0], 0.1).strain)
+    assert not is_harmonic(np.linspace(0.0, 0.1, 5))
+    stress = specimen.stress_pa
+    samples = np.column_stack([specimen.t_s, stress, stress, np.full_like(stress, np.nan)])
+    (axes,) = harmonic_picture(specimen.strain, specimen.t_s, samples).axes
+    lines = {line.get_label(): line for line in axes.lines}
+    np.testing.assert_allclose(lines["storage, measured"].get_ydata(), storage / 1e3)
+    np.testing.assert_allclose(lines["loss, measured"].get_ydata(), loss / 1e3)
+    np.testing.assert_allclose(lines["loss, measured"].get_xdata(), FREQUENCY_HZ)

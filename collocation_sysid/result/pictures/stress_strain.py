@@ -1,5 +1,5 @@
-"""Pictures of specimens and test benches: stress over strain and force over displacement, measured,
-fitted and simulated.
+"""Pictures of specimens and test benches: stress over strain, complex modulus over frequency, and
+force over displacement, measured, fitted and simulated.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
+from ...recording.specimen import RELAXED_STRAIN
 from ..figure_style import BLACK, COLUMN_MM, add_legend_above, framed_figure, style_axes
 from .over_time import drawn_models
 
@@ -46,6 +47,36 @@ def strain_picture(strain: Array, t_s: Array, samples: Array, name: str, unit: s
     shown_unit, factor = _readable_unit(samples[:, 1], unit)
     label = f"{name} [{shown_unit}]" if shown_unit else name
     return _curve(at, factor * samples[:, 1:], xlabel="strain", ylabel=label)
+
+
+def is_harmonic(strain: Array) -> bool:
+    """Return whether strains (T,) are those of a harmonic test, see `Specimen.harmonic`."""
+    rest, amplitudes = strain[::2], strain[1::2]
+    is_small = len(strain) > 1 and amplitudes.max() <= 1.001 * RELAXED_STRAIN
+    return bool(is_small and len(strain) % 2 and amplitudes.min() > 0 and not rest.any())
+
+
+def harmonic_picture(strain: Array, t_s: Array, samples: Array) -> Figure:
+    """Return a figure of storage and loss modulus over frequency; arguments as of `strain_picture`."""
+    moduli_pa = samples[1:, 1:].reshape(-1, 2, 3) / strain[1::2, None, None] * [[[1], [-1]]]
+    frequency_hz = 0.25 / np.diff(t_s)[::2]
+    unit, factor = _readable_unit(moduli_pa, "Pa")
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=13)
+    axes = figure.subplots()
+    order = np.argsort(frequency_hz)
+    for part, (title, marker) in enumerate((("storage", "o"), ("loss", "s"))):
+        measured, fitted, simulated = factor * moduli_pa[order, part].T
+        dots = {"ls": "", "marker": marker, "ms": 3, "mec": BLACK, "mew": 0.5, "zorder": 3}
+        fill = "white" if part else BLACK
+        axes.plot(frequency_hz[order], measured, label=f"{title}, measured", mfc=fill, **dots)
+        models = (each if np.isfinite(each).any() else None for each in (fitted, simulated))
+        for label, values, style in drawn_models(*models):
+            axes.plot(frequency_hz[order], values, label="" if part else label, **style)
+    style_axes(axes, "", xlabel="frequency [Hz]", ylabel=f"modulus [{unit}]")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    add_legend_above(axes, columns=2)
+    return figure
 
 
 def force_picture(travel_m: Array, t_s: Array, samples: Array) -> Figure | None:
