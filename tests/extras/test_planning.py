@@ -1280,8 +1280,10 @@ def test_tasks_that_do_not_fit_the_body_are_explained(changes, message):
         program(**changes)
 
 
-def test_references_of_a_file_leave_empty_cells_free(tmp_path: Path):
-    (tmp_path / "tip.csv").write_text("t_s,x_m,z_m\n0,0,0\n0.4,0.01,\n0.8,0.02,0.01\n")
+@pytest.mark.parametrize(("head", "times"), [("t_s", "0 0.4 0.8"), ("t_ms", "0 400 800")])
+def test_references_of_a_file_leave_empty_cells_free(tmp_path: Path, head: str, times: str):
+    rows = zip(times.split(), ("0,0", "0.01,", "0.02,0.01"), strict=True)
+    (tmp_path / "tip.csv").write_text("\n".join([f"{head},x_m,z_m", *map(",".join, rows)]))
     (tmp_path / "task.toml").write_text(
         GOOD.replace("t_s = [0.8]", 'file = "tip.csv"\ninterpolation = "linear"').replace(
             "position_m = [[0.02, 0.0, nan]]\n", ""
