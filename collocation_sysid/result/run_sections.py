@@ -370,7 +370,7 @@ def _combination_text(result: Result, name: str) -> str:
     """Return the best determined combination of a parameter with others; "" if there is none."""
     for each in result.combinations:
         if name in each.determined.names and not each.is_lone:
-            return f"only {each.determined.formula()} {each.precision()}".rstrip()
+            return f"only {each.determined.label} {each.precision()}".rstrip()
     return ""
 
 

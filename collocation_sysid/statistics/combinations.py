@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from textwrap import shorten
 from typing import Literal
 
 import numpy as np
@@ -46,6 +47,8 @@ LARGEST_LOGARITHM = 700.0
 KNOWN = 0.05
 # Number of recordings whose effect is predicted, over those that were made.
 REPETITIONS = 4
+# Longest formula in a table or a picture, in characters; sentences have all of it.
+LONGEST_FORMULA = 27
 # A modulus replaces a combination if its interval is at most this many times as wide.
 SAME = 1.5
 
@@ -104,6 +107,11 @@ class Direction:
             w = w * values[kept[0]] / values[kept]
         factor = float(np.exp(min(NORMAL_95 * np.sqrt(variance), LARGEST_LOGARITHM)))
         return cls(own, tuple(w.tolist()), form, factor)
+
+    @property
+    def label(self) -> str:
+        """The formula for a table or a picture, in which a long one ends with "…"."""
+        return shorten(self.formula(), LONGEST_FORMULA, placeholder=" …")
 
     def formula(self) -> str:
         """Return the combination as text, such as "λ + 0.9 μ" or "E · ν^0.22"."""

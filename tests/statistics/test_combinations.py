@@ -113,6 +113,15 @@ def test_values_that_are_not_positive_have_no_powers():
     assert found.sentence() == "the data determine a combination of λ, μ better than each of them"
 
 
+def test_a_table_has_the_beginning_of_a_long_combination():
+    names = tuple(f"prony_{part}_{k}" for k in (1, 2, 3) for part in ("share", "time_s"))
+    long = Direction(names, (1.0, -0.8, 0.7, -0.6, 0.5, -0.4), "product", 1.1)
+    assert len(long.label) <= 27 < len(long.formula())
+    assert long.formula().startswith(long.label.removesuffix(" …"))
+    short = Direction(MODULI, (1.0, 0.9), "sum", 1.1)
+    assert short.label == short.formula() == "λ + 0.9 μ"
+
+
 def test_a_modulus_that_is_known_as_well_names_the_combination():
     weights = np.array([1.0, 0.9]) / 1.9
     moduli = {"young_pa": weights, "poisson": np.array([1.0, -1.0])}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from textwrap import shorten
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -228,10 +227,6 @@ PRECISION_TICKS = {1.001: "0.1 %", 1.01: "1 %", 1.1: "10 %", 2.0: "×2", 10.0: "
 WIDEST_DRAWN = 1e4
 
 
-# Longest formula that is drawn, in characters; the report has all of it.
-LONGEST_FORMULA = 27
-
-
 def combinations_picture(alone: Mapping[str, float], directions: Sequence[Direction]) -> Figure:
     """Return a figure of the 95 % intervals of constants alone and of their independent
     combinations, as bars over a logarithmic axis.
@@ -247,10 +242,7 @@ def combinations_picture(alone: Mapping[str, float], directions: Sequence[Direct
         Combinations, the best determined first.
     """
     rows = [(symbol_of(name), factor) for name, factor in alone.items()]
-    rows += [
-        (shorten(each.formula(), LONGEST_FORMULA, placeholder=" …"), each.factor)
-        for each in directions
-    ]
+    rows += [(each.label, each.factor) for each in directions]
     longest = max(len(text) for text, _ in rows)
     figure = framed_figure(
         COLUMN_MM, 16 + 6 * len(rows), left_mm=min(45.0, 6 + 1.5 * longest), right_mm=5, foot_mm=11,
