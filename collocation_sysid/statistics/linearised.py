@@ -174,7 +174,7 @@ class ResidualBlock:
 
     def may_be_slow_errors(self) -> bool:
         """Return whether the instrument may err slowly, and the residuals are within its σ."""
-        return self.errs_slowly and np.sum(self.residual**2) <= self.count_measurements()
+        return self.errs_slowly and bool(np.sum(self.residual**2) <= self.count_measurements())
 
     def count_measurements(self) -> int:
         """Return the number of coordinates that exist: of scalar measurements in this block."""

@@ -60,7 +60,9 @@ def recordings() -> dict[str, cs.Experiment]:
     return found
 
 
-def recording(positions_m=None, places_m=PLACES_M, readings=()) -> cs.Experiment:
+def recording(
+    positions_m: np.ndarray | None = None, places_m: np.ndarray | None = PLACES_M, readings=()
+) -> cs.Experiment:
     """Return the swung bar with its measurements."""
     share = 0.5 * (1 - np.cos(np.pi * np.clip(T_S / 0.12, 0, 1)))
     poses = np.tile(np.eye(4), (len(T_S), 1, 1))

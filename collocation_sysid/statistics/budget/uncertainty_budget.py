@@ -359,7 +359,7 @@ def _determined_rulers(
 
 def _covariance(fit: LinearisedFit) -> Array:
     information = least_squares_of_fit(fit).compute_information()
-    return np.linalg.pinv(information, hermitian=True)
+    return np.asarray(np.linalg.pinv(information, hermitian=True), float)
 
 
 def rescaled(step: Array, parameters: Parameters, is_proportional: Callable[[str], bool]) -> Array:
