@@ -10,6 +10,7 @@ from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.probes.relaxed_assumptions import EstimateChange, Probe, assumption_name
+from ..statistics.probes.routine_probes import is_possible
 from ..statistics.thresholds import SIGNIFICANT_ALONE
 
 # Measures of stiffness, the most important first.
@@ -161,9 +162,10 @@ def _conclusions(result: Result) -> Iterator[str]:
     assumption that the data do not determine follows.
     """
     significant = [probe for probe in result.probes if probe.sentences]
-    relaxed = sorted(
+    assumptions = sorted(
         (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
     )
+    relaxed = [p for p in assumptions if is_possible(p)]
     for kind in ("window", "recording"):
         disagreeing = [p for p in significant if p.kind == kind]
         if disagreeing:
@@ -186,6 +188,12 @@ def _conclusions(result: Result) -> Iterator[str]:
         )
         if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
             yield f"alternative explanations with similar effects: {listed(others)}"
+    if len(relaxed) < len(assumptions):
+        most = next(p.chi_squared for p in assumptions if not is_possible(p))
+        yield (
+            f"χ² would decrease by {most:.3g} with memory of a negative share, which no material "
+            "has: this is another effect, not memory"
+        )
     elif not significant and is_routine(result):
         tested = listed(source_label(probe.name) for probe in _largest_probes(result))
         first = max(result.probes, key=lambda probe: probe.chi_squared)

@@ -70,6 +70,23 @@ def test_a_probe_without_shown_estimates_states_no_changes():
     assert first.endswith("χ² decreases by 30; measure it, or estimate it")
 
 
+def test_memory_of_a_negative_share_is_called_another_effect():
+    def probe(name: str, size: float, chi_squared: float) -> SimpleNamespace:
+        return SimpleNamespace(
+            name=name, kind="assumption", sentences=(name,), chi_squared=chi_squared, size=size,
+            size_error=0.03, moves={}, routine=True,
+        )  # fmt: skip
+
+    probes = [probe("memory_share τ=0.01s", -0.25, 79.8), probe("clock_rate", 0.1, 30.0)]
+    result: Any = SimpleNamespace(probes=probes, collect_estimates=dict, parameters={}, budget={})
+    measured, impossible = _conclusions(result)
+    assert measured.startswith("the data determine clock rate")
+    assert impossible.startswith("χ² would decrease by 79.8 with memory of a negative share")
+    result.probes = probes[:1]
+    (impossible,) = _conclusions(result)
+    assert impossible.endswith("this is another effect, not memory")
+
+
 @pytest.mark.parametrize(("chi_squared", "explained"), [(44.0, True), (4.0, False)])
 def test_a_decrease_without_a_finding_is_explained(chi_squared, explained):
     probe = SimpleNamespace(

@@ -148,14 +148,20 @@ def significance_limit(changes: ResidualChanges, name: str) -> float:
     return float(normal_isf(RARE / 2 / tests))
 
 
-def is_alarming(probe: Probe) -> bool:
-    """Whether a probe relaxes an assumption that is significant (it has `sentences`), relevant to
-    the estimates (`relevance` at least `RELEVANT`), and explains the residuals (`suffices`); false
-    for parts of the data, and for memory with a negative share, which no material has.
+def is_possible(probe: Probe) -> bool:
+    """Whether a body can have the size of a relaxed assumption: no material has a memory with a
+    negative share.
     """
-    is_possible = assumption_name(probe.name) != MEMORY or (probe.size or 0.0) > 0
+    return assumption_name(probe.name) != MEMORY or (probe.size or 0.0) > 0
+
+
+def is_alarming(probe: Probe) -> bool:
+    """Whether a probe relaxes an assumption that is possible, significant (it has `sentences`),
+    relevant to the estimates (`relevance` at least `RELEVANT`), and explains the residuals
+    (`suffices`); false for parts of the data.
+    """
     return (
-        is_possible
+        is_possible(probe)
         and probe.suffices
         and bool(probe.sentences)
         and probe.kind == "assumption"
