@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +214,32 @@ def test_files_that_are_no_masks_are_refused(tmp_path: Path, content: str, messa
     (tmp_path / "front.json").write_text(content)
     with pytest.raises(cs.InputError, match=message):
         cs.Problem.read(folder_with(tmp_path, "front.json"))
+
+
+def png(size_px: tuple[int, int], second_chunk: bytes) -> bytes:
+    """A PNG file of a stated size with any second chunk."""
+    header = struct.pack(">IIBBBBB", *size_px, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", header), (second_chunk, zlib.compress(bytes(64))), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
+    )
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        png((8, 7), b"+\xb4\xd89"),
+        png((10_000, 10_000), b"IDAT"),
+        png((50_000, 50_000), b"IDAT"),
+        b"",
+    ],
+    ids=["a wrong chunk", "100 million pixels", "more than memory", "empty"],
+)
+def test_damaged_png_files_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "front.png").write_bytes(content)
+    with pytest.raises(cs.InputError, match=r"front\.png: cannot be read"):
+        read_masks(tmp_path / "front.png")
 
 
 def test_a_photograph_is_no_mask(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,15 @@ Mask = NDArray[np.bool_]
 # Values of a PNG: brighter ones are the body; more of the pixels in between show a photograph.
 BRIGHT = 127
 MOST_GREY = 0.05
+# What the library raises for damaged files (a wrong chunk is a SyntaxError), and for more pixels than
+# memory may hold.
+UNREADABLE = (
+    OSError,
+    ValueError,
+    SyntaxError,
+    Image.DecompressionBombError,
+    Image.DecompressionBombWarning,
+)
 EXPECTED = (
     "expected masks as .png, a folder of these, or .json with run lengths of COCO: "
     '{"size": [rows, columns], "counts": …}, or a list of these'
@@ -58,14 +68,16 @@ def read_masks(path: Path) -> list[Mask]:
 def _read_png(file: Path) -> Mask:
     """Return the mask of a PNG: its alpha channel if that is no constant, else its brightness."""
     try:
-        with Image.open(file) as image:
-            grey = np.asarray(image.convert("L"))
-            if image.mode in ("LA", "RGBA"):
-                alpha = np.asarray(image.getchannel("A"))
-                grey = alpha if np.ptp(alpha) else grey
-            elif image.mode in ("P", "I", "I;16") or (np.ptp(grey) and grey.max() <= BRIGHT):
-                grey = np.where(np.asarray(image) > 0, 255, 0)  # numbers of objects
-    except (OSError, ValueError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(file) as image:
+                grey = np.asarray(image.convert("L"))
+                if image.mode in ("LA", "RGBA"):
+                    alpha = np.asarray(image.getchannel("A"))
+                    grey = alpha if np.ptp(alpha) else grey
+                elif image.mode in ("P", "I", "I;16") or (np.ptp(grey) and grey.max() <= BRIGHT):
+                    grey = np.where(np.asarray(image) > 0, 255, 0)  # numbers of objects
+    except UNREADABLE as error:
         raise InputError(f"cannot be read ({reason(error)}); {EXPECTED}", file) from error
     if np.mean((grey > 16) & (grey < 239)) > MOST_GREY:
         raise InputError(
