@@ -170,7 +170,7 @@ def plan(
                 allow_code=allow_code,
                 solver=solver,
                 robust=robust,
-                say=progress.announce,
+                say=progress.say,
                 watch=lambda number, value: progress.announce(
                     f"iteration {number}, objective {value:.4g} (Ctrl-C keeps the best)"
                 ),

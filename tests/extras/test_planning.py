@@ -944,7 +944,8 @@ def test_a_tendon_bends_the_shipped_tentacle(tmp_path: Path):
     assert plan.largest_error_m < 1e-5
     command = plan.commands(plan.t_s)["tendon_1"]
     assert command[0] == pytest.approx(3.077)
-    assert 4.5 < command[-1] < 6.0  # more tension bends it further
+    # At first the tip is 98 mm aside; the deflection is nearly proportional to the tension.
+    assert command[-1] / command[0] == pytest.approx(0.05 / 0.098, rel=0.1)
 
 
 # Reliability --------------------------------------------------------------------------------------
