@@ -26,6 +26,8 @@ from ...statistics.misspecification.misspecification_hypothesis import Hypothesi
 from ..feature import Feature
 from .obstacles import MESSAGES, obstacle_hypotheses
 
+# Number of faces below which the mesh determines the width of a contact.
+FEWEST_FACES = 4.0
 # Penetration of a solid from which on a node is inside, over the body's diagonal.
 DEEP = 0.01
 # Largest share of the nodes that may be inside.
@@ -84,8 +86,6 @@ def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothes
     yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=100 * share)
 
 
-# Number of faces below which the mesh determines the width of a contact.
-FEWEST_FACES = 4.0
 AT_THE_GUESS = ", at the guess"
 TOPICS = {
     "contact": Topic(
