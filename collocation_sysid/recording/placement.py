@@ -304,6 +304,24 @@ class LocatedBody:
         return best
 
 
+def barycentric_in_triangles(points: Array, triangles: Array) -> Array:
+    """Return the barycentric coordinates (..., 3) of points (..., 3) in the planes of triangles
+    (..., 3, 3).
+    """
+    first = triangles[..., 0, :]
+    ab = triangles[..., 1, :] - first
+    ac = triangles[..., 2, :] - first
+    away = points - first
+    bb, bc, cc, to_b, to_c = (
+        np.einsum("...i,...i->...", u, v)
+        for u, v in ((ab, ab), (ab, ac), (ac, ac), (away, ab), (away, ac))
+    )
+    determinants = bb * cc - bc**2
+    of_b = (cc * to_b - bc * to_c) / determinants
+    of_c = (bb * to_c - bc * to_b) / determinants
+    return np.stack([1 - of_b - of_c, of_b, of_c], axis=-1)
+
+
 def nearest_points_of_triangles(point: Array, triangles: Array) -> Array:
     """Return the point (F, 3) of each triangle (F, 3, 3) that is nearest to one point (3,), or to
     the point (F, 3) of that triangle.

@@ -66,6 +66,17 @@ def ray_hits(
         return is_hit, distance, np.stack([1 - in_b - in_c, in_b, in_c], axis=-1)
 
 
+def facing(corners: Array, points_m: Array, eyes_m: Array) -> Array:
+    """Return the cosines (...) between the normals of triangles (..., 3, 3) and the directions from
+    points (..., 3) on them to eyes (..., 3).
+    """
+    first = corners[..., 0, :]
+    normals = cross(corners[..., 1, :] - first, corners[..., 2, :] - first)
+    to_eye = eyes_m - points_m
+    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(to_eye, axis=-1)
+    return np.einsum("...i,...i->...", normals, to_eye) / np.maximum(lengths, 1e-30)
+
+
 def points_on_surface(
     origins: Array, directions: Array, nodes_m: Array, surface: Index
 ) -> tuple[Index, Array, Array]:

@@ -19,7 +19,7 @@ from ...recording.camera import Camera
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
-from .rays import points_on_surface
+from .rays import facing, points_on_surface
 from .tracked_places import poses_of_tracks
 from .tracks import ImageTracks, stated_places
 
@@ -325,10 +325,7 @@ class _Trial:
             # All faces at an edge or corner.
             faces = np.flatnonzero(away <= away.min() + 1e-6 * self.length_m)
             at = self._carried_m[:, surface[faces]]
-            normals = np.cross(at[:, :, 1] - at[:, :, 0], at[:, :, 2] - at[:, :, 0])
-            to_eye = eyes_m[:, None] - at.mean(axis=2)
-            scale = np.linalg.norm(normals, axis=2) * np.linalg.norm(to_eye, axis=2)
-            count += bool((np.sum(normals * to_eye, axis=2) < TURNED_AWAY * scale).all())
+            count += bool((facing(at, at.mean(axis=2), eyes_m[:, None]) < TURNED_AWAY).all())
         return count
 
     # Motion -----------------------------------------------------------------------------------

@@ -23,9 +23,21 @@ from ...program.correspondences import Correspondences
 from ...program.markers.marker_association import MarkerAssociation
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
-from ...recording.placement import LocatedBody, nearest_points_of_triangles
+from ...recording.placement import (
+    LocatedBody,
+    barycentric_in_triangles,
+    nearest_points_of_triangles,
+)
 from .camera_images import POSE_UNKNOWNS
-from .rays import FEWEST_POINTS, cross, is_behind, is_occluded, points_on_surface, poses_from_points
+from .rays import (
+    FEWEST_POINTS,
+    cross,
+    facing,
+    is_behind,
+    is_occluded,
+    points_on_surface,
+    poses_from_points,
+)
 from .tracks import ImageTracks, stated_places
 
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
@@ -296,7 +308,7 @@ class TrackedPlaces(Correspondences):
     def _shares(self) -> Array:
         """Barycentric coordinates (N, 3) in the faces of the places at the centre of the association."""
         corners = self._corners[self.faces]
-        shares = _barycentric(self.association.centre_places_m, corners).clip(0.0)
+        shares = barycentric_in_triangles(self.association.centre_places_m, corners).clip(0.0)
         return shares / shares.sum(axis=1, keepdims=True)
 
     @cached_property
@@ -321,7 +333,7 @@ class TrackedPlaces(Correspondences):
         corners = triangles[:, self.faces]
         points = np.einsum("nc,snci->sni", self._shares, corners)
         eyes = self.translations[:count]
-        cosines = _facing(corners, points, eyes[:, None])
+        cosines = facing(corners, points, eyes[:, None])
         before = self.is_visible[:count]
         visible = np.where(before, cosines > TURNS_HIDDEN, cosines > TURNS_VISIBLE)
         margin_m = OCCLUSION_EDGES * self._mean_edge_m
@@ -394,7 +406,7 @@ class TrackedPlaces(Correspondences):
         """
         association = self.association
         corners = self._corners
-        least = _barycentric(points_m, corners[self.faces]).min(axis=1)
+        least = barycentric_in_triangles(points_m, corners[self.faces]).min(axis=1)
         estimated = np.isin(np.arange(len(points_m)), association.estimated)
         normals = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -428,31 +440,6 @@ class TrackedPlaces(Correspondences):
         return replace(self, association=moved, faces=faces, crossings=crossings)
 
 
-def _barycentric(points_m: Array, corners: Array) -> Array:
-    """Return the barycentric coordinates (..., 3) of points (..., 3) in the planes of triangles
-    (..., 3, 3).
-    """
-    ab, ac = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    away = points_m - corners[..., 0, :]
-    normals = cross(ab, ac)
-    squares = np.einsum("...i,...i->...", normals, normals)
-    in_c = np.einsum("...i,...i->...", cross(ab, away), normals) / squares
-    in_b = np.einsum("...i,...i->...", cross(away, ac), normals) / squares
-    return np.stack([1 - in_b - in_c, in_b, in_c], axis=-1)
-
-
-def _facing(corners: Array, points_m: Array, eyes_m: Array) -> Array:
-    """Return the cosines (...) between the normals of triangles (..., 3, 3) and the directions from
-    points (..., 3) on them to eyes (..., 3).
-    """
-    normals = cross(
-        corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    )
-    to_eye = eyes_m - points_m
-    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(to_eye, axis=-1)
-    return np.einsum("...i,...i->...", normals, to_eye) / np.maximum(lengths, 1e-30)
-
-
 def _enterable_faces(
     experiment: Experiment, names: Sequence[str], poses: Mapping[str, Array], shapes_at: ShapesAt
 ) -> NDArray[np.bool_]:
@@ -471,7 +458,7 @@ def _enterable_faces(
         t_s = tracks.sample_times_s[samples]
         corners = shapes_at(t_s)[:, surface]
         eyes = camera.pose_at(t_s)[1]
-        look = _facing(corners, corners.mean(axis=2), eyes[:, None]) > 0
+        look = facing(corners, corners.mean(axis=2), eyes[:, None]) > 0
         for k, name in enumerate(names):
             if name in firsts:
                 faces[k] &= look[samples.index(firsts[name])]

@@ -14,7 +14,7 @@ from ...fem.body import Body
 from ...fem.elements import face_shape_functions
 from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
-from ...recording.placement import nearest_points_of_triangles
+from ...recording.placement import barycentric_in_triangles, nearest_points_of_triangles
 
 # Number of triangles, nearest by their middles, among which the nearest point is searched.
 NEARBY = 10
@@ -382,7 +382,7 @@ def _nearest_of_triangles(
     feet = points - height[rows, rank, None] * normals[nearest]
     (not_above,) = np.nonzero(~is_above[rows, rank])
     feet[not_above] = nearest_points_of_triangles(points[not_above], triangles[nearest[not_above]])
-    return nearest, _barycentric(feet, triangles[nearest])
+    return nearest, barycentric_in_triangles(feet, triangles[nearest])
 
 
 def _affine_values(slopes: Array, through: Array, points: Array, rows: Index) -> Array:
@@ -393,24 +393,6 @@ def _affine_values(slopes: Array, through: Array, points: Array, rows: Index) ->
     for slope, coordinate in zip(slopes.T, points.T, strict=True):
         values += np.take(slope, rows) * coordinate[:, None]
     return values
-
-
-def _barycentric(points: Array, triangles: Array) -> Array:
-    """Return the barycentric coordinates (P, 3) of points (P, 3) in the planes of triangles
-    (P, 3, 3).
-    """
-    a, b, c = triangles.transpose(1, 0, 2)
-    ab = b - a
-    ac = c - a
-    away = points - a
-    bb, bc, cc, to_b, to_c = (
-        np.einsum("pi,pi->p", u, v)
-        for u, v in ((ab, ab), (ab, ac), (ac, ac), (away, ab), (away, ac))
-    )
-    determinants = bb * cc - bc**2
-    of_b = (cc * to_b - bc * to_c) / determinants
-    of_c = (bb * to_c - bc * to_b) / determinants
-    return np.column_stack([1 - of_b - of_c, of_b, of_c])
 
 
 def _cross_2d(a: Array, b: Array) -> Array:
