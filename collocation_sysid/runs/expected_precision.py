@@ -40,9 +40,8 @@ from ..statistics.combinations import (
     WIDE,
     Combination,
     Fix,
-    find_combinations,
-    lone_constants,
     undetermined_names,
+    vague_constants,
     widest_after,
 )
 from ..statistics.estimates import relative_derivatives
@@ -82,14 +81,8 @@ class ExpectedPrecision:
         value that would determine its constants.
         """
         vague = undetermined_names(self.names, self.covariance)
-        found = find_combinations(self.names, self.values, self.covariance, vague, self.moduli)
-        noise = self.statistical
-        lone = lone_constants(self.names, self.values, self.covariance, noise, vague, found)
-        return tuple(
-            each.with_repetitions(self.names, self.covariance, self.statistical).with_known_value(
-                self.names, self.covariance
-            )
-            for each in (*found, *lone)
+        return vague_constants(
+            self.names, self.values, self.covariance, self.statistical, vague, self.moduli
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from typing import Any, Literal
@@ -38,9 +38,9 @@ from ..statistics.combinations import (
     Combination,
     Direction,
     Fix,
-    find_combinations,
-    lone_constants,
     principal_directions,
+    vague_constants,
+    with_something_to_state,
 )
 from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate, relative_derivatives
@@ -583,7 +583,7 @@ class SolvedProblem:
         `fixes`; empty without error bars. Coefficients of fields and parameters at a bound are left
         out.
         """
-        return tuple(each for each in self.vague_constants if each.fixes or not each.is_lone)
+        return with_something_to_state(self.vague_constants)
 
     @cached_property
     def vague_constants(self) -> tuple[Combination, ...]:
@@ -592,16 +592,11 @@ class SolvedProblem:
         if not names or self.uncertainty is None:
             return ()
         vague = {name for name in names if not self._is_determined_alone(name)}
-        found = find_combinations(names, values, covariance, vague, self._modulus_slopes(names))
         places = [self._estimated_names.index(name) for name in names]
         noise = self.uncertainty.complete_covariance[np.ix_(places, places)]
-        found = (*found, *lone_constants(names, values, covariance, noise, vague, found))
-        added = (self.added_measurements.get(frozenset(each.determined.names)) for each in found)
-        return tuple(
-            (each if fix is None else replace(each, fixes=(fix,)))
-            .with_repetitions(names, covariance, noise)
-            .with_known_value(names, covariance)
-            for each, fix in zip(found, added, strict=True)
+        moduli = self._modulus_slopes(names)
+        return vague_constants(
+            names, values, covariance, noise, vague, moduli, self.added_measurements
         )
 
     @cached_property

@@ -316,6 +316,35 @@ def lone_constants(
     return tuple(found)
 
 
+def vague_constants(
+    names: Sequence[str],
+    values: Array,
+    covariance: Array,
+    noise: Array,
+    undetermined: Collection[str],
+    moduli: Mapping[str, Array],
+    added: Mapping[frozenset[str], Fix] | None = None,
+) -> tuple[Combination, ...]:
+    """Return the combinations of `find_combinations` and the constants of `lone_constants`, each with
+    repetitions and the known value that would determine its constants, after the effect of an
+    added measurement on its constants; arguments as of these functions.
+    """
+    found = find_combinations(names, values, covariance, undetermined, moduli)
+    lone = lone_constants(names, values, covariance, noise, undetermined, found)
+    vague = []
+    for each in (*found, *lone):
+        fix = (added or {}).get(frozenset(each.determined.names))
+        fixed = each if fix is None else replace(each, fixes=(fix,))
+        fixed = fixed.with_repetitions(names, covariance, noise)
+        vague.append(fixed.with_known_value(names, covariance))
+    return tuple(vague)
+
+
+def with_something_to_state(vague: Sequence[Combination]) -> tuple[Combination, ...]:
+    """Return the combinations, and the constants that one of their `fixes` would determine."""
+    return tuple(each for each in vague if each.fixes or not each.is_lone)
+
+
 def principal_directions(
     names: Sequence[str], values: Array, covariance: Array
 ) -> tuple[Direction, ...]:

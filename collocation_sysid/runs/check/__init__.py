@@ -36,7 +36,7 @@ from ...program.modes.stability import Instability, find_instabilities
 from ...recording.impact_steps import IMPACT_NOTE
 from ...statistics.assessment import rotation_step_concerns, stability_concerns
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
-from ...statistics.combinations import Combination
+from ...statistics.combinations import Combination, with_something_to_state
 from ...statistics.concerns import Concern
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
 from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
@@ -336,8 +336,7 @@ def _expected_combinations(
     deviations = problem.assumed_deviations
     try:
         found = expected_precision(collocation, z, deviations).combinations()
-        with_fixes = with_measurements(found, collocation, z, deviations)
-        return tuple(each for each in with_fixes if each.fixes or not each.is_lone)
+        return with_something_to_state(with_measurements(found, collocation, z, deviations))
     except SimulationError:
         return ()
 
