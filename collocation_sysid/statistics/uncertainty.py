@@ -324,8 +324,7 @@ def _error_bars(
     """
     level = estimate_noise_level(fit, factored)
     without_outliers, outliers = remove_outliers(fit)
-    dependence, dependent = _dependence(without_outliers)
-    unexplained = _unexplained_dependence(without_outliers, dependence)
+    dependence, dependent, unexplained = _dependence(without_outliers)
     correlated = requested.errors == "autocorrelated" or (requested.errors == "auto" and dependent)
     kind: Noise = level.suggest_noise() if requested.noise == "auto" else requested.noise
     if requested.noise == "auto" and correlated and level.pooled < 1:
@@ -448,9 +447,10 @@ def _has_no_information(parameters: Parameters, q: Array, variances: Array) -> N
     return np.array(uninformed, dtype=bool)
 
 
-def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
-    """Return the tests of the residuals for correlation, and whether they show more than known
-    disturbances, such as noise of the poses, explain.
+def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool, Dependence]:
+    """Return the tests of the residuals for correlation, whether they show more than known
+    disturbances, such as noise of the poses, explain, and the tests without residuals that may be
+    slow errors of instruments.
 
     The standard deviation of the autocorrelation is increased if the noise of markers differs.
     """
@@ -458,12 +458,15 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool]:
     level = estimate_noise_level(fit, factored)
     tested = analyse_dependence(fit, factored)
     tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.compute_unevenness())
-    return tested, tested.is_correlated() and not _is_explained(
+    is_dependent = tested.is_correlated() and not _is_explained(
         fit, factored, level=level, result=tested
     )
+    return tested, is_dependent, _unexplained_dependence(fit, factored, tested)
 
 
-def _unexplained_dependence(fit: LinearisedFit, dependence: Dependence) -> Dependence:
+def _unexplained_dependence(
+    fit: LinearisedFit, factored: Information, dependence: Dependence
+) -> Dependence:
     """Return the tests of the residuals without those that may be slow errors of instruments;
     `dependence` has the tests of all.
     """
@@ -472,7 +475,6 @@ def _unexplained_dependence(fit: LinearisedFit, dependence: Dependence) -> Depen
         return dependence
     if not any(kept):
         return Dependence(0.0, np.inf, shared_p=1.0)
-    factored = factorise_information(fit)
     slopes = tuple(compress(factored.scaled_jacobians, kept))
     rest = replace(fit, blocks=tuple(compress(fit.blocks, kept)))
     return analyse_dependence(rest, replace(factored, scaled_jacobians=slopes))

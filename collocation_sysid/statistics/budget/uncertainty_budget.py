@@ -26,7 +26,7 @@ from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
 from ..distributions import student_ppf
 from ..estimates import Estimate, IntervalCoordinate
-from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step, least_squares_of_fit
 from ..thresholds import DETERMINED, GRANTED
 from ..uncertainty import Uncertainty
 from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
@@ -194,10 +194,12 @@ class VarianceSources:
         known_deviations = deviations or {}
         budgeted = [k for k, row in enumerate(rows) if known_deviations.get(row, 1.0) is not None]
         considered = budgeted if has_rulers else []
-        rulers, values, covariance = _determined_rulers(fit, assumed, columns=considered)
+        rulers, values, joint = _determined_rulers(fit, assumed, columns=considered)
         shift = moved[:, rulers] @ values
+        ruler_errors = np.zeros(0)
         if rulers:
-            joint = with_relaxed_columns(fit, assumed, rulers)
+            covariance = covariance_of_fit(joint)[len(fit.names) :, len(fit.names) :]
+            ruler_errors = np.sqrt(np.diag(covariance))
             widths, axes = np.linalg.eigh(covariance)
             others = [k for k in budgeted if k not in rulers]
             moved[:, rulers] = moved[:, rulers] @ (axes * np.sqrt(widths)) @ axes.T
@@ -223,8 +225,8 @@ class VarianceSources:
             means=known_effects,
             alternatives=alternatives,
             rulers={
-                assumed.names[k]: (float(values[n]), float(np.sqrt(covariance[n, n])))
-                for n, k in enumerate(rulers)
+                assumed.names[k]: (float(value), float(error))
+                for k, value, error in zip(rulers, values, ruler_errors, strict=True)
             },
             shift=shift,
         )
@@ -330,36 +332,27 @@ class VarianceSources:
 
 def _determined_rulers(
     fit: LinearisedFit, assumed: ResidualChanges, columns: Sequence[int]
-) -> tuple[list[int], Array, Array]:
-    """Return the columns of the rulers that the data determine, their values (r,) by one linear step,
-    and the covariance (r, r) of these, in the deviations of the budget; nothing if a value is
-    larger than the budget grants.
+) -> tuple[list[int], Array, LinearisedFit]:
+    """Return the columns of the rulers that the data determine, their values (r,) by one linear step
+    in the deviations of the budget, and the fit in which they are parameters; the fit itself without
+    any, or if a value is larger than the budget grants.
 
     `columns` are those of the budget: whether a ruler is determined is tested with all of them
     relaxed.
     """
+    nothing: tuple[list[int], Array, LinearisedFit] = [], np.zeros(0), fit
     rulers = [k for k in columns if DEVIATIONS[assumed.names[k].partition(" ")[0]].is_ruler]
-    nothing: tuple[list[int], Array, Array] = [], np.zeros(0), np.zeros((0, 0))
     if not rulers:
         return nothing
     first = len(fit.names)
     wide = with_relaxed_columns(fit, assumed, columns)
-    errors = np.sqrt(np.diag(_covariance(wide))[first:])
-    rulers = [
-        k for k, error in zip(columns, errors, strict=True) if k in rulers and error < DETERMINED
-    ]
+    errors = dict(zip(columns, np.sqrt(np.diag(covariance_of_fit(wide))[first:]), strict=True))
+    rulers = [k for k in rulers if errors[k] < DETERMINED]
     if not rulers:
         return nothing
     joint = with_relaxed_columns(fit, assumed, rulers)
     values = gauss_newton_step(joint)[first:]
-    if (np.abs(values) > GRANTED).any():
-        return nothing
-    return rulers, values, _covariance(joint)[first:, first:]
-
-
-def _covariance(fit: LinearisedFit) -> Array:
-    information = least_squares_of_fit(fit).compute_information()
-    return np.asarray(np.linalg.pinv(information, hermitian=True), float)
+    return nothing if (np.abs(values) > GRANTED).any() else (rulers, values, joint)
 
 
 def rescaled(step: Array, parameters: Parameters, is_proportional: Callable[[str], bool]) -> Array:

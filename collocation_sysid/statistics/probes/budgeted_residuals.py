@@ -19,7 +19,7 @@ from ..budget.consider_analysis import with_relaxed_assumption
 from ..budget.systematic_effects import DEVIATIONS
 from ..budget.uncertainty_budget import source_label
 from ..distributions import chi2_isf, normal_isf
-from ..linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step
 from ..thresholds import GRANTED, RARE
 from ..uncertainty import ErrorBasis
 from .relaxed_assumptions import SolvedFit, assumption_name
@@ -86,8 +86,7 @@ def is_significant_beside_budget(
         return bool((np.abs(gauss_newton_step(fit)[first:][own]) > GRANTED).any())
     changes = solved_fit.changes
     wide = with_relaxed_assumption(fit, changes, name=name, widening=prior_widening(name))
-    information = least_squares_of_fit(wide).compute_information()
-    errors = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
+    errors = np.sqrt(np.diag(covariance_of_fit(wide)))
     ratios = np.abs(gauss_newton_step(wide) / errors)[len(fit.names) :]
     return bool((ratios > significance_limit(changes, name)).any())
 
