@@ -323,7 +323,7 @@ class Problem:
             chosen.require(each for each in self.experiments if not each.validation)
         return cast(Method, chosen)
 
-    def require_guesses(self, why: str, otherwise: str = "") -> None:
+    def require_guesses(self, why: str, otherwise: str = "", *, with_set: bool = True) -> None:
         """Raise an `InputError`, naming the parameter and the remedy, if one has no guess.
 
         Parameters
@@ -332,11 +332,14 @@ class Problem:
             Why a value is needed, as a clause that begins with "and" or "but".
         otherwise : str
             Another remedy, behind that of a stated guess.
+        with_set : bool
+            Whether the option --set may state it.
         """
         if names := self.parameters.list_names_without_guess():
             key = f"parameters.{names[0]}"
+            guess = f"--set {key}.guess=VALUE" if with_set else "a guess"
             raise InputError(
-                f"this parameter has no guess, {why}; expected --set {key}.guess=VALUE{otherwise}",
+                f"this parameter has no guess, {why}; expected {guess}{otherwise}",
                 self.path,
                 where=key,
             )

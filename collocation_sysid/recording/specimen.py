@@ -634,9 +634,8 @@ def conditioned(cell: Body, oscillates: bool, shift: str, temperature_difference
             None,
             where="prony",
         )
-    factor = TimeShift(shift, temperature_difference_k)
-    if not (shift or temperature_difference_k):
-        factor = None
+    is_shifted = bool(shift or temperature_difference_k)
+    factor = TimeShift(shift, temperature_difference_k) if is_shifted else None
     parts = (replace(part, oscillates=oscillates, shift=factor) for part in cell.parts)
     return cell.with_parts(tuple(parts))
 

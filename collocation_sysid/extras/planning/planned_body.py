@@ -91,13 +91,11 @@ class PlannedBody:
 
     @classmethod
     def _from_problem(cls, problem: Problem, experiment: str | None) -> PlannedBody:
-        if names := problem.parameters.list_names_without_guess():
-            raise InputError(
-                "this parameter has no guess, but a motion is planned for a value of each parameter; "
-                "expected a guess, or a run that identified it: collocation-sysid solve",
-                problem.path,
-                where=f"parameters.{names[0]}",
-            )
+        problem.require_guesses(
+            "but a motion is planned for a value of each parameter",
+            ", or a run that identified it: collocation-sysid solve",
+            with_set=False,
+        )
         template = _select(problem, problem.experiments, experiment)
         places = _stated_places(template)
         guess = problem.parameters.guess_q
