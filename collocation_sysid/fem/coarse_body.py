@@ -19,9 +19,10 @@ from ..common.array_types import Array, Index
 from ..errors import InputError
 from .meshes.coarsening import CoarseMesh, coarsen_mesh
 from .meshes.mesh import ElementNodes
+from .meshes.refinement import on_mesh
 from .meshes.selection import Indices
 from .node_force import LocatedForce, NodeForce
-from .regions import BodyPart, Region
+from .regions import BodyPart
 from .rest_shape import UnderGravity
 from .spatial_field import FieldModes
 
@@ -138,39 +139,14 @@ def _own_node_sets(body: Body) -> list[Index]:
 
 def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBody:
     """Return the body on the coarse mesh; `groups` (E,) are the parts of its elements."""
-    cells = [np.flatnonzero(groups == k) for k in range(len(body.parts))]
-    regions = [
-        Region(
-            part.name,
-            own,
-            material=part.material,
-            density_kg_m3=part.density_kg_m3 if part.has_own_density else None,
-            damping=part.damping,
-            prony=part.prony,
-        )
-        for part, own in zip(body.parts, cells, strict=True)
-        if part.name
-    ]
-    # A region without a density has that of the body, even if regions claim all cells.
-    rest = next((part for part in body.parts if not part.has_own_density), body.parts[0])
     nodes = ElementNodes.for_element(meshes.mesh, body.element)
-    coarse = type(body)(
+    coarse = on_mesh(
+        body,
         meshes.mesh,
-        rest.material,
-        rest.density_kg_m3,
-        body.element.name,
-        damping=rest.damping,
-        regions=regions,
-        prony=rest.prony,
+        cells=[np.flatnonzero(groups == k) for k in range(len(body.parts))],
         forces=[_coarse_force(each, meshes, nodes) for each in body.placed_forces],
         rest_shape=_coarse_rest_shape(body, meshes, nodes),
-        made=body.made,
-        mesh_from=body.mesh_from,
-        evaluator=body.evaluator,
-        threads=body.threads,
     )
-    coarse.has_declared_mass = body.has_declared_mass
-    coarse = coarse.with_free_densities([part.name for part in body.parts if part.has_free_density])
     parts = zip(coarse.parts, body.parts, strict=True)
     coarse = coarse.with_parts(
         tuple(

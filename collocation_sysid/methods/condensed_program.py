@@ -497,13 +497,6 @@ class CondensedCollocation(Collocation):
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Return the constraints g (constraints,) and the values of ∂g/∂z, including the dependence
         through the eliminated positions, from one evaluation of the elements.
-
-        Parameters
-        ----------
-        z : (variables,) array
-            Variables.
-        out : array, optional
-            Memory for the values of ∂g/∂z; it is overwritten.
         """
         pattern = self._jacobian
         rows, complete_values = self.complete.constraints_and_jacobian(self.complete_variables(z))
@@ -583,19 +576,7 @@ class CondensedCollocation(Collocation):
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
-        """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle.
-
-        Parameters
-        ----------
-        z : (variables,) array
-            Variables.
-        loss_weight : float
-            Weight of the objective.
-        multipliers : (constraints,) array or None
-            Multipliers; None gives the Gauss–Newton Hessian of the objective.
-        out : array, optional
-            Memory for the values; it is overwritten.
-        """
+        """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
         pattern = self._hessian
         numbers, _ = self._condensed_indices
         if multipliers is not None:

@@ -150,5 +150,5 @@ def test_a_large_tare_is_named_although_its_prior_can_follow_it():
 
 @pytest.mark.long
 def test_check_lists_a_wrong_wrench():
-    findings = check_problem(sensed("wrench: force alone reversed"))
+    findings = check_problem(sensed("wrench: force alone reversed"), full=True)
     assert "its forces fit with the opposite sign" in findings.warnings[0]

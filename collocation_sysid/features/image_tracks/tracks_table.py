@@ -146,12 +146,6 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> ImageTracks:
         """Return the tracks within the times t_s (T,) of the experiment [s], and note how many
         images are used.
-
-        Raises
-        ------
-        InputError
-            If a file is missing or unusable, the calibration is for images of another size, a point
-            is not in the file, or nothing is within the times.
         """
         camera = self.camera.read(folder, f"{where}.camera")
         arguments: dict[str, Any] = {

@@ -63,12 +63,6 @@ class OutlinesSection(MeasurementSection, of=Outlines):
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> Outlines:
         """Return the masks within the times t_s (T,) of the experiment [s], and note how many are
         used.
-
-        Raises
-        ------
-        InputError
-            If the file is missing or unusable, a mask cannot be one of the body, or no image is
-            within the times.
         """
         if self.camera.pose == "unknown":
             raise InputError(

@@ -12,7 +12,7 @@ each comparison.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,12 +27,19 @@ from ...program.markers.marker_residual import MarkerResidual
 from ...program.observables import ObservedMotion, ReactionForces
 from ...program.transcription import Transcription
 from ...program.wrench_residual import WrenchResidual, without_grasp_sensors
+from ...recording.deviation import Deviation
+from ...recording.experiment import Experiment
 from ...recording.measured_wrench import Wrench
 from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ...recording.poses import Frame
 from ...statistics.axes import with_other_axes
 from ...statistics.budget.shape_error import other_section
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    HypothesisTest,
+    corrected_hypothesis,
+)
+from ...statistics.misspecification.sensor_misspecifications import measurement_mistake
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES = {
@@ -103,6 +110,8 @@ UNITS = (
     ),
     ("torques", {"newton millimetres": 1e-3, "kilogram-force metres": 9.80665}, TORQUES),
 )
+# Prior of a tare that any offset satisfies, in standard deviations of the noise.
+FREE_TARE = 1e9
 # Offset over the standard deviation of the tare's prior from which on the sensor was not zeroed.
 LARGEST_TARE = 3.0
 # Error of a calibration that gives no concern.
@@ -116,15 +125,6 @@ LIKE_SECTION = 0.1
 FITTED = 1.5
 # Additional factor for each of many variants of one mistake.
 ONE_OF_MANY = 1.05
-
-
-@dataclass(frozen=True, eq=False)
-class DescribedWrench:
-    """Description of a wrench to be tested."""
-
-    wrench: Wrench  # samples as they would be without the mistake
-    # Standard deviation of each tare, in standard deviations of the noise; inf for a free tare.
-    tare: float
 
 
 def wrench_causes(solution: Solution) -> list[Hypothesis]:
@@ -270,9 +270,8 @@ class _OneSensor:
         blind = without_grasp_sensors(transcription.experiment)
         self.scale_known = not transcription.body.mass_derivatives or blind.has_known_force()
         self._known: dict[tuple[bytes, Frame, bytes], Array] = {}
-        self.declared = DescribedWrench(
-            sensor.wrench, transcription.experiment.nuisance.tare or 0.0
-        )
+        self.declared = transcription.experiment
+        self._place = self.declared.wrenches.index(sensor.wrench)
 
     def causes(self) -> Iterator[Hypothesis]:
         """Yield the hypotheses whose correction improves the fit far enough, if the misfit exceeds
@@ -282,17 +281,17 @@ class _OneSensor:
         misfit = self.misfit(self.declared)
         if misfit > MISFIT:
             test = HypothesisTest(misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0)
-            accepted = list(test.accepted(self._mistakes()))
+            accepted = list(test.accepted(self._hypotheses()))
         yield from accepted or self._large_tare()
 
     def _large_tare(self) -> Iterator[Hypothesis]:
         """Yield the hypothesis that the mean difference of a component, without any tare, exceeds
         `LARGEST_TARE` deviations of the tare's prior; nothing without a tare.
         """
-        tare = self.declared.tare
+        tare = self.declared.nuisance.tare
         if not tare:
             return
-        measured, predicted = self._scaled_by_sigma(DescribedWrench(self.declared.wrench, 0.0))
+        measured, predicted = self._scaled_by_sigma(self._with_tare(None))
         factor = 1.0 if self.scale_known else _slope(measured, predicted)
         differences = measured - factor * predicted
         is_measured = np.isfinite(differences).any(axis=0)
@@ -305,7 +304,11 @@ class _OneSensor:
             of = f"the wrench of '{self.part.transcription.experiment.name}'"
             yield Hypothesis("wrench-tare", of, strength=float(largest / LARGEST_TARE))
 
-    def misfit(self, trial: DescribedWrench) -> float:
+    def _with_tare(self, tare: float | None) -> Experiment:
+        """Return the experiment as stated, with another prior of the tares."""
+        return replace(self.declared, nuisance=replace(self.declared.nuisance, tare=tare))
+
+    def misfit(self, trial: Experiment) -> float:
         """Return the root mean square of the residuals of a description in standard deviations,
         with the best tares and, if the scale is unknown, the best factor of the prediction that
         is not negative; infinite without samples.
@@ -316,15 +319,16 @@ class _OneSensor:
         factor = 1.0 if self.scale_known else max(0.0, _slope(measured, predicted))
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
-    def _scaled_by_sigma(self, trial: DescribedWrench) -> tuple[Array, Array]:
+    def _scaled_by_sigma(self, trial: Experiment) -> tuple[Array, Array]:
         """Return samples and prediction (S, 6) of a description over the standard deviations of the
         noise, without what its tare explains; NaN in the same places.
         """
-        wrench = trial.wrench
-        sigmas = trial.wrench.sample_sigmas
+        wrench = trial.wrenches[self._place]
+        sigmas = wrench.sample_sigmas
         predicted = np.where(wrench.is_measured, self._predicted(wrench), np.nan) / sigmas
         measured = np.where(np.isfinite(predicted), wrench.values / sigmas, np.nan)
-        return _without_tare(measured, trial.tare), _without_tare(predicted, trial.tare)
+        tare = trial.nuisance.tare or 0.0
+        return _without_tare(measured, tare), _without_tare(predicted, tare)
 
     def _predicted(self, wrench: Wrench) -> Array:
         """Return the predicted wrench (S, 6) [N, N m] at the times, in the frame and about the
@@ -368,14 +372,15 @@ class _OneSensor:
             and not (factor := _slope(measured[:, FORCES], predicted[:, FORCES])) > 0
         ):
             return np.zeros(3)
-        wrench = self.declared.wrench
+        wrench = self.sensor.wrench
         forces = self._predicted(wrench)[:, FORCES]
         by_shift = (
             np.cross(forces[:, None], np.eye(3)[None]) / wrench.sample_sigmas[:, 3, None, None]
         )  # (S, shift, 3)
         by_shift = np.where(np.isfinite(measured[:, None, TORQUES]), by_shift, np.nan)
         slopes = np.stack(
-            [_without_tare(by_shift[:, k], self.declared.tare) for k in range(3)], axis=2
+            [_without_tare(by_shift[:, k], self.declared.nuisance.tare or 0.0) for k in range(3)],
+            axis=2,
         )
         differences = (measured - factor * predicted)[:, TORQUES]
         is_measured = np.isfinite(differences)
@@ -385,41 +390,43 @@ class _OneSensor:
         shift_m: Array = np.asarray(solution[0], dtype=np.float64)
         return shift_m
 
-    def _mistakes(self) -> Iterator[Hypothesis]:
-        """Yield each common mistake, untested, with the description that corrects it: signs, frame,
-        axes, units, gains, point, clock and a free tare.
-        """
-        of = f"the wrench of '{self.part.transcription.experiment.name}'"
-        wrench = self.declared.wrench
+    def _hypotheses(self) -> Iterator[Hypothesis]:
+        """Yield the hypothesis of each common mistake, untested."""
+        subject = f"the wrench of '{self.part.transcription.experiment.name}'"
+        for row, handicap in self._mistakes():
+            if (found := corrected_hypothesis(row, self.declared)) is not None:
+                yield replace(found, subject=subject, handicap=handicap)
+        free = self._with_tare(FREE_TARE)
+        yield Hypothesis("wrench-tare", subject, corrected=free)
 
-        def hypothesis(code: str, without: Wrench, handicap: float = 1.0, **data) -> Hypothesis:
-            """Return the hypothesis of a code about the sensor with the wrench `without` in place
-            of the stated one; `data` are for the message.
-            """
-            return Hypothesis(
-                code,
-                of,
-                data=data,
-                corrected=replace(self.declared, wrench=without),
-                handicap=handicap,
-            )
+    def _mistakes(self) -> Iterator[tuple[Deviation, float]]:
+        """Yield each common mistake with the handicap of its hypothesis: signs, frame, axes, units,
+        gains, point and clock.
+        """
+        wrench = self.sensor.wrench
+
+        def mistake(
+            code: str, without: Wrench, handicap: float = 1.0, **data: Any
+        ) -> tuple[Deviation, float]:
+            """Return the row of a sensor that measured `without`; `data` are for the message."""
+            return measurement_mistake(code, wrench, lambda _: without, **data), handicap
 
         values = np.array(wrench.values)
-        yield hypothesis("wrench-sign", replace(wrench, values=-values))
+        yield mistake("wrench-sign", replace(wrench, values=-values))
         for what, columns in (("forces", FORCES), ("torques", TORQUES)):
             if wrench.measured_components[columns].any():
-                yield hypothesis(
+                yield mistake(
                     "wrench-sign/part", _multiplied(wrench, columns, factor=-1.0), what=what
                 )
         other: Frame = "grasp" if wrench.frame == "world" else "world"
-        yield hypothesis("wrench-frame", replace(wrench, frame=other), other=other)
+        yield mistake("wrench-frame", replace(wrench, frame=other), other=other)
         for axes, turned in with_other_axes(values, has_sign=False):
             without = replace(wrench, values=turned)
-            yield hypothesis("wrench-axes", without, handicap=ONE_OF_MANY, axes=axes)
+            yield mistake("wrench-axes", without, handicap=ONE_OF_MANY, axes=axes)
         for what, units, columns in UNITS:
             for unit, factor in units.items() if wrench.measured_components[columns].any() else ():
                 without = _multiplied(wrench, columns, factor=factor)
-                yield hypothesis("wrench-unit", without, what=what, unit=unit, factor=factor)
+                yield mistake("wrench-unit", without, what=what, unit=unit, factor=factor)
         body = self.part.transcription.body
         section = None if body.has_declared_mass else other_section(body.mesh, body.mesh.points_m)
         for what, columns in (
@@ -434,9 +441,8 @@ class _OneSensor:
                 if section and abs(factor * section.volume_ratio - 1) < LIKE_SECTION:
                     code += "/section"
                     data |= {"ratio": section.volume_ratio, "real": section.name}
-                yield hypothesis(
-                    code, _multiplied(wrench, columns, factor=factor), handicap=FITTED, **data
-                )
+                without = _multiplied(wrench, columns, factor=factor)
+                yield mistake(code, without, handicap=FITTED, **data)
         shift_m = self._point_shift_m()
         if np.linalg.norm(shift_m) > SAME_POINT_M:
             point_m = wrench.point_m + shift_m
@@ -444,23 +450,21 @@ class _OneSensor:
                 "by_mm": 1e3 * np.linalg.norm(shift_m),
                 "point": str(np.round(point_m, 3).tolist()),
             }
-            yield hypothesis(
-                "wrench-point", replace(wrench, point_m=point_m), handicap=FITTED, **data
-            )
+            without = replace(wrench, point_m=point_m)
+            yield mistake("wrench-point", without, handicap=FITTED, **data)
         span_s = LATEST * float(np.ptp(wrench.t_s))
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
             data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
-            yield hypothesis("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
-        yield Hypothesis("wrench-tare", of, corrected=replace(self.declared, tare=np.inf))
+            yield mistake("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
 
 
 def _without_tare(values: Array, tare: float) -> Array:
     """Return columns (S, c) in standard deviations, without the offset that a tare with a prior of
-    `tare` standard deviations explains: none for 0, the mean if infinite. NaN is ignored.
-    Columns without a value stay NaN.
+    `tare` standard deviations explains: none for 0. NaN is ignored. Columns without a value stay
+    NaN.
     """
     is_measured = np.isfinite(values)
-    prior_weight = 0.0 if np.isinf(tare) else np.inf if not tare else 1 / tare**2
+    prior_weight = 1 / tare**2 if tare else np.inf
     return values - np.nansum(values, axis=0) / np.maximum(
         is_measured.sum(axis=0) + prior_weight, 1e-12
     )

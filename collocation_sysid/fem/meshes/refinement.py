@@ -5,6 +5,7 @@ Use `refine_body` for the body, and `refine_nodes` for nodes that are selected o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
@@ -69,6 +70,53 @@ def split_faces_in_four(faces: Index, mesh: TetMesh) -> Index:
     return nodes[:, [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]].reshape(-1, 3)
 
 
+def on_mesh(
+    body: Body,
+    mesh: TetMesh,
+    cells: Sequence[Index],
+    forces: Sequence[NodeForce],
+    rest_shape: UnderGravity | Literal["stress_free"] | None,
+) -> Body:
+    """Return a body with the properties of another on a mesh of its own; fields and axes are missing.
+
+    Parameters
+    ----------
+    cells : sequence of (k,) arrays
+        Elements of each of `body.parts` in the new mesh.
+    """
+    regions = [
+        Region(
+            part.name,
+            own,
+            material=part.material,
+            density_kg_m3=part.density_kg_m3 if part.has_own_density else None,
+            damping=part.damping,
+            prony=part.prony,
+        )
+        for part, own in zip(body.parts, cells, strict=True)
+        if part.name
+    ]
+    # A region without a density has that of the body, even if regions claim all cells.
+    rest = next((part for part in body.parts if not part.has_own_density), body.parts[0])
+    other = type(body)(
+        mesh,
+        rest.material,
+        rest.density_kg_m3,
+        body.element.name,
+        damping=rest.damping,
+        regions=regions,
+        prony=rest.prony,
+        forces=forces,
+        rest_shape=rest_shape,
+        made=body.made,
+        mesh_from=body.mesh_from,
+        evaluator=body.evaluator,
+        threads=body.threads,
+    )
+    other.has_declared_mass = body.has_declared_mass
+    return other.with_free_densities([part.name for part in body.parts if part.has_free_density])
+
+
 def refine_body(body: Body) -> Body:
     """Return the body on a mesh with half the element size, see `split_in_eight`.
 
@@ -76,39 +124,14 @@ def refine_body(body: Body) -> Body:
     shape and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
     not copied.
     """
-    cells = [8 * part.cells[:, None] + np.arange(8) for part in body.parts]
-    regions = [
-        Region(
-            part.name,
-            inside.ravel(),
-            material=part.material,
-            density_kg_m3=part.density_kg_m3 if part.has_own_density else None,
-            damping=part.damping,
-            prony=part.prony,
-        )
-        for part, inside in zip(body.parts, cells, strict=True)
-        if part.name
-    ]
-    # A region without a density has that of the body, even if regions claim all cells.
-    rest = next((part for part in body.parts if not part.has_own_density), body.parts[0])
     mesh = split_in_eight(body.mesh)
-    finer = type(body)(
+    finer = on_mesh(
+        body,
         mesh,
-        rest.material,
-        density_kg_m3=rest.density_kg_m3,
-        element=body.element.name,
-        damping=rest.damping,
-        regions=regions,
-        prony=rest.prony,
+        cells=[(8 * part.cells[:, None] + np.arange(8)).ravel() for part in body.parts],
         forces=[_refined_force(placed, mesh, body=body) for placed in body.placed_forces],
         rest_shape=_refined_rest_shape(body, mesh),
-        made=body.made,
-        mesh_from=body.mesh_from,
-        evaluator=body.evaluator,
-        threads=body.threads,
     )
-    finer.has_declared_mass = body.has_declared_mass
-    finer = finer.with_free_densities([part.name for part in body.parts if part.has_free_density])
     if not any(part.field or part.axes is not None for part in body.parts):
         return finer
     return finer.with_parts(

@@ -224,23 +224,7 @@ class DepthResidual(CorrespondenceResidual):
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
     ) -> SurfaceCorrespondences:
-        """Align the camera with the first rows of a motion and return the correspondences.
-
-        Parameters
-        ----------
-        x : (rows, 3n) array
-            First rows [m]; if they do not reach the first image, the last row is used for it.
-            Images that they do not reach keep their shapes.
-        phi : (k,) array
-            Nuisance parameters; not modified.
-        only_pose : bool
-            Whether to keep the present correspondences, with the new pose of the camera.
-
-        Returns
-        -------
-        SurfaceCorrespondences
-            The present correspondences if they are those of an alignment with the same shapes.
-        """
+        """Align the camera with the first rows of a motion and return the correspondences."""
         correspondences = self.correspondences
         shapes = self.surface_shapes(x, phi)
         if not len(shapes):

@@ -65,14 +65,14 @@ class LiftedCollocation(Collocation):
         parameters.
         """
         parts = self.iterates_at(p, positions)
-        lifted = [each.consistent_values(parts[each.segment_index]) for each in self.lifted]
+        lifted = [each.consistent_values(parts[each.transcription_index]) for each in self.lifted]
         return np.concatenate([super().pack(p, positions), *lifted])
 
     def iterates(self, z: Array) -> list[ExperimentIterate]:
         """Return every fitted experiment at the variables z, with lifted variables taken from z."""
         parts = super().iterates(z)
         for each in self.lifted:
-            parts[each.segment_index] = each.with_lifted(parts[each.segment_index], z)
+            parts[each.transcription_index] = each.with_lifted(parts[each.transcription_index], z)
         return parts
 
     def bounds(self) -> tuple[Array, Array]:
@@ -88,7 +88,7 @@ class LiftedCollocation(Collocation):
 
     def _additional_equations(self, parts: Sequence[ExperimentIterate], z: Array) -> list[Array]:
         """Return the equations of each group of lifted variables."""
-        return [each.residuals(parts[each.segment_index], z) for each in self.lifted]
+        return [each.residuals(parts[each.transcription_index], z) for each in self.lifted]
 
     def _additional_jacobian_entries(self) -> list[tuple[Index, Index]]:
         """Return the Jacobian's entries of each group of lifted variables."""
@@ -98,11 +98,11 @@ class LiftedCollocation(Collocation):
         self, parts: Sequence[ExperimentIterate], z: Array
     ) -> list[tuple[Array, Array]]:
         """Return equations and derivatives of each group of lifted variables."""
-        return [each.jacobian_values(parts[each.segment_index], z) for each in self.lifted]
+        return [each.jacobian_values(parts[each.transcription_index], z) for each in self.lifted]
 
     def _additional_gradients(self, parts: Sequence[ExperimentIterate]) -> list[Array]:
         """Return the gradient of the loss by each group of lifted variables."""
-        return [each.loss_gradient(parts[each.segment_index]) for each in self.lifted]
+        return [each.loss_gradient(parts[each.transcription_index]) for each in self.lifted]
 
     def _additional_weights(
         self, number: int, part: ExperimentIterate, multipliers: Array
@@ -110,7 +110,7 @@ class LiftedCollocation(Collocation):
         """Return the weights of the residuals c and of the history variables in the equations of
         the lifted variables of one experiment.
         """
-        own = [each for each in self.lifted if each.segment_index == number]
+        own = [each for each in self.lifted if each.transcription_index == number]
         histories = [
             each.weighted_history(part, multipliers)
             for each in own
@@ -134,11 +134,11 @@ class LiftedCollocation(Collocation):
         """Return the second derivatives of each group of lifted variables."""
         return [
             each.hessian_values(
-                parts[each.segment_index],
+                parts[each.transcription_index],
                 z,
                 loss_weight=loss_weight,
                 multipliers=multipliers,
-                weights=weights[each.segment_index],
+                weights=weights[each.transcription_index],
             )
             for each in self.lifted
         ]
@@ -217,7 +217,11 @@ def lift_variables(
     """
     groups: list[LiftedVariables] = []
     for number, transcription in enumerate(transcriptions):
-        lift = {"transcription": transcription, "segment_index": number, "first_phi": first_phi}
+        lift = {
+            "transcription": transcription,
+            "transcription_index": number,
+            "first_phi": first_phi,
+        }
 
         def add(kind: type[LiftedVariables], lift: dict[str, Any] = lift, **own: Any) -> None:
             start = groups[-1].next_offsets if groups else offsets

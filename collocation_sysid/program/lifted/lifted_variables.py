@@ -37,7 +37,7 @@ class LiftedVariables(ABC):
     """A group of lifted variables of one experiment, and as many equations."""
 
     transcription: Transcription  # transcription of the experiment
-    segment_index: int  # index of the transcription
+    transcription_index: int  # index of the transcription
     first_phi: int  # index in z where the nuisance parameters of all experiments begin
     offsets: LiftedOffsets  # offsets of the variables and equations
     kind: ClassVar[str]  # kind of quantity

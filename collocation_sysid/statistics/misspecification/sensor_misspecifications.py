@@ -7,7 +7,7 @@ markers. Here nothing else may be measured, so that each mistake is corrected in
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -95,25 +95,33 @@ def sensor_hypotheses(
                 yield replace(hypothesis, subject=f"{title} of '{experiment.name}'")
 
 
-def _mistake(
-    code: str, sensor: Measurement, values: Array, t_s: Array | None = None, **data: object
+def measurement_mistake(
+    code: str, stated: Measurement, without: Callable[[Measurement], Measurement], **data: object
 ) -> Deviation:
-    """Return the row of a sensor that measured other values (S, m), or at other times (S,); its name
-    is the code of the hypothesis.
+    """Return the row of a measurement that is described wrongly; its name is the code of the
+    hypothesis, and `without` returns the measurement without the mistake.
     """
 
     def corrected(experiment: Experiment, _: Array) -> Correction:
-        times_s = sensor.sample_times_s if t_s is None else t_s
         try:
             other = experiment.with_measurements(
-                each.with_samples(times_s, values) if each is sensor else each
-                for each in experiment.measurements
+                without(each) if each is stated else each for each in experiment.measurements
             )
         except InputError:
             return None
         return other, data
 
-    return Deviation(code, sensor.unit, corrected=corrected, is_whole=True)
+    return Deviation(code, stated.unit, corrected=corrected, is_whole=True)
+
+
+def _mistake(
+    code: str, sensor: Measurement, values: Array, t_s: Array | None = None, **data: object
+) -> Deviation:
+    """Return the row of a sensor that measured other values (S, m), or at other times (S,)."""
+    times_s = sensor.sample_times_s if t_s is None else t_s
+    return measurement_mistake(
+        code, sensor, lambda each: each.with_samples(times_s, values), **data
+    )
 
 
 def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
