@@ -108,6 +108,31 @@ def test_steps_that_cannot_be_condensed_are_solved_completely(monkeypatch):
             np.testing.assert_allclose(simulated(experiment), x, atol=1e-12)
 
 
+def test_contact_that_a_step_makes_and_undoes_is_not_condensed(capfd):
+    """A point touches at the end of the step without contact, but not at the end of that with it:
+    no dof is left, and LAPACK reports empty matrices.
+    """
+
+    def points(*dofs: int) -> Mock:
+        found = Mock(dofs=np.array(dofs, dtype=np.int64))
+        found.assemble_force.return_value = 2.0 * np.ones(len(dofs))
+        found.assemble_stiffness.return_value = np.eye(len(dofs))
+        return found
+
+    def at_dofs(dofs):
+        each = np.eye(3)[dofs]
+        return condensed_steps.ActiveCompliance(dofs, each, np.asfortranarray(each[:, dofs]))
+
+    compliance = Mock(active_dofs=lambda found: found, at_dofs=at_dofs)
+    compliance.factor.solve = lambda right: right
+    equations = Mock(local_weight=1.0, residual_without_local=np.ones_like)
+    equations.active_points.side_effect = [points(), points(1), points()]
+    steps = condensed_steps.CondensedSteps(equations, compliance, np.arange(3), 1.0)
+    with pytest.raises(condensed_steps.CondensationError):
+        steps.step_from(np.zeros(3))
+    assert capfd.readouterr() == ("", "")
+
+
 def between_two_obstacles() -> Experiment:
     """A cube below a plate that comes down and rubs, and beside a smooth bar that comes later."""
     body = box()

@@ -492,7 +492,8 @@ class CondensedSteps:
         dofs = (
             start.dofs if np.array_equal(now.dofs, start.dofs) else np.union1d(start.dofs, now.dofs)
         )
-        if len(dofs) > MAX_ACTIVE_DOFS:
+        # Without any, contact is made by the step without contact, and undone by that with it.
+        if not 0 < len(dofs) <= MAX_ACTIVE_DOFS:
             raise CondensationError
         present = self._equations.local_weight * now.active.assemble_stiffness(now.points)
         stiffness = present
