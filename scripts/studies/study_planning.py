@@ -2,9 +2,10 @@
 
 A cylinder of MuJoCo (energy of St. Venant and Kirchhoff, damping of MuJoCo, a fine mesh) is recorded
 once. A body of this package with a coarser mesh and default damping law is identified from six noisy
-markers. Five motions are planned and executed in MuJoCo: the tip moves along a circle, moves by
-200 mm from rest to rest along a path of least jerk, by a hand that keeps its orientation or turns, or
-on any path, and stays where it is while the hand moves by 50 mm. The tip is compared with its
+markers. Six motions are planned and executed in MuJoCo: the tip moves along a circle, moves by
+200 mm from rest to rest along a path of least jerk, by a hand that moves during the same time, that
+may begin 0.1 s earlier and end 0.1 s later, or that may turn, or on any path, and stays where it is
+while the hand moves by 50 mm. The tip is compared with its
 reference for the plan, for a plan with the estimates of the penalty method, and for hands that move
 as if the body were rigid, with and without a zero-vibration shaper.
 
@@ -78,11 +79,12 @@ def main() -> None:
         f"plan, penalty, ρ = {rho:.0e}": penalty_problem(recorded, rho) for rho in (1e2, 1e6)
     }  # fmt: skip
     rows = []
+    rigid = np.nan, np.nan, np.nan
     for name in arguments.tasks:
         wanted = TASKS[name]()
         plan = plan_motion(run, wanted.task, LIMITS)
-        motions: dict[str, Motion] = {"plan": plan_coordinates(plan)}
-        motions["rigid"] = wanted.rigid_hand
+        motions: dict[str, Motion] = {"rigid": wanted.rigid_hand}
+        motions["plan"] = plan_coordinates(plan)
         motions["rigid, shaped"] = Shaper.at(plan, run).shaped(wanted)
         for title, problem in problems.items():
             try:
@@ -92,11 +94,14 @@ def main() -> None:
         for title, motion in motions.items():
             t_s, tip = executed(plant, motion, wanted.task.duration_s + AFTER_S)
             values = errors_of(t_s, tip, wanted)
-            rows.append((name, title, *(number(value, 1e3) for value in values)))
+            rigid = values if title == "rigid" else rigid
+            shares = [number(mine / its) for mine, its in zip(values[:2], rigid[:2], strict=True)]
+            rows.append((name, title, *(number(value, 1e3) for value in values), *shares))
             print(*rows[-1], f"hand off by {1e6 * plant.lag_m:.2g} µm", flush=True)
             if title == "plan":
                 print(band_report(tip, plan), flush=True)
     heads = ("task", "hand", "RMS mm", "largest mm", "residual vibration mm")
+    heads += ("RMS, times rigid", "largest, times rigid")
     save(arguments.out, "planning", markdown(heads, rows))
 
 
@@ -268,35 +273,48 @@ class Wanted:
         Coordinates (T, 6) of the rigid hand, by the share of the way.
     from_s : float
         Time from which the tip is compared with its reference [s].
+    lead_s : float
+        Time for which the planned hand may move before the tip does, and after it [s].
     """
 
     task: Task
     tip: Motion
     hand: Motion
     from_s: float = 0.0
+    lead_s: float = 0.0
+
+    @property
+    def way_s(self) -> float:
+        """Time in which the tip moves [s]."""
+        return self.task.duration_s - 2 * self.lead_s
+
+    def tip_at(self, t_s: Array) -> Array:
+        """Return the displacement (T, 3) of the tip from its place before the motion [m]."""
+        return self.tip(smooth(t_s - self.lead_s, self.way_s))
 
     def rigid_hand(self, t_s: Array) -> Array:
         """Return the coordinates (T, 6) of the hand of a rigid body."""
-        return self.hand(smooth(t_s, self.task.duration_s))
+        return self.hand(smooth(t_s - self.lead_s, self.way_s))
 
 
-def _task(duration_s: float, tip: Motion, **hand: Any) -> Task:
-    t_s = np.linspace(0, duration_s, 101)
-    places = tip(smooth(t_s, duration_s))
-    after = duration_s + 0.1 * np.arange(1, 4)
+def _task(way_s: float, tip: Motion, lead_s: float = 0.0, **hand: Any) -> Task:
+    t_s = np.linspace(0, way_s, 101)
+    standing = [0.0] if lead_s else []
+    after = np.arange(0.1, lead_s + 0.35, 0.1)
+    t_s = np.concatenate([standing, lead_s + t_s, lead_s + way_s + after])
     reference = {
         "point": "tip",
-        "t_s": [*t_s.tolist(), *after.tolist()],
-        "position_m": [tuple(each) for each in [*places.tolist(), *[places[-1].tolist()] * 3]],
+        "t_s": t_s.tolist(),
+        "position_m": [tuple(each) for each in tip(smooth(t_s - lead_s, way_s)).tolist()],
         "relative": True,
     }
     return Task.model_validate(
         {
-            "duration_s": duration_s,
+            "duration_s": way_s + 2 * lead_s,
             "sample_s": SAMPLE_S,
             "reference": [reference],
             "end": {"window_s": 0.3},
-            "hand": {"intervals": 24, **hand},
+            "hand": {"intervals": 24} | hand,
         }
     )
 
@@ -320,8 +338,14 @@ def straight() -> Wanted:
     return Wanted(_task(0.5, tip), tip, lambda share: np.pad(tip(share), ((0, 0), (0, 3))))
 
 
+def ahead() -> Wanted:
+    """The same by a hand that may move 0.1 s before the tip does, and 0.1 s after it."""
+    wanted = straight()
+    return replace(wanted, task=_task(0.5, wanted.tip, 0.1, intervals=32), lead_s=0.1)
+
+
 def turning() -> Wanted:
-    """The same by a hand that may turn."""
+    """The same by a hand that may turn, within the 0.5 s."""
     wanted = straight()
     free = wanted.task.hand.model_copy(update={"free": ["x", "z", "ry"], "jerk_weight": 1e-5})
     return replace(wanted, task=wanted.task.model_copy(update={"hand": free}))
@@ -357,6 +381,7 @@ def still() -> Wanted:
 TASKS = {
     "circle": circle,
     "straight": straight,
+    "ahead": ahead,
     "turning": turning,
     "arrival": arrival,
     "still": still,
@@ -380,11 +405,12 @@ class Shaper:
         return cls(np.pi / (omega * root), 1 / (1 + np.exp(-ratio * np.pi / root)))
 
     def shaped(self, wanted: Wanted) -> Motion:
-        """Return the rigid hand, shaped; both impulses are within the duration."""
-        duration_s = wanted.task.duration_s - self.delay_s
+        """Return the rigid hand, shaped; both impulses are within the time in which the tip moves."""
+        way_s = wanted.way_s - self.delay_s
 
         def motion(t_s: Array) -> Array:
-            parts = [wanted.hand(smooth(t_s - late, duration_s)) for late in (0.0, self.delay_s)]
+            begins = wanted.lead_s, wanted.lead_s + self.delay_s
+            parts = [wanted.hand(smooth(t_s - begin_s, way_s)) for begin_s in begins]
             return self.first * parts[0] + (1 - self.first) * parts[1]
 
         return motion
@@ -409,10 +435,9 @@ def errors_of(t_s: Array, tip: Array, wanted: Wanted) -> tuple[float, float, flo
     """Return RMS and largest distance of the tip from its reference, and the largest distance from
     its mean place after the motion [m].
     """
-    duration_s = wanted.task.duration_s
-    distance = np.linalg.norm(tip - wanted.tip(smooth(t_s, duration_s)), axis=1)
+    distance = np.linalg.norm(tip - wanted.tip_at(t_s), axis=1)
     distance = distance[t_s >= wanted.from_s - 1e-9]
-    after = tip[t_s >= duration_s - 1e-9]
+    after = tip[t_s >= wanted.task.duration_s - 1e-9]
     vibration = np.linalg.norm(after - after.mean(axis=0), axis=1).max()
     return float(np.sqrt(np.mean(distance**2))), float(distance.max()), float(vibration)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.stats import chi2, norm
 
 from ...common.array_types import Array
 from ...errors import InputError, SimulationError
@@ -22,7 +23,6 @@ from ...problem.code_loader import CodeLoader
 from ...program.simulation import Trajectory, simulate
 from ...recording import Experiment, Markers, PoseSequence
 from ...runs.solved_problem import SolvedProblem
-from ...statistics.budget.combined_intervals import NORMAL_95
 from ..design.hand_limits import REACHED, Limits
 from .durations import shortest, shortest_of_hand
 from .full_program import require_full_program, solve_full
@@ -42,6 +42,8 @@ from .task import Reference, Task
 Solver = Literal["reduced-space", "interior-point"]
 # Share of a limit, tightened by its margin, from which it binds.
 BINDING = 1 - 1e-4
+# Probability with which the whole motion of all points is inside the band.
+BAND = 0.95
 # Sources of the band beside those of a budget.
 DESCRIPTION, UNKNOWN = "description", "all sources"
 # Limits of a hand that does not move.
@@ -214,26 +216,43 @@ class MotionPlan:
         return float(np.linalg.norm(on_grid - fine, axis=2).max(initial=0.0))
 
     @cached_property
-    def constants_std_m(self) -> dict[str, Array] | None:
-        """Standard deviation (T, 3) of each point due to the uncertainty of the constants [m], by
-        name; None if that is not known.
+    def std_m(self) -> dict[str, Array] | None:
+        """Standard deviation (T, 3) of each point due to the uncertainty of the constants and to
+        errors of the description [m], by name; None if these are not known.
         """
         contributions = self.contributions_m
         return None if contributions is None else {
-            name: np.sqrt(np.einsum("tiq,qr,tir->ti", by_q, self.covariance, by_q))
-            for name, by_q in contributions.items()
+            name: self._std_m(by_q, self.covariance) for name, by_q in contributions.items()
         }  # fmt: skip
 
     @cached_property
     def half_widths_m(self) -> dict[str, Array] | None:
-        """Half width (T, 3) of the 95 % band of each point [m], by name: of the constants and of
-        errors of the description; None if these are not known.
+        """Half width (T, 3) of the 95 % band of each point [m], by name: all coordinates of all
+        points at all times are inside at once with a probability of at least 95 %. None if the
+        uncertainty of the constants is not known.
         """
-        std = self.constants_std_m
-        other = self.program.body.description_std_m
+        std = self.std_m
         return None if std is None else {
-            name: NORMAL_95 * np.sqrt(each**2 + other**2) for name, each in std.items()
+            name: self.band_factor * each for name, each in std.items()
         }  # fmt: skip
+
+    @cached_property
+    def band_factor(self) -> float:
+        """Half width of the band in standard deviations, the smaller one of two bounds for normal
+        deviations: Šidák's for the number of coordinates and times, whatever their correlation (JASA
+        62, 1967), and Scheffé's for the number of constants, which errors of the description exceed.
+        """
+        points = self.program.experiment.markers.names
+        values = 3 * len(points) * len(self.t_s)
+        factor = float(norm.ppf(0.5 + 0.5 * BAND ** (1 / values)))
+        if self.program.body.description_std_m:
+            return factor
+        constants = int(np.linalg.matrix_rank(self.covariance, hermitian=True))
+        return min(factor, float(np.sqrt(chi2.ppf(BAND, max(1, constants)))))
+
+    def _std_m(self, by_q: Array, covariance: Array) -> Array:
+        variance = self.program.body.description_std_m**2
+        return np.sqrt(variance + np.einsum("tiq,qr,tir->ti", by_q, covariance, by_q))
 
     @property
     def covariance(self) -> Array:
@@ -285,10 +304,8 @@ class MotionPlan:
         information = rows.T @ rows / float(np.median(body.template.markers.sigma_m)) ** 2
         reduced = statistical @ np.linalg.inv(np.eye(len(statistical)) + information @ statistical)
         remaining = self.covariance - statistical + reduced
-        variance = body.description_std_m**2
-        return NORMAL_95 * max(
-            float(np.sqrt(variance + np.einsum("tiq,qr,tir->ti", each, remaining, each).max()))
-            for each in contributions.values()
+        return self.band_factor * max(
+            float(self._std_m(each, remaining).max()) for each in contributions.values()
         )
 
     @cached_property
@@ -344,16 +361,14 @@ class MotionPlan:
         at = counted.any(axis=1)
         distance = np.linalg.norm(deviation[at], axis=1)
         rms = float(np.sqrt(np.mean(distance**2)))
-        half_widths = self.half_widths_m
-        if half_widths is None:
+        if self.std_m is None:
             return TrackingError(rms, float(distance.max()), None, None)
-        half = np.where(counted, half_widths[reference.name], 0.0)[at]
-        variance = np.sum((half / NORMAL_95) ** 2, axis=1)
+        std = np.where(counted, self.std_m[reference.name], 0.0)[at]
         return TrackingError(
             rms,
             float(distance.max()),
-            float(half.max()),
-            float(np.sqrt(np.mean(distance**2 + variance))),
+            self.band_factor * float(std.max()),
+            float(np.sqrt(np.mean(distance**2 + np.sum(std**2, axis=1)))),
         )
 
     @cached_property

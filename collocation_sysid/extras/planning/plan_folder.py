@@ -43,7 +43,7 @@ REPORT_FILE = "report.html"
 CAPTIONS = {
     "hand": "The hand over time",
     "commands": "Tensions and pressures, with their limits",
-    "tracking": "Displacements of the points with their 95 % bands, and their references, dashed",
+    "tracking": "Displacements of the points with their 95 % band, and their references, dashed",
 }
 # Form of plan.json.
 SCHEMA = 1
@@ -105,7 +105,7 @@ def write_plan(
         save_pictures(place, figures)
         pictures = (Picture(place / f"{name}.png", CAPTIONS[name]) for name in figures)
         title = f"Plan for {plan.program.body.template.name!r}"
-        report = TitledParts(title, (*plan_summary(plan, target), *pictures), level=1)
+        report = TitledParts(title, (*plan_summary(plan), *pictures), level=1)
         (place / REPORT_FILE).write_text(report_html(report), encoding="utf-8")
         if with_film:
             say("rendering the film of the motion")
@@ -280,8 +280,8 @@ def _improvement(largest: BandContribution) -> str:
     return f"{percent} are {of_constant} by {largest.source}; to reduce it, {remedy}"
 
 
-def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
-    """Return a plan on one screen."""
+def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
+    """Return a plan on one screen, and where it is, if it was written to a folder."""
     notes: list[Shown] = [Line(f"warning: {text}", "check") for text in plan.program.body.warnings]
     if plan.interrupted:
         notes.append(Line("interrupted: the best plan so far", "check"))
@@ -331,6 +331,8 @@ def plan_summary(plan: MotionPlan, folder: Path) -> list[Shown]:
             )
         )
     shown += _limit_lines(plan)
+    if folder is None:
+        return shown
     shown.append(f"written to {folder}; the page is {REPORT_FILE}")
     if (folder / CHECK_FILE).is_file():
         shown.append(
