@@ -140,7 +140,7 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
     tracks = true_recording.markers.positions_m
     tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
     uncertainty, combined_contains_truth, half_widths, converged = identified(
-        with_markers(described, tracks), None if fault in EVERY else ROWS.get(fault, ())
+        with_markers(described, tracks), BUDGETS.get(fault, ROWS.get(fault, ()))
     )
     errors_without_nuisance = np.full(len(QUANTITIES), np.nan)
     if true_recording is described:
@@ -171,15 +171,15 @@ def positions_m() -> Array:
 
 
 def identified(
-    experiment: Experiment, assumed: Sequence[Deviation] | None = ()
+    experiment: Experiment, assumed: Sequence[Deviation] | Mapping[str, None] = ()
 ) -> tuple[Uncertainty, Array, Array, bool]:
     """Identify an experiment with default options, starting from the truth.
 
     Parameters
     ----------
     experiment : Experiment
-    assumed : sequence of Deviation or None
-        Rows of the uncertainty budget; None for the default budget.
+    assumed : sequence of Deviation, or mapping of str to None
+        Rows of the uncertainty budget, or the names of rows that the default budget lacks.
 
     Returns
     -------
@@ -204,17 +204,17 @@ def identified(
     return fit.uncertainty, contained, np.array(half_widths), fit.converged
 
 
-def fit_from_truth(experiment: Experiment, assumed: Sequence[Deviation] | None) -> BudgetedFit:
-    """Return the fit of an experiment from the truth, with a budget of some assumptions, or of all
-    for None.
-    """
+def fit_from_truth(
+    experiment: Experiment, assumed: Sequence[Deviation] | Mapping[str, None]
+) -> BudgetedFit:
+    """Return the fit of an experiment from the truth, with a budget as in `identified`."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation = solution.collocation
     z = solution.z
     uncertainty = uncertainty_at(collocation, z)
-    if assumed is None:
-        changes = changes_of_assumptions(collocation, z, {})
+    if isinstance(assumed, Mapping):
+        changes = changes_of_assumptions(collocation, z, assumed)
     else:
         deviations = [(row, row.considered) for row in assumed if row.considered is not None]
         changes = changed_residuals(collocation, z, deviations)
@@ -426,11 +426,14 @@ SINGLE = (
 ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
 ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
 ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
-# All effects of the default budget, and the nuisance parameters; the budget is the default one.
+# All effects of the default budget, and the nuisance parameters; the budget has what is drawn.
 WITHOUT_LAW = (*SINGLE, "surface", "grip_layer_m", "grasp_edge_m")
 EVERY = {
     "every effect": (*WITHOUT_LAW, "damping_law"),
     "every effect but the damping law": WITHOUT_LAW,
+}
+BUDGETS: dict[str, Mapping[str, None]] = {
+    name: {} if "damping_law" in names else {"damping_law": None} for name, names in EVERY.items()
 }
 
 FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from assumed_twins import with_wrong_assumptions
-from kit.problems import EDGE_M, box, hung_cube, smooth_poses
+from kit.problems import EDGE_M, box, hung_cube
 from kit.static import PRESSED_M, TIMES, block
 
 from collocation_sysid import (
@@ -19,7 +18,6 @@ from collocation_sysid import (
     Force,
     Grasp,
     Markers,
-    NodeForce,
     Nuisance,
     Obstacle,
     Plane,
@@ -61,9 +59,13 @@ OFF = {
     "buoyancy": 0.3,
     "added_mass": 0.03,
     "air_drag": 0.03,
+    "grip_layer_m": 1e-5,
+    "grasp_edge_m": 1e-5,
 }
 
 
+# Drift is piecewise constant in the twins, and a longer body has more mass there.
+INEXACT = {"stiffness_drift": 0.05, "grip_layer_m": 0.2, "grasp_edge_m": 0.2}
 OF_AIR = ("buoyancy", "added_mass", "air_drag")
 
 
@@ -100,30 +102,8 @@ def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
     simulated = (tracks[0] - tracks[1]) / off
     largest = np.abs(simulated).max()
     assert largest > 0
-    atol = (0.05 if name == "stiffness_drift" else 0.01) * largest
+    atol = INEXACT.get(name, 0.01) * largest
     np.testing.assert_allclose(changed(experiment, name), simulated, atol=atol)
-
-
-def test_a_grip_that_gives_way_is_a_body_on_springs():
-    layer_m, sway_m = 1e-4, np.array([0.02, 0.01, -0.015])
-    mesh, hung = (box().mesh, hung_cube(24, start="undeformed", gravity_m_s2=(0.0, 0.0, 0.0)))
-    nodes, body = hung.grasps[0].nodes, Body(mesh, density_kg_m3=60.0)
-    poses = smooth_poses(hung.t_s, tuple(sway_m), turn_rad=(0.0, 0.0, 0.0))
-
-    def spring(x, v, at):
-        way = x - at.rest_m - sway_m * (1 - ca.cos(20.0 * at.t_s))
-        return -VALUES["young_pa"] * at.volume_m3 ** (2 / 3) / layer_m * way
-
-    loose = Body(mesh, density_kg_m3=60.0, forces=[NodeForce.from_law(spring, nodes=nodes)])
-    gripped = replace(hung, body=body, grasps=(Grasp(nodes, poses),))
-    on_springs = replace(hung, body=loose, grasps=())
-    # Under the midpoint rule springs as stiff as these would ring.
-    tracks = [
-        simulate(each, VALUES, "bdf2", substeps=1).markers_m for each in (on_springs, gripped)
-    ]
-    simulated = (tracks[0] - tracks[1]) / layer_m
-    expected = changed(gripped, "grip_layer_m", "bdf2")
-    np.testing.assert_allclose(expected, simulated, atol=0.01 * np.abs(simulated).max())
 
 
 @pytest.mark.parametrize("has_stated_places", [True, False])
@@ -178,12 +158,11 @@ def hanging_bar(layers: int) -> Experiment:
 
 
 def test_a_gripper_that_holds_less_of_the_body_leaves_a_longer_bar():
-    """The row is that of a compliant layer, whose areas are estimated from the volumes of nodes."""
     sag_m = [simulate(hanging_bar(layers), VALUES).markers_m[0, 0, 2] for layers in (16, 17)]
     # The additional layer at the top carries the weight of the bar below it.
     simulated = (sag_m[1] - sag_m[0]) / 0.005
     (expected,) = changed(hanging_bar(16), "grasp_edge_m")[:, 0, 2]
-    assert 0.5 < expected / simulated < 2.0
+    assert expected == pytest.approx(simulated, rel=0.2)
 
 
 def test_the_edge_of_a_platen_is_the_face_of_the_specimen():

@@ -28,6 +28,7 @@ from ...fem.body import Body
 from ...fem.laws.constants import GAMMA_M, GAMMA_R, is_modulus, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
+from ...fem.meshes.mesh import boundary_of
 from ...fem.rest_shape import RestShape
 from ...model.contact.contact_summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
@@ -342,6 +343,42 @@ class ExperimentAtAnswer:
         return np.where(np.isnan(self.iterate.equations.prescribed.positions_m), 0.0, reaction_n)
 
     @cached_property
+    def effect_of_grips(self) -> Effect | None:
+        """Effect of grippers that hold the body at one metre outside the faces that they hold, while
+        they hold it; None without such faces. A grasp that prescribes some axes only is a platen or
+        a plane of symmetry, not a gripper.
+        """
+        experiment = self.iterate.transcription.experiment
+        grippers = [each for each in experiment.body_grasps if len(each.axes) == len(_AXES)]
+        if not grippers:
+            return None
+        body = self.body
+        is_held = np.isin(
+            np.arange(len(body.nodes_m)), np.concatenate([each.nodes for each in grippers])
+        )
+        cells = body.mesh.tetrahedra
+        faces, _ = boundary_of(cells[~is_held[cells].all(axis=1)])
+        faces = faces[is_held[faces].all(axis=1)]
+        a, b, c = np.moveaxis(self.stress_free_m[faces], 1, 0)
+        normals = np.zeros_like(body.nodes_m)
+        np.add.at(normals, body.nodes.nodes_of_faces(faces), np.cross(b - a, c - a)[:, None])
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        if not length.any():
+            return None
+        np.divide(normals, length, out=normals, where=length > 0)
+        force_n = np.zeros_like(self.iterate.x)
+        displacement_m = np.zeros_like(self.grasp_force_n)
+        for grasp in grippers:
+            is_own = np.isin(np.arange(len(normals)), grasp.nodes)
+            effect = shape_effect(self, np.where(is_own[:, None], normals, 0.0))
+            assert effect.force_n is not None
+            assert effect.displacement_m is not None
+            active = grasp.is_active(self.dynamics.t_s[: len(force_n)])
+            force_n[active] += effect.force_n[active]
+            displacement_m += effect.displacement_m
+        return Effect(force_n, displacement_m=displacement_m)
+
+    @cached_property
     def proportional_s(self) -> Array:
         """Damping times γ_r (E,) of elements with Rayleigh damping γ_r K(x) v [s], zero of
         others.
@@ -588,23 +625,10 @@ def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a compliant layer of the body's own material between body and grippers,
-    per metre of thickness; None without a gripper.
-
-    A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
+    """Return the effect of a layer of the body's own material, without mass, between body and
+    grippers, per metre of thickness; None without a gripper that holds faces of the body.
     """
-    prescribed = at.iterate.equations.prescribed
-    holding = at.iterate.transcription.experiment.body_grasps
-    gripped = [grasp.prescribed_dofs for grasp in holding if len(grasp.axes) == len(_AXES)]
-    if not gripped:
-        return None
-    area_m2 = at.body.sum_dof_volumes_m3()[prescribed.dofs] ** (2 / 3)
-    is_gripped = np.isin(prescribed.dofs, np.concatenate(gripped))
-    displacement_m = np.zeros_like(at.grasp_force_n)
-    displacement_m[:, is_gripped] = -at.grasp_force_n[:, is_gripped] / (
-        at.young_pa * area_m2[is_gripped]
-    )
-    return Effect(displacement_m=displacement_m)
+    return at.effect_of_grips
 
 
 def _grasp_edge(at: ExperimentAtAnswer, _: int) -> Effect | None:
