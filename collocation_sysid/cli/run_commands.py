@@ -86,8 +86,8 @@ def export(
     to: Annotated[
         str,
         option(
-            "Destination: a file .xml (MuJoCo), .usda, .py (Newton), .inp (CalculiX), .json or .rrd "
-            "(Rerun); or a format: mujoco, usd, newton, calculix, json, rerun.",
+            "Destination: a file .xml (MuJoCo), .usda, .py (Newton), .inp (CalculiX), .feb (FEBio), "
+            ".json or .rrd (Rerun); or a format: mujoco, usd, newton, calculix, febio, json, rerun.",
             "FILE|FORMAT",
         ),
     ],

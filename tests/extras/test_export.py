@@ -493,7 +493,7 @@ def test_doubts_about_the_run_go_along(run_folder, tmp_path, to):
 HOSTILE = "a --- b --> \"<&'\x00\x1b[2J\x0c\ufffe\n"
 
 
-@pytest.mark.parametrize("to", ["mujoco", "calculix", "newton", "usd"])
+@pytest.mark.parametrize("to", ["mujoco", "calculix", "newton", "usd", "febio"])
 def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_path: Path):
     bar = box_mesh(BAR_M, DIVISIONS)
     cells = np.arange(len(bar.tetrahedra))
@@ -514,7 +514,7 @@ def test_any_title_or_name_is_written_in_the_form_of_the_target(to: str, tmp_pat
     for file in folder.iterdir():
         text = file.read_text(encoding="utf-8")
         assert all(mark.isprintable() or mark in "\n\t" for mark in text)
-        if file.suffix == ".xml":
+        if file.suffix in (".xml", ".feb"):
             ElementTree.parse(file)
         elif file.suffix == ".py":
             compile(text, file, "exec")

@@ -1,7 +1,8 @@
 """CalculiX: an input deck of the body at rest under gravity, in its grasp and in contact with
 obstacles.
 
-For a static recording the deck has one step for each sample, else one for the first sample.
+For a static recording the deck has one step for each sample, else one for the first sample. A body
+with fibres gets a second deck with the cards that Abaqus has for them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError
-from ...fem.laws.constants import FIBRE_ANGLE, FIBRE_EXPONENT, FIBRE_STIFFNESS
+from ...fem.laws.constants import FIBRE_ANGLE, FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
 from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
 from ...fem.regions import BodyPart
 from .export_target import (
@@ -31,6 +32,7 @@ from .identified import IdentifiedBody, IdentifiedRegion
 from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
 DECK = "body.inp"
+ABAQUS_DECK = "abaqus.inp"
 # Time after which a run of CalculiX is stopped.
 TIME_LIMIT_S = 600.0
 # Corners of the sides of a tetrahedron in the order of CalculiX.
@@ -51,6 +53,9 @@ _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
 MOST_TERMS = 3
 # Largest number of values on a line of a card, by the manual of CalculiX.
 VALUES_PER_LINE = 8
+# Abaqus divides by the exponent k₂ of fibres: that of the quadratic law, which changes the energy by
+# k₂ e² / 2.
+ABAQUS_QUADRATIC = 1e-6
 DISPERSED = (
     "fibres that scatter are not exported: the exported part is softer along them than the "
     "identified one"
@@ -66,8 +71,18 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
     The deck has one step for each sample of a static recording, else one for the first sample
     alone. Damping is not exported. A material that CalculiX does not have becomes a neo-Hookean
-    one, with a sentence on that.
+    one, with a sentence on that. A body with fibres has the deck for Abaqus, too, whose comments
+    say what it cannot express.
     """
+    deck, limits = _deck(body, for_abaqus=False)
+    files = {DECK: deck}
+    if any(isinstance(part.material, ReinforcedMaterial) for part in body.body.parts):
+        files[ABAQUS_DECK], _ = _deck(body, for_abaqus=True)
+    return ExportedFiles(files, limits)
+
+
+def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ...]]:
+    """Return the deck, and what it does not express."""
     static = body.experiment.is_static
     limits = replace(
         CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
@@ -80,7 +95,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
         sections = f"*SOLID SECTION,ELSET=E{k},MATERIAL={name}\n"
         if isinstance(part.material, ReinforcedMaterial):
             fibres = part.material.energy.fibres
-            if fibres.is_dispersed:
+            if for_abaqus:
+                card, limitation = _abaqus_fibre_card(region, fibres)
+                sections = _fibre_sections(body, part, k, name, _local_directions(region, fibres))
+            elif fibres.is_dispersed:
                 limitation = f"{limitation}; {DISPERSED}".removeprefix("; ")
             else:
                 name = f"ELASTIC_FIBER{k}"
@@ -94,8 +112,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     limits.append("damping is not exported: an equilibrium has none")
     if body.is_quadratic:
         limits.append(
-            "CalculiX distributes the weight of an element with its shape functions, "
-            "this program lumps it at the nodes"
+            f"{'Abaqus' if for_abaqus else 'CalculiX'} distributes the weight of an element with its "
+            "shape functions, this program lumps it at the nodes"
         )
     nodes = (f"{k},{_format_values(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
     mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
@@ -110,9 +128,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     steps = ""
     for t_s in _step_times_s(body):
         steps += _step_card(body, obstacles, t_s=t_s, is_linear=linear)
-    return ExportedFiles(
-        {DECK: f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"}, tuple(limits)
-    )
+    if for_abaqus:
+        steps = steps.replace("TOTALS=ONLY", "TOTALS=YES")
+    deck = f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"
+    return deck, tuple(limits)
 
 
 def _step_times_s(body: IdentifiedBody) -> Array:
@@ -271,30 +290,70 @@ def _fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)², and fibres resist "
         "their stretch without the change of volume"
     )
-    if not fibres.tension_only:
-        limitation += "; they carry no compression, while the identified ones do"
-    return f"*USER MATERIAL,CONSTANTS={len(values)}\n{card}", limitation
+    return f"*USER MATERIAL,CONSTANTS={len(values)}\n{card}", limitation + _compression(fibres)
 
 
-def _fibre_sections(body: IdentifiedBody, part: BodyPart, number: int, name: str) -> str:
-    """Return an orientation, an element set and a section for each direction of the fibres of a
-    part: local axes are the normal of the fibres, across them, and against them.
+def _abaqus_fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
+    """Return the card of the law of Gasser, Ogden & Holzapfel (2006) in Abaqus, and a sentence on
+    what it does not express.
+
+    Its energy is C₁₀ (Ī₁ − 3) + ((J² − 1)/2 − ln J)/D + k₁/(2 k₂) (exp(k₂ ⟨e⟩²) − 1) of each family,
+    with e = κ (Ī₁ − 3) + (1 − 3 κ)(Ī₄ − 1).
     """
-    assert part.axes is not None
-    here = body.nodes_m - body.nodes_m.mean(axis=0)
-    undeformed = body.body.nodes_m - body.body.nodes_m.mean(axis=0)
-    turn = np.linalg.lstsq(undeformed, here)[0].T  # of the body as its grasp holds it
-    axes = np.round(np.einsum("ij,kjl->kil", turn, part.axes), 12)
-    different, of_cell = np.unique(axes.reshape(-1, 9), axis=0, return_inverse=True)
+    c = region.constants
+    values = (
+        region.mu_pa / 2,
+        2 / region.kappa_pa,
+        c[FIBRE_STIFFNESS.name] / 4,
+        c.get(FIBRE_EXPONENT.name, ABAQUS_QUADRATIC),
+        c.get(FIBRE_DISPERSION.name, 0.0),
+    )
+    limitation = (
+        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ ((J² − 1)/2 − ln J), and "
+        "fibres resist their stretch without the change of volume"
+    )
+    keyword = f"*ANISOTROPIC HYPERELASTIC,HOLZAPFEL,LOCAL DIRECTIONS={fibres.families}"
+    return f"{keyword}\n{_format_values(*values)}\n", limitation + _compression(fibres)
+
+
+def _compression(fibres: FibreLaw) -> str:
+    if fibres.tension_only:
+        return ""
+    return "; they carry no compression, while the identified ones do"
+
+
+def _local_directions(region: IdentifiedRegion, fibres: FibreLaw) -> list[tuple[float, ...]]:
+    """Return the direction of each family in the axes of the fibres."""
+    angle = region.constants.get(FIBRE_ANGLE.name, 0.0)
+    sides = (1, -1)[: fibres.families]
+    return [(float(np.cos(angle)), side * float(np.sin(angle)), 0.0) for side in sides]
+
+
+def _fibre_sections(
+    body: IdentifiedBody,
+    part: BodyPart,
+    number: int,
+    name: str,
+    directions: Sequence[tuple[float, ...]] = (),
+) -> str:
+    """Return an orientation, an element set and a section for each direction of the fibres of a
+    part. Local axes for CalculiX are the normal of the fibres, across them, and against them. With
+    the local directions of Abaqus they are the axes of the fibres.
+    """
     cards = ""
-    for k, own in enumerate(different.reshape(-1, 3, 3)):
-        cells = part.cells[of_cell.ravel() == k] + 1
+    keyword = "SYSTEM=RECTANGULAR"
+    tail = ""
+    if directions:
+        keyword += f",LOCAL DIRECTIONS={len(directions)}"
+        tail = "".join(f"{_format_values(*each)}\n" for each in ((3, 0.0), *directions))
+    for k, (cells, own) in enumerate(body.fibre_axes(part)):
         label = f"F{number}_{k}"
+        first, second = (own[:, 0], own[:, 1]) if directions else (own[:, 2], own[:, 1])
         cards += (
-            f"*ORIENTATION,NAME={label},SYSTEM=RECTANGULAR\n"
-            f"{_format_values(*own[:, 2], *own[:, 1])}\n"
+            f"*ORIENTATION,NAME={label},{keyword}\n"
+            f"{_format_values(*first, *second)}\n{tail}"
             f"*ELSET,ELSET={label}\n"
-            + "".join(f"{cell}\n" for cell in cells)
+            + "".join(f"{cell}\n" for cell in cells + 1)
             + f"*SOLID SECTION,ELSET={label},MATERIAL={name},ORIENTATION={label}\n"
         )
     return cards

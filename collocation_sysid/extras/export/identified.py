@@ -20,6 +20,7 @@ from ...errors import InputError, listed, located
 from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
+from ...fem.regions import BodyPart
 from ...problem import Problem
 from ...program.collocation import Collocation
 from ...recording import Experiment, Markers, Obstacle
@@ -373,6 +374,21 @@ class IdentifiedBody:
                 )
             )
         return tuple(regions)
+
+    def fibre_axes(self, part: BodyPart) -> list[tuple[Index, Array]]:
+        """Return the elements of a part with fibres by their axes: for each axes (3, 3) in the
+        world, whose columns are those of `Fibres.axes`, the indices of the elements.
+        """
+        assert part.axes is not None
+        here = self.nodes_m - self.nodes_m.mean(axis=0)
+        undeformed = self.body.nodes_m - self.body.nodes_m.mean(axis=0)
+        turn = np.linalg.lstsq(undeformed, here)[0].T  # of the body as its grasp holds it
+        axes = np.round(np.einsum("ij,kjl->kil", turn, part.axes), 12)
+        different, of_cell = np.unique(axes.reshape(-1, 9), axis=0, return_inverse=True)
+        return [
+            (part.cells[of_cell.ravel() == k], own)
+            for k, own in enumerate(different.reshape(-1, 3, 3))
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of identified.json as a dictionary, with arrays and dataclasses that

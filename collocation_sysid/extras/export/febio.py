@@ -1,0 +1,218 @@
+"""FEBio: a model of the body at rest under gravity, in its grasp at the first sample.
+
+The file has the format 4.0. FEBio's fibres of the type "fiber-exp-pow" and its law "HGO
+unconstrained" have the energies of `Fibres`, with the change of volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ...common.array_types import Array, Index
+from ...fem.laws.constants import FIBRE_ANGLE, FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
+from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
+from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
+from .identified import IdentifiedBody, IdentifiedRegion
+
+MODEL = "body.feb"
+# Law of FEBio with the energy of a material; "linear" has it at small strain.
+LAWS = {
+    "neo-hookean": "neo-Hookean",
+    "st-venant-kirchhoff": "isotropic elastic",
+    "linear": "isotropic elastic",
+}
+CAPABILITIES = TargetCapabilities(
+    LAWS,
+    "{material} becomes the neo-Hookean energy of the same λ and μ at small strain",
+    mass_damping="",
+    node_forces="",
+    has_quadratic_elements=True,
+    has_fibres=True,
+)
+# A matrix without stiffness beside another one, and the exponent of the quadratic law, relative to
+# ones that count: FEBio's law of dispersed fibres accepts no zeros.
+NOTHING = 1e-9
+HEAD = """\
+  <Module type="solid"/>
+  <Control>
+    <analysis>STATIC</analysis>
+    <time_steps>10</time_steps>
+    <step_size>0.1</step_size>
+    <time_stepper type="default"/>
+    <solver type="solid"/>
+  </Control>
+"""
+RAMP = """\
+  <LoadData>
+    <load_controller id="1" type="loadcurve">
+      <interpolate>LINEAR</interpolate>
+      <points>
+        <pt>0,0</pt>
+        <pt>1,1</pt>
+      </points>
+    </load_controller>
+  </LoadData>
+"""
+OUTPUT = """\
+  <Output>
+    <logfile>
+      <node_data data="ux;uy;uz" file="displacements.csv" delim=","/>
+    </logfile>
+    <plotfile type="febio">
+      <var type="displacement"/>
+      <var type="stress"/>
+    </plotfile>
+  </Output>
+"""
+
+
+def export(body: IdentifiedBody) -> ExportedFiles:
+    """Return the model, one text file, and what FEBio cannot express; nothing is written."""
+    limits = CAPABILITIES.limitations(body)
+    limits += [f"{each.name} is not exported" for each in body.obstacles]
+    limits.append("damping is not exported: an equilibrium has none")
+    materials, domains = "", []
+    for region, part in zip(body.regions, body.body.parts, strict=True):
+        if region.material == "linear":
+            limits.append(
+                f"{region.name}: the linear material becomes that of St. Venant and Kirchhoff"
+            )
+        fibres = None
+        groups: list[tuple[Index, Array]] = [(part.cells, np.eye(3))]
+        if isinstance(part.material, ReinforcedMaterial):
+            fibres = part.material.energy.fibres
+            groups = body.fibre_axes(part)
+            if not fibres.tension_only:
+                limits.append(
+                    f"{region.name}: fibres carry no compression, while the identified ones do"
+                )
+        for cells, axes in groups:
+            number = len(domains) + 1
+            materials += _material(number, region, fibres, axes)
+            domains.append(cells)
+    sets, boundary = _prescribed(body)
+    force_sets, loads = _loads(body)
+    kind = "tet10" if body.is_quadratic else "tet4"
+    elements = "".join(
+        f'    <Elements type="{kind}" name="E{k}">\n'
+        + _lines("elem", cells + 1, body.body.cells[cells] + 1)
+        + "    </Elements>\n"
+        for k, cells in enumerate(domains, start=1)
+    )
+    nodes = _lines("node", range(1, len(body.nodes_m) + 1), body.nodes_m)
+    solids = "".join(
+        f'    <SolidDomain name="E{k}" mat="M{k}"/>\n' for k in range(1, len(domains) + 1)
+    )
+    head = comment_lines(body, limits, start="  <!-- ", end=" -->")
+    text = (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<febio_spec version="4.0">\n{head}{HEAD}'
+        f"  <Material>\n{materials}  </Material>\n"
+        f'  <Mesh>\n    <Nodes name="body">\n{nodes}    </Nodes>\n{elements}{sets}{force_sets}  </Mesh>\n'
+        f"  <MeshDomains>\n{solids}  </MeshDomains>\n{RAMP}"
+        f"  <Loads>\n{loads}  </Loads>\n  <Boundary>\n{boundary}  </Boundary>\n{OUTPUT}</febio_spec>\n"
+    )
+    return ExportedFiles({MODEL: text}, tuple(limits))
+
+
+def _material(number: int, region: IdentifiedRegion, fibres: FibreLaw | None, axes: Array) -> str:
+    """Return the material of one domain, whose fibres have the axes (3, 3)."""
+    law = LAWS.get(region.material, "neo-Hookean")
+    constants = {"density": region.density_kg_m3, "E": region.young_pa, "v": region.poisson}
+    if fibres is None:
+        return _law("material", law, constants, f'id="{number}" name="M{number}" ')
+    solids = _law("solid", law, constants)
+    solids += "".join(_fibre_solids(region, fibres, axes))
+    return (
+        f'    <material id="{number}" name="M{number}" type="solid mixture">\n{solids}'
+        "    </material>\n"
+    )
+
+
+def _fibre_solids(region: IdentifiedRegion, fibres: FibreLaw, axes: Array) -> Iterable[str]:
+    """Yield the components of a mixture that are fibres. The density of a mixture is the sum of those
+    of its components, which is 1 where none is stated.
+    """
+    c = region.constants
+    angle = c.get(FIBRE_ANGLE.name, 0.0)
+    sides = (1, -1)[: fibres.families]
+    along = [axes @ np.array([np.cos(angle), side * np.sin(angle), 0.0]) for side in sides]
+    k1 = c[FIBRE_STIFFNESS.name] / 4
+    exponent = c.get(FIBRE_EXPONENT.name, 0.0)
+    if not fibres.is_dispersed:
+        for direction in along:
+            constants = {"density": 0.0, "ksi": k1, "alpha": exponent, "beta": 2.0}
+            fibre = f'<fiber type="vector">{values_as_text(direction, ",")}</fiber>'
+            yield _law("solid", "fiber-exp-pow", constants, inside=fibre)
+        return
+    # This law has two families at ± gamma from the first axis: one family is half of each.
+    single = len(along) == 1
+    first, second = (along[0], np.cross(axes[:, 2], along[0])) if single else axes.T[:2]
+    acute = np.arctan2(abs(np.sin(angle)), abs(np.cos(angle)))
+    constants = {
+        "density": 0.0,
+        "c": NOTHING * region.mu_pa,
+        "k1": k1 / 2 if single else k1,
+        "k2": exponent or NOTHING,
+        "gamma": 0.0 if single else float(np.degrees(acute)),
+        "kappa": c[FIBRE_DISPERSION.name],
+        "k": NOTHING * region.mu_pa,
+    }
+    inside = (
+        f'<mat_axis type="vector"><a>{values_as_text(first, ",")}</a>'
+        f"<d>{values_as_text(second, ',')}</d></mat_axis>"
+    )
+    yield _law("solid", "HGO unconstrained", constants, inside=inside)
+
+
+def _law(tag: str, law: str, constants: dict[str, float], names: str = "", inside: str = "") -> str:
+    lines = [f"<{name}>{float(value)!r}</{name}>" for name, value in constants.items()]
+    body = "".join(f"      {line}\n" for line in [*lines, inside] if line)
+    return f'    <{tag} {names}type="{law}">\n{body}    </{tag}>\n'
+
+
+def _lines(tag: str, numbers: Iterable[int], rows: Array | Index) -> str:
+    """Return an element with an id for each row of numbers."""
+    return "".join(
+        f'      <{tag} id="{number}">{",".join(map(repr, row))}</{tag}>\n'
+        for number, row in zip(numbers, rows.tolist(), strict=True)
+    )
+
+
+def _node_set(name: str, nodes: Sequence[int] | Index) -> str:
+    numbers = ",".join(str(int(node) + 1) for node in nodes)
+    return f'    <NodeSet name="{name}">{numbers}</NodeSet>\n'
+
+
+def _prescribed(body: IdentifiedBody) -> tuple[str, str]:
+    """Return node sets and boundary conditions: one for each axis and displacement."""
+    moved_m = np.round(body.prescribed_m - body.nodes_m, 12)
+    sets, conditions = "", ""
+    for axis, name in enumerate("xyz"):
+        for k, value in enumerate(np.unique(moved_m[np.isfinite(moved_m[:, axis]), axis])):
+            label = f"held_{name}{k}"
+            sets += _node_set(label, np.flatnonzero(moved_m[:, axis] == value))
+            conditions += (
+                f'    <bc type="prescribed displacement" node_set="{label}">\n'
+                f"      <dof>{name}</dof>\n"
+                f'      <value lc="1">{float(value)!r}</value>\n    </bc>\n'
+            )
+    return sets, conditions
+
+
+def _loads(body: IdentifiedBody) -> tuple[str, str]:
+    """Return node sets and loads: forces on nodes, and the weight, which FEBio subtracts."""
+    sets, loads = "", ""
+    for k, node in enumerate(np.flatnonzero(body.node_loads_n.any(axis=1))):
+        sets += _node_set(f"loaded_{k}", [int(node)])
+        loads += (
+            f'    <nodal_load type="nodal_force" node_set="loaded_{k}">\n'
+            f'      <value lc="1">{values_as_text(body.node_loads_n[node], ",")}</value>\n'
+            "    </nodal_load>\n"
+        )
+    axes = "".join(
+        f'      <{name} lc="1">{float(-value)!r}</{name}>\n'
+        for name, value in zip("xyz", body.experiment.gravity_m_s2, strict=True)
+    )
+    return sets, f'{loads}    <body_load type="const">\n{axes}    </body_load>\n'
