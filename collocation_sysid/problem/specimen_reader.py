@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..common.time_dependence import at_times, values_over_time
-from ..errors import InputError, located
+from ..errors import InputError, listed, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
 from ..recording.hysteresis import loading_rows
@@ -87,6 +87,12 @@ class SpecimenReader:
         if not section.modulus:
             for warning in order_warnings(specimen):
                 self._add_note(warning)
+            if table.compressive and specimen.strain.max() > -specimen.strain.min():
+                self._add_note(
+                    f"the name of {listed([repr(each) for each in table.compressive])} states "
+                    "compression, and its values are read as tension: state strain_sign = -1 and "
+                    "stress_sign = -1 where compression is positive"
+                )
         if table.is_displacement and section.area_m2 is None:
             self._add_note(
                 "the compliance of the test bench is not part of the budget: state area_m2, the "

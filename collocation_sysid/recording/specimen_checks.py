@@ -160,7 +160,8 @@ def require_equal_units(specimens: Mapping[str, Specimen]) -> None:
         if not softest_pa <= young <= stiffest_pa:
             raise InputError(
                 f"the initial slope of the stress corresponds to E = {young:.3g} Pa; expected "
-                f"{softest_pa:g} to {stiffest_pa:g} Pa. Check the unit of the stress",
+                f"{softest_pa:g} to {stiffest_pa:g} Pa. Check the unit of the stress, "
+                "or of the force and area_m2, which is in square metres (24 mm² are 24e-6)",
                 where=f"experiment '{name}'",
             )
     if len(known) < 2:

@@ -47,6 +47,7 @@ from .formats.columns import (
     column_statement,
     fitting_column_names,
     name_and_unit,
+    names_compression,
     other_columns_text,
     read_columns,
     similar_column_names,
@@ -167,6 +168,8 @@ class SpecimenTable:
     # Frequency and loss modulus of a harmonic test, whose storage modulus counts as stress.
     frequency_hz: Array | None = field(default=None, metadata=over_time())
     loss_pa: Array | None = field(default=None, metadata=over_time())
+    # Columns whose names state compression, such as Druckspannung.
+    compressive: tuple[str, ...] = ()
 
     @property
     def is_displacement(self) -> bool:
@@ -240,6 +243,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         is_incompressible=(layout.stress == "true" or layout.test == "biaxial-difference")
         and lateral is None
         and bool(DEFORMATIONS[layout.test].lateral),
+        compressive=tuple(filter(names_compression, table.grid.columns)),
         columns=tuple(table.values),
         unread=table.unread,
         sigma_pa=None if sigma_pa is None else sigma_pa * factor,

@@ -51,6 +51,8 @@ from .run_sections import (
 
 # Derived moduli in the summary; others are in the details.
 SHOWN_MODULI = ("young_pa", "poisson", INSTANTANEOUS.name)
+# Reasons of the verdict in the summary, gravest first.
+SHOWN_REASONS = 4
 # Sources of uncertainty in the summary, and the smallest share of a variance that counts.
 SHOWN_SOURCES = 3
 SMALLEST_SHOWN_SHARE = 0.01
@@ -117,9 +119,10 @@ def _brief(result: Result) -> list[Shown]:
     # A mistake of the description or the search is corrected before an assumption is relaxed.
     if is_routine(result) and (not is_found or is_first_to_correct(result)):
         probes = []
-    sections = (*outcome, verdict_section(result.trust))
+    sections = (*outcome, verdict_section(result.trust, max_reasons=SHOWN_REASONS))
     return [
         *flattened_parts(sections),
+        *_further_reasons(result),
         *remedy_command(result.trust.concerns),
         *(Line(note, "quiet") for note in result.notes if note.startswith(NO_CAUSE)),
         *_estimates(result),
@@ -129,6 +132,13 @@ def _brief(result: Result) -> list[Shown]:
         *_fit(result),
         *probes,
     ]
+
+
+def _further_reasons(result: Result) -> Iterator[Line]:
+    """Yield the number of reasons of the verdict beyond those shown, if there are any."""
+    if (count := len(result.trust.concerns) - SHOWN_REASONS) > 0:
+        further = "1 further reason" if count == 1 else f"{count} further reasons"
+        yield Line(f"  {further}, less grave: in the report, and with --details", "quiet")
 
 
 def _details(result: Result) -> list[Shown]:

@@ -355,7 +355,8 @@ TOPICS: dict[str, Topic] = {
             "law": "the residuals are {factor:.2g} times as large as expected from sigma_pa: the "
             "law {laws} may be too simple for {range}. First compare laws with "
             "collocation-sysid compare-models FILE --materials {others}; then check sigma_pa, the "
-            "units of the columns and the kind of test",
+            "units of the columns, the kind of test, and whether the stresses are true ones "
+            '(stress = "true")',
             "outlier": "sample {number} deviates by {deviations:.2g} sigma and contributes "
             "{percent:.0f} % of the sum of squared residuals: correct or remove this row, or set "
             "solver.huber",

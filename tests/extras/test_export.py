@@ -1092,3 +1092,21 @@ def test_newton_is_pressed_alike_from_the_stage_and_has_all_solids(tmp_path):
     kinds = [newton.GeoType(kind).name.lower() for kind in model.shape_type.numpy()]
     assert kinds == list(SOLIDS)
     np.testing.assert_allclose(model.shape_material_mu.numpy(), 0.2)
+
+
+def test_constants_of_a_specimen_are_exported_as_a_material_but_not_as_a_body(tmp_path):
+    strain = np.linspace(0.02, 0.3, 6)
+    stress_pa = 1e5 * (1 + strain - (1 + strain) ** -2) / 3
+    specimen = cs.Specimen("uniaxial", strain, stress_pa, 100.0)
+    run = cs.run(
+        cs.Problem(
+            [specimen.experiment("neo-hookean", "pull")],
+            {"young_pa": cs.Unknown(1e5), "poisson": 0.4999},
+        )
+    )
+    body = IdentifiedBody.from_run(run)
+    (deck,) = exported(body, "calculix", tmp_path).glob("*.inp")
+    text = deck.read_text()
+    assert "one homogeneous cell with a nominal density" in text
+    with pytest.raises(InputError, match="no body that moves"):
+        exported(body, "mujoco", tmp_path)

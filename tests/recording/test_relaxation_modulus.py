@@ -69,6 +69,7 @@ MODULUS_PA = 2e4 * (1 + 0.5 * np.exp(-T_S / 2.0))
     ("test", "kind", "header"),
     [
         ("relaxation", "uniaxial", "relaxation modulus (kPa)"),
+        ("relaxation", "uniaxial", "Relaxationsmodul (kPa)"),
         ("shear-relaxation", "simple-shear", "modulus (kPa)"),
     ],
 )

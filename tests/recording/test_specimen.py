@@ -320,6 +320,21 @@ def test_rows_out_of_order_are_noted(tmp_path):
     assert any("loading and unloading" in each for each in cs.Problem.read(path).notes)
 
 
+def test_a_column_named_after_compression_with_positive_values_is_noted(tmp_path):
+    rows = np.column_stack([100 * STRAIN, simulated("uniaxial", STRAIN)["stress"]])
+    header = "Stauchung [%],Druckspannung [Pa]"
+    (note,) = [
+        each
+        for each in cs.Problem.read(written(tmp_path, header=header, rows=rows)).notes
+        if "compression" in each
+    ]
+    assert "strain_sign = -1" in note
+    assert "'Druckspannung [Pa]'" in note
+    text = PROBLEM + "strain_sign = -1\nstress_sign = -1\n"
+    notes = cs.Problem.read(written(tmp_path, text, header, 0.5 * rows)).notes
+    assert not any("compression" in each for each in notes)
+
+
 def test_first_loading_cycles_are_left_out(tmp_path):
     cycle = np.concatenate([np.linspace(0.02, 0.8, 10), np.linspace(0.75, 0.0, 10)])
     strain = np.tile(cycle, 3)

@@ -190,6 +190,11 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
     """
     e = body.experiment
     times = body.experiment.t_s
+    if e.specimen is not None:
+        yield (
+            "the specimen is one homogeneous cell with a nominal density of "
+            f"{e.body.parts[0].density_kg_m3:g} kg/m³: use the card of the material in a model of your own"
+        )
     if e.actuators:
         yield "tendons and pressures are not exported"
     if e.air_density_kg_m3:

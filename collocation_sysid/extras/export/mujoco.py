@@ -68,6 +68,11 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     InputError
         For grasps that hold single axes, or not during the whole recording.
     """
+    if body.experiment.specimen is not None:
+        raise InputError(
+            "a test of a specimen has no body that moves; export its constants with --to json or "
+            "calculix, also with --samples, or export a recording of a body"
+        )
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         if grasp.axes != "xyz" or not grasp.is_active(body.experiment.t_s).all():
             raise InputError(

@@ -112,7 +112,10 @@ STRESS_DIFFERENCE = Quantity(
     "stress_difference", "pressure", unit="pa", words=STRESS.words, qualifier="difference"
 )
 MODULUS = Quantity(
-    "modulus", "pressure", unit="pa", words="modulus modul module", qualifier="modulus"
+    *("modulus", "pressure"),
+    unit="pa",
+    words="modulus modul module relaxationsmodul",
+    qualifier="modulus",
 )
 FREQUENCY = Quantity(
     "frequency", "frequency", unit="hz", words="frequency frequenz fréquence frecuencia frequenza"
@@ -161,7 +164,7 @@ QUALIFIERS = {
     "second": {"second", "zweite"},
     "lateral": {"lateral", "transverse", "quer"},
     "difference": {"difference", "differenz", "différence"},
-    "modulus": {"modulus", "modul", "module"},
+    "modulus": {"modulus", "modul", "module", "relaxationsmodul"},
     "storage": {"storage", "stor", "speichermodul"},
     "loss": {"loss", "verlustmodul"},
     "factor": {"factor", "tan", "tanδ"},
@@ -175,6 +178,8 @@ QUALIFIERS = {
     },
 }
 _ALL_QUALIFIERS = frozenset().union(*QUALIFIERS.values())
+# Names of columns in which compression counts as positive.
+_COMPRESSIVE = re.compile(r"stauch|druck(spann|kraft)|compress|compres[ií]", re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -513,6 +518,11 @@ def name_and_unit(column: str) -> tuple[str, str | None]:
 
 def _key_of(name: str) -> str:
     return name.strip().lower().replace(" ", "_")
+
+
+def names_compression(column: str) -> bool:
+    """Return whether the name of a column states compression, as in Druckspannung."""
+    return _COMPRESSIVE.search(column) is not None
 
 
 def _words(name: str) -> set[str]:

@@ -1009,8 +1009,8 @@ ASSUMPTIONS = (
         considered=0.05,
         description="relative difference of the stiffness along one axis from that across it",
         assumed="the material is equally stiff along all axes",
-        remedy="repeat the recording with the body loaded along another axis, or test specimens cut "
-        "along each axis",
+        remedy="repeat the recording with the body loaded along another axis, test specimens cut "
+        'along each axis, or state anisotropy = "none" where the material is known to be isotropic',
         effect=_anisotropy,
         axes="x y z",
         of_specimens=True,
