@@ -8,6 +8,7 @@ correspondences of points with the surface), the search also updates the associa
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -39,6 +40,8 @@ DECREASE = 1e-3
 # With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
 # simulated. Where a body strikes or slips, forces change within a small part of any step.
 SMALL_IMPACT_STRAIN = 1e-4
+# Steps of the parameters longer than this share of one whose sweep left more are simulated at once.
+LEAST_INFEASIBLE_SHARE = 0.5
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With
 # impacts, whose simulations repeat a loss to about 1e-9, the rejection of such a full step ends the
 # search as converged, otherwise only if shorter steps are rejected, too: the stress of a nearly
@@ -172,7 +175,9 @@ class ReducedSearch:
         sufficient length.
     ended_by_association : bool
         Whether the last `minimise` ended because new correspondences changed the loss by more than
-        short steps did.
+        short steps did, while a full step was longer than a standard error of a parameter.
+    infeasible_length : float
+        Shortest step of the parameters whose sweep left too much infeasibility beside impacts.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
     most_measurements : int
@@ -235,6 +240,7 @@ class ReducedSearch:
         self.most_measurements = 0
         self.is_associated = True
         self.ended_by_association = False
+        self.infeasible_length = np.inf
         self.reach = collocation.compute_reach_p()
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
@@ -363,6 +369,7 @@ class ReducedSearch:
         """
         assert self.trajectories is not None
         self.ended_by_association = False
+        self.infeasible_length = np.inf
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.largest_trust)
         point = self._accept(
@@ -428,7 +435,11 @@ class ReducedSearch:
                 return Status.CONVERGED  # rounding keeps it from getting better
             if self.has_unlabelled and length <= LEAST_DETERMINED_SHARE:
                 # The association changes the loss by more than such a step.
-                self.ended_by_association = True
+                count = self.collocation.nq
+                distance = np.abs(self._full_step(point, curvature)[:count])
+                # The intervals contain the minima that other correspondences have so near.
+                is_near = distance <= point.fit.standard_errors[:count]
+                self.ended_by_association = not is_near.all()
                 return Status.CONVERGED
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return self._status_without_progress(point, curvature)
@@ -441,11 +452,14 @@ class ReducedSearch:
         """Return the status after rejections of ever shorter steps: that of convergence if even a
         full step is predicted to decrease the loss by less than is significant.
         """
-        self.trust = self.largest_trust
-        full_step = self._next_step(point, curvature)
-        remaining = point.loss - point.predicted_loss(full_step)
+        remaining = point.loss - point.predicted_loss(self._full_step(point, curvature))
         is_feasible = point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
         return Status.CONVERGED if is_feasible and remaining <= INSIGNIFICANT else Status.STALLED
+
+    def _full_step(self, point: Iterate, curvature: Array) -> Array:
+        """Return the next step (np,) within the largest trust region, which is set."""
+        self.trust = self.largest_trust
+        return self._next_step(point, curvature)
 
     def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
         """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
@@ -476,19 +490,21 @@ class ReducedSearch:
     def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
         """Return the point after a step (np,) of the parameters from `point`, clipped to the
         bounds, by one sweep on the horizon, which is counted; with impacts by a simulation if the
-        sweep leaves too much infeasibility. None if that fails or is not finite. Nothing else of
-        the search changes.
+        sweep leaves too much infeasibility, or that of a similar step did. None if that fails or is
+        not finite. Nothing else of the search changes.
         """
-        self.sweeps += 1
         p = np.clip(point.p + step, self.lower, self.upper)
-        accuracy = self._accuracy_after(self._step_length(step))
-        try:
-            trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
-        except SimulationError:
-            trial = None
+        length = self._step_length(step)
+        trial = None
+        if length < LEAST_INFEASIBLE_SHARE * self.infeasible_length:
+            self.sweeps += 1
+            with suppress(SimulationError):
+                accuracy = self._accuracy_after(length)
+                trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
         if self.has_impacts and not (
             trial is not None and trial.feasibility_m <= SMALL_IMPACT_STRAIN * self.edge_m
         ):
+            self.infeasible_length = min(length or np.inf, self.infeasible_length)
             trial = self._simulated(horizon, p, point)
         return trial if trial is not None and trial.is_finite else None
 

@@ -6,7 +6,7 @@ converted to points when they are read; clouds are points already.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, cast
 
@@ -295,6 +295,10 @@ class Depth(Measurement):
         normals; (0, 3) for a dropout.
         """
         return [cloud[:, :3] for cloud in self.clouds]
+
+    def series(self) -> Iterator[tuple[str, Array]]:
+        """Yield the points of all images."""
+        yield self.title, np.concatenate([*self.points_m, np.zeros((0, 3))])
 
     def until_time(self, end_s: float) -> Depth | None:
         """Return a copy with the samples up to the time `end_s`, this one included; None if these

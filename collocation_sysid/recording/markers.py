@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -290,6 +290,11 @@ class Markers(Measurement):
     def identity(self) -> frozenset[str]:
         """Names of the markers."""
         return frozenset(self.names)
+
+    def series(self) -> Iterator[tuple[str, Array]]:
+        """Yield the name and the track of each marker."""
+        for k, name in enumerate(self.names):
+            yield f"marker {name}", np.ascontiguousarray(self.positions_m[:, k])
 
     def values_of(self, other: Markers) -> Array:
         """Return the measured coordinates (T, 3M) [m] of markers with the same names in another

@@ -7,7 +7,7 @@ attributes of `Measurement`, so that they are the same for every kind.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import Field
 from typing import Any, ClassVar, Self
 
@@ -98,6 +98,11 @@ class Measurement:
     def identity(self) -> Any:
         """What two recordings must have in common so that one's measurement predicts the other's."""
         return self.title
+
+    def series(self) -> Iterator[tuple[str, Array]]:
+        """Yield the name of each series of its values, and these, by which copies are found."""
+        columns = np.ascontiguousarray(self.measured_values.T)
+        yield from zip(map(str, self.number_names), columns, strict=True)
 
     def values_of(self, other: Any) -> Array:
         """Return the values (S, m) of a measurement with the same `identity` as a prediction."""

@@ -27,6 +27,7 @@ EXPLICABLE_CONCERNS = (
     "residuals/shared",
     "roll-out/predicted",
     "specimen/law",
+    "specimen/branches",
     "specimen/persist",
 )
 # Topics of a verdict that come first.

@@ -197,6 +197,8 @@ TOPICS: dict[str, Topic] = {
             "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
             "specimen-kind/open": "the curve does not show the kind of test: with the same law it fits "
             "as well as {kinds}, instead of {stated} ({young}); make sure that the kind is right",
+            "specimen-moduli": "its moduli fit if storage and loss modulus are exchanged: check which "
+            "column is which",
             "specimen-gap": "its amounts of shear fit as the displacement over the distance before "
             "axial_stretch: divide them by axial_stretch, or state the distance after it as length_m",
             "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
@@ -357,6 +359,10 @@ TOPICS: dict[str, Topic] = {
             "collocation-sysid compare-models FILE --materials {others}; then check sigma_pa, the "
             "units of the columns, the kind of test, and whether the stresses are true ones "
             '(stress = "true")',
+            "branches": "the residuals are {factor:.2g} times as large as expected from the stated "
+            "noise: branches of the memory ({branches}) may be too few, or their times too far from "
+            "those of the table. First add an [[object.prony]] about every decade of time or "
+            "frequency; then check which column is which modulus, the units and the noise",
             "outlier": "sample {number} deviates by {deviations:.2g} sigma and contributes "
             "{percent:.0f} % of the sum of squared residuals: correct or remove this row, or set "
             "solver.huber",

@@ -121,6 +121,29 @@ def test_a_harmonic_test_of_a_liquid_determines_its_instantaneous_modulus():
     assert found.parameters["b.tau_s"] == pytest.approx(tau_s, rel=0.02)
 
 
+def causes_and_reasons(storage_pa, loss_pa):
+    """Of a run with one branch of memory."""
+    specimen = cs.Specimen.harmonic(np.geomspace(1e-2, 10.0, 9), storage_pa, loss_pa, 0.01)
+    unknown = {name: cs.Unknown() for name in ("young_pa", "a.share")}
+    parameters = unknown | {"poisson": 0.4999, "a.tau_s": cs.Unknown(3.0)}
+    run = cs.run(cs.Problem([specimen.experiment("neo-hookean", "dma", prony=("a",))], parameters))
+    return [cause.cause for cause in run.causes], [each.code for each in run.trust.concerns]
+
+
+@pytest.mark.long
+def test_too_few_branches_and_exchanged_moduli_are_named():
+    frequency_hz = np.geomspace(1e-2, 10.0, 9)
+    w = 2 * np.pi * frequency_hz
+    one = YOUNG_PA * (1 + 2.0 * 1j * w / (1 + 1j * w))
+    one *= 1 + 0.01 * np.random.default_rng(0).normal(size=9)
+    assert causes_and_reasons(one.real, one.imag) == ([], [])
+    causes, reasons = causes_and_reasons(one.imag, one.real)
+    assert causes == ["specimen-moduli"]
+    assert reasons[0] == "description/specimen-moduli"
+    causes, reasons = causes_and_reasons(*complex_modulus_pa(frequency_hz))
+    assert (causes, reasons[0]) == ([], "specimen/branches")
+
+
 @pytest.mark.parametrize(
     ("arguments", "found"),
     [

@@ -15,6 +15,8 @@ from kit.depth import hanging
 from kit.filmed import swung, tracks_of
 from kit.fits import PARAMETERS, autoregressive, problem
 from kit.problems import hung_cube, measured
+from kit.silhouettes import hanging as hung_in_photograph
+from kit.silhouettes import outlines_of
 from scipy.signal import butter, sosfiltfilt
 
 import collocation_sysid as cs
@@ -42,7 +44,16 @@ from collocation_sysid.statistics.misspecification.track_misspecifications impor
 )
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
-NUMBERS = ("markers", "wrench", "custom sensor", "specimen", "image tracks")
+NUMBERS = (
+    "markers",
+    "wrench",
+    "custom sensor",
+    "specimen",
+    "harmonic test",
+    "image tracks",
+    "outlines",
+)
+SPECIMENS = ("specimen", "harmonic test")
 
 
 @cache
@@ -51,6 +62,10 @@ def only(kind, cube=None):
     if kind == "specimen":
         strain = np.linspace(0.1, 0.5, 11)
         return cs.Specimen("uniaxial", strain, 1.0 + 0 * strain, 0.1).experiment(name="pull")
+    if kind == "harmonic test":
+        ones = np.ones(11)
+        test = cs.Specimen.harmonic(np.geomspace(0.1, 10.0, 11), ones, ones, 0.1)
+        return test.experiment(name="dma", prony=("a",))
     cube = cube or measured(hung_cube())
     ones = np.ones(len(cube.t_s))
     if kind == "markers":
@@ -61,6 +76,8 @@ def only(kind, cube=None):
         return replace(cube, grasps=grasps, markers=None)
     if kind == "image tracks":
         return swung(readings=[tracks_of()], markers=None)
+    if kind == "outlines":
+        return hung_in_photograph([outlines_of()])
     if kind == "depth camera":
         points_m = np.random.default_rng(0).uniform(0.1, 0.2, size=(20, 3))
         return hanging((cs.Depth("front", [0.0], [points_m], 1e-3),))
@@ -143,7 +160,9 @@ BLOCKS = {
     "custom sensor": ("sigma", (3, 1)),
     "specimen": ("sigma", (3, 1)),
     "depth camera": ("sigma_m of depth", (5, 3)),
+    "harmonic test": ("sigma", (3, 1)),
     "image tracks": ("sigma_px", (5, 2)),
+    "outlines": ("sigma_px of outlines", (3, 1)),
 }
 SAMPLES = 80
 
@@ -188,14 +207,14 @@ def codes(kind, errors, second=None):
             each,
             sigma_key=key,
             components=np.broadcast_to(is_number, each.residual.shape),
-            is_static=kind == "specimen",
+            is_static=kind in SPECIMENS,
             errs_slowly=kind == "image tracks",
         )
         for each in fit.blocks
     ]
     found = uncertainty_from_fit(replace(fit, blocks=tuple(blocks)), PARAMETERS, wrong[:4])
     concerns = fit_concerns(found)
-    if kind == "specimen":
+    if kind in SPECIMENS:
         concerns = as_specimen_concerns(concerns, [only(kind)])
     return {each.code for each in concerns}
 
@@ -203,7 +222,10 @@ def codes(kind, errors, second=None):
 def named(kind, code):
     """The code of a concern about a kind of measurement."""
     code = code.replace("marker", "sensor") if kind != "markers" else code
-    return SPECIMEN_CODES.get(code, code) if kind == "specimen" else code
+    codes = SPECIMEN_CODES | (
+        {"noise/larger": "specimen/branches"} if kind == "harmonic test" else {}
+    )
+    return codes.get(code, code) if kind in SPECIMENS else code
 
 
 def white(kind, seed=0):
@@ -223,7 +245,7 @@ def small_but_persistent(kind):
     slow = autoregressive(np.random.default_rng(3), SAMPLES, BLOCKS[kind][1][0], 0.99)
     found = codes(kind, slow / 4)
     assert named(kind, "noise/smaller") in found
-    if kind not in ("specimen", "image tracks"):
+    if kind not in (*SPECIMENS, "image tracks"):
         assert "residuals/persist" in found
 
 
@@ -297,6 +319,10 @@ def with_values(experiment, values):
     if measurement is experiment.markers:
         tracks_m = values.reshape(measurement.positions_m.shape)
         return replace(experiment, markers=replace(measurement, positions_m=tracks_m))
+    if isinstance(measurement, cs.Outlines):
+        shift = 1 + int(abs(1e6 * np.nanmax(values))) % 9
+        masks = [np.roll(mask, shift, axis=1) for mask in measurement.all_masks]
+        return replace(experiment, readings=[replace(measurement, masks=masks)])
     if isinstance(measurement, cs.ImageTracks):
         other = replace(measurement, pixels=values.reshape(len(values), -1, 2))
     else:
@@ -401,14 +427,17 @@ CHECKS = {
         wrench="statistics/test_wrench_causes.py::test_a_mistake_is_the_likeliest_cause",
         custom="statistics/test_sensor_causes.py::test_a_mistake_of_a_sensor_is_named",
         specimen="statistics/test_specimen_misspecifications.py::test_another_kind_of_test_is_named",
+        outlines="program/test_outlines.py::test_a_mask_of_something_else_is_named",
         depth="statistics/test_wrong_depth_images.py::test_solve_names_a_wrong_matrix",
         image="statistics/test_wrong_tracks.py::test_lost_tracks_are_named",
+        harmonic="recording/test_harmonic.py::test_too_few_branches_and_exchanged_moduli_are_named",
     ),
     "the same in `check`": elsewhere(
         markers="statistics/test_wrong_descriptions.py::test_a_wrong_description_is_named_before_solving",
         wrench="statistics/test_wrench_causes.py::test_a_mistake_is_named_before_solving",
         depth="statistics/test_wrong_depth_images.py::test_check_names_a_flipped_image",
         image="statistics/test_wrong_tracks.py::test_wrong_descriptions_of_a_camera_are_named",
+        outlines="program/test_outlines.py::test_a_mask_of_something_else_is_named",
     ),
     "mistakes in the description of body": elsewhere(
         markers="statistics/test_body_causes.py::test_hidden_errors_of_a_bent_bar_are_named",
@@ -428,6 +457,8 @@ CHECKS = {
         depth="result/test_depth_pictures.py::"
         "test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart",
         image="problem/test_image_tracks_table.py::test_tracks_are_simulated_and_identified_from",
+        harmonic="recording/test_harmonic.py::"
+        "test_the_picture_of_a_harmonic_test_has_its_moduli_over_frequency",
     ),
 }
 TESTS = Path(__file__).parents[1]

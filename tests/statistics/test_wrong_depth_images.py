@@ -13,6 +13,7 @@ import pytest
 from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
+import collocation_sysid as cs
 from collocation_sysid.features.cameras.feature import depth_image_hypotheses
 from collocation_sysid.features.cameras.images import camera_image_hypotheses, equilibrium_shapes_m
 from collocation_sysid.features.cameras.times import camera_clock_hypotheses
@@ -162,3 +163,12 @@ def test_solve_names_a_wrong_matrix():
 @pytest.mark.long
 def test_solve_names_no_cause_of_a_right_image():
     assert find_misspecifications(solve(hanging(None))) == ()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [9, 19])
+def test_a_search_that_correspondences_end_near_the_minimum_is_good(seed):
+    run = cs.run(hanging_twin(seed))
+    assert run.trust.verdict == "good"
+    low, high = run.interval("young_pa")
+    assert low < TRUTH["young_pa"] < high

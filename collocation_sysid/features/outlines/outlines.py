@@ -175,6 +175,13 @@ class Outlines(CameraImages):
         """Outlines of two recordings are not compared with each other."""
         return id(self)
 
+    def series(self) -> Iterator[tuple[str, Array]]:
+        """Yield the pixels at the edges of all masks, by their number in the image."""
+        edges = [
+            np.flatnonzero(np.diff(mask.ravel())) for mask in self.all_masks if mask is not None
+        ]
+        yield self.title, np.concatenate([*edges, []])
+
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with the masks at those times of which any value is finite; at other times
         than its own there is none.

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...recording.experiment import Experiment
-from ...recording.specimen import LATERAL_NAME
+from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN
 from ...recording.specimen_files import specimen_strains
 from ...statistics.concerns import Concern
 
@@ -40,7 +40,8 @@ def as_specimen_concerns(
     specimens, whose noise is stated by `sigma_pa`; else as they are.
 
     The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
-    too simple is the most frequent cause of the others.
+    too simple is the most frequent cause of the others; in its place "specimen/branches" about tables
+    of moduli, at whose small strain all laws are linear.
 
     Parameters
     ----------
@@ -52,15 +53,15 @@ def as_specimen_concerns(
     if not experiments or any(each.specimen is None for each in experiments):
         return list(concerns)
     data = {"stated": "sigma_pa", **_law_data(experiments)}
+    codes = dict(SPECIMEN_CODES)
+    if all(np.abs(specimen_strains(each)[0]).max() < 2 * RELAXED_STRAIN for each in experiments):
+        codes["noise/larger"] = "specimen/branches"
+        data["branches"] = max(len(p.prony) for each in experiments for p in each.body.parts)
     replaced = [
-        replace(
-            concern,
-            code=SPECIMEN_CODES.get(concern.code, concern.code),
-            data={**concern.data, **data},
-        )
+        replace(concern, code=codes.get(concern.code, concern.code), data={**concern.data, **data})
         for concern in concerns
     ]
-    return sorted(replaced, key=lambda each: each.code != "specimen/law")
+    return sorted(replaced, key=lambda each: each.code != codes["noise/larger"])
 
 
 def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:

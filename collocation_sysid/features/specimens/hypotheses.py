@@ -2,10 +2,10 @@
 
 Mistakes in a table that show without a fit are in `recording.specimen_checks`. The others leave a
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
-place of ratios, stresses in another unit, another kind of test, and columns of zeros that were not
-measured. All specimens are fitted again with one of them corrected; the misfit contains the nuisance
-parameters, so that a wrong area does not explain all. A correction keeps all measurements, unless
-the mistake is that one was none.
+place of ratios, stresses in another unit, another kind of test, columns of zeros that were not
+measured, and exchanged moduli. All specimens are fitted again with one of them corrected; the
+misfit contains the nuisance parameters, so that a wrong area does not explain all. A correction
+keeps all measurements, unless the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
 mistake is therefore named only if the corrected description explains the data, see `_is_explained`.
@@ -112,13 +112,13 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         The fit. Its recordings without specimens are not refitted.
     """
     fitted = [part for part in solution.parts if part.transcription.experiment.specimen is not None]
-    oscillates = any(part.transcription.body.memory.oscillates for part in fitted)
-    # A table of complex moduli has neither strains nor samples that could be left out.
-    if not fitted or oscillates or not solution.status.converged:
+    if not fitted or not solution.status.converged:
         return []
     stated_misfit = _misfit(fitted)
     if stated_misfit <= NOISE_LEVEL:
-        return _kinds_in_doubt(solution)
+        # The moduli of a harmonic test are those of its kind.
+        oscillates = any(part.transcription.body.memory.oscillates for part in fitted)
+        return [] if oscillates else _kinds_in_doubt(solution)
     fitted.sort(key=lambda part: -_misfit([part]))
     originals = [part.transcription.experiment for part in fitted]
     experiments = [_thinned(each, most_samples=REFITTED_SAMPLES) for each in originals]
@@ -285,6 +285,8 @@ def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
     evenly chosen by index, without markers and without sensors that have no value there.
     """
     count = len(experiment.t_s)
+    if experiment.body.memory.oscillates:
+        return experiment  # each sample is a quarter of a period after the one before
     chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
     readings = [
         replace(
@@ -353,6 +355,9 @@ def likely_mistakes(
     experiment: Experiment, other_slopes_pa: Sequence[float]
 ) -> Iterator[Deviation]:
     """Yield the likely mistakes about a specimen. The name of a row is the code of its hypothesis."""
+    if experiment.body.memory.oscillates:
+        yield _mistake("specimen-moduli", _with_exchanged_moduli)
+        return
     yield _mistake("specimen-true-stress", _of_engineering_stress)
     yield _mistake("specimen-compression", _compressed)
     yield _mistake("specimen-gap", _of_undeformed_gap)
@@ -392,6 +397,16 @@ def _of_engineering_stress(experiment: Experiment) -> Correction:
     if areas is None or not np.ptp(areas) or is_unloading(strain):
         return None
     return _with_stress(experiment, areas), {}
+
+
+def _with_exchanged_moduli(experiment: Experiment) -> Correction:
+    """Return the experiment of a harmonic test, see `Specimen.harmonic`, with storage and loss modulus
+    exchanged.
+    """
+    (gauge,) = experiment.readings
+    values = gauge.measured_values.copy()
+    values[1::2], values[2::2] = -gauge.measured_values[2::2], -gauge.measured_values[1::2]
+    return replace(experiment, readings=[replace(gauge, values=values)]), {}
 
 
 def _of_ratios(experiment: Experiment) -> Correction:

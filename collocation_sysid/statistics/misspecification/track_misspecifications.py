@@ -11,7 +11,6 @@ from scipy.spatial import KDTree
 
 from ...common.array_types import Array
 from ...program.measured_motion import Predicted
-from ...recording.depth_camera import Depth
 from ...recording.experiment import Experiment
 from ...recording.markers import Markers
 from ...recording.measurement import Measurement
@@ -79,7 +78,7 @@ def copied_measurements(experiments: Iterable[Experiment]) -> list[Hypothesis]:
     pairs: dict[tuple[Experiment, Measurement, Experiment, Measurement], Hypothesis] = {}
     for experiment in experiments:
         for measurement in experiment.measurements:
-            for name, values in _series(measurement):
+            for name, values in measurement.series():
                 if len(np.unique(values[np.isfinite(values)])) < FEWEST_VALUES:
                     continue
                 found = experiment, measurement, f"{name} of '{experiment.name}'"
@@ -90,20 +89,6 @@ def copied_measurements(experiments: Iterable[Experiment]) -> list[Hypothesis]:
                     twice = Hypothesis("measured-twice", data=data)
                     pairs.setdefault((*earlier[:2], *found[:2]), twice)
     return [*pairs.values()]
-
-
-def _series(measurement: Measurement) -> Iterator[tuple[str, Array]]:
-    """Yield the names and the values of the series of a measurement: tracks of markers, numbers of
-    sensors, or all points of a depth camera.
-    """
-    if isinstance(measurement, Depth):
-        yield measurement.title, np.concatenate([*measurement.points_m, np.zeros((0, 3))])
-    elif isinstance(measurement, Markers):
-        for k, name in enumerate(measurement.names):
-            yield f"marker {name}", np.ascontiguousarray(measurement.positions_m[:, k])
-    else:
-        columns = np.ascontiguousarray(measurement.measured_values.T)
-        yield from zip(map(str, measurement.number_names), columns, strict=True)
 
 
 def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Iterator[Hypothesis]:
