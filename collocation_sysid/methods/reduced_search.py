@@ -40,8 +40,8 @@ DECREASE = 1e-3
 # With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
 # simulated. Where a body strikes or slips, forces change within a small part of any step.
 SMALL_IMPACT_STRAIN = 1e-4
-# Steps of the parameters longer than this share of one whose sweep left more are simulated at once.
-LEAST_INFEASIBLE_SHARE = 0.5
+# Steps longer than so many times the one that is expected to leave as much are simulated at once.
+LONGEST_SWEPT = 2.0
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With
 # impacts, whose simulations repeat a loss to about 1e-9, the rejection of such a full step ends the
 # search as converged, otherwise only if shorter steps are rejected, too: the stress of a nearly
@@ -176,8 +176,9 @@ class ReducedSearch:
     ended_by_association : bool
         Whether the last `minimise` ended because new correspondences changed the loss by more than
         short steps did, while a full step was longer than a standard error of a parameter.
-    infeasible_length : float
-        Shortest step of the parameters whose sweep left too much infeasibility beside impacts.
+    feasible_length : float
+        Step of the parameters whose sweep is expected to leave as much infeasibility as is allowed with
+        impacts.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
     most_measurements : int
@@ -240,7 +241,7 @@ class ReducedSearch:
         self.most_measurements = 0
         self.is_associated = True
         self.ended_by_association = False
-        self.infeasible_length = np.inf
+        self.feasible_length = np.inf
         self.reach = collocation.compute_reach_p()
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
@@ -369,7 +370,7 @@ class ReducedSearch:
         """
         assert self.trajectories is not None
         self.ended_by_association = False
-        self.infeasible_length = np.inf
+        self.feasible_length = np.inf
         tolerance = self.options.tolerance
         self.trust = min(self.options.trust, self.largest_trust)
         point = self._accept(
@@ -496,16 +497,19 @@ class ReducedSearch:
         p = np.clip(point.p + step, self.lower, self.upper)
         length = self._step_length(step)
         trial = None
-        if length < LEAST_INFEASIBLE_SHARE * self.infeasible_length:
+        if length <= LONGEST_SWEPT * self.feasible_length:
             self.sweeps += 1
             with suppress(SimulationError):
                 accuracy = self._accuracy_after(length)
                 trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
-        if self.has_impacts and not (
-            trial is not None and trial.feasibility_m <= SMALL_IMPACT_STRAIN * self.edge_m
-        ):
-            self.infeasible_length = min(length or np.inf, self.infeasible_length)
-            trial = self._simulated(horizon, p, point)
+        if self.has_impacts:
+            limit_m = SMALL_IMPACT_STRAIN * self.edge_m
+            if trial is not None and not trial.feasibility_m <= limit_m:
+                # Infeasibility is of second order in the step.
+                share = np.sqrt(limit_m / np.fmin(trial.feasibility_m, self.edge_m))
+                self.feasible_length = share * length if length else self.feasible_length
+                trial = None
+            trial = trial or self._simulated(horizon, p, point)
         return trial if trial is not None and trial.is_finite else None
 
     def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:

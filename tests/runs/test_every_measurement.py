@@ -222,9 +222,9 @@ def codes(kind, errors, second=None):
 def named(kind, code):
     """The code of a concern about a kind of measurement."""
     code = code.replace("marker", "sensor") if kind != "markers" else code
-    codes = SPECIMEN_CODES | (
-        {"noise/larger": "specimen/branches"} if kind == "harmonic test" else {}
-    )
+    codes = dict(SPECIMEN_CODES)
+    if kind == "harmonic test":
+        codes["noise/larger"] = "specimen/branches"
     return codes.get(code, code) if kind in SPECIMENS else code
 
 
@@ -321,7 +321,7 @@ def with_values(experiment, values):
         return replace(experiment, markers=replace(measurement, positions_m=tracks_m))
     if isinstance(measurement, cs.Outlines):
         shift = 1 + int(abs(1e6 * np.nanmax(values))) % 9
-        masks = [np.roll(mask, shift, axis=1) for mask in measurement.all_masks]
+        masks = [np.roll(np.asarray(mask), shift, axis=1) for mask in measurement.all_masks]
         return replace(experiment, readings=[replace(measurement, masks=masks)])
     if isinstance(measurement, cs.ImageTracks):
         other = replace(measurement, pixels=values.reshape(len(values), -1, 2))

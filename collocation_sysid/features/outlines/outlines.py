@@ -178,9 +178,11 @@ class Outlines(CameraImages):
     def series(self) -> Iterator[tuple[str, Array]]:
         """Yield the pixels at the edges of all masks, by their number in the image."""
         edges = [
-            np.flatnonzero(np.diff(mask.ravel())) for mask in self.all_masks if mask is not None
+            np.flatnonzero(np.diff(mask.ravel())).astype(float)
+            for mask in self.all_masks
+            if mask is not None
         ]
-        yield self.title, np.concatenate([*edges, []])
+        yield self.title, np.concatenate([*edges, np.zeros(0)])
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Return a copy with the masks at those times of which any value is finite; at other times
