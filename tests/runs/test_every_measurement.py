@@ -430,7 +430,7 @@ CHECKS = {
         outlines="program/test_outlines.py::test_a_mask_of_something_else_is_named",
         depth="statistics/test_wrong_depth_images.py::test_solve_names_a_wrong_matrix",
         image="statistics/test_wrong_tracks.py::test_lost_tracks_are_named",
-        harmonic="recording/test_harmonic.py::test_too_few_branches_and_exchanged_moduli_are_named",
+        harmonic="recording/test_harmonic.py::test_exchanged_moduli_are_named",
     ),
     "the same in `check`": elsewhere(
         markers="statistics/test_wrong_descriptions.py::test_a_wrong_description_is_named_before_solving",

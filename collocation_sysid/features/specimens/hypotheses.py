@@ -2,10 +2,10 @@
 
 Mistakes in a table that show without a fit are in `recording.specimen_checks`. The others leave a
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
-place of ratios, stresses in another unit, another kind of test, columns of zeros that were not
-measured, and exchanged moduli. All specimens are fitted again with one of them corrected; the
-misfit contains the nuisance parameters, so that a wrong area does not explain all. A correction
-keeps all measurements, unless the mistake is that one was none.
+place of ratios, stresses in another unit, another kind of test, and columns of zeros that were not
+measured. All specimens are fitted again with one of them corrected; the misfit contains the
+nuisance parameters, so that a wrong area does not explain all. A correction keeps all measurements,
+unless the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
 mistake is therefore named only if the corrected description explains the data, see `_is_explained`.
@@ -91,6 +91,8 @@ CONFUSED_TESTS = {
     "simple-shear": ("planar", "uniaxial"),
     "confined": ("uniaxial",),
 }
+# Decrease of a modulus with the frequency that is no noise, over its standard deviation.
+DECREASE = 6.0
 # Largest strain from which on a table of ratios may be one of percent.
 PERCENT_STRAIN = 1.0
 
@@ -112,13 +114,14 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         The fit. Its recordings without specimens are not refitted.
     """
     fitted = [part for part in solution.parts if part.transcription.experiment.specimen is not None]
+    if any(part.transcription.body.memory.oscillates for part in fitted):
+        # A table of complex moduli has neither strains nor samples that could be left out.
+        return [h for part in fitted for h in exchanged_moduli(part.transcription.experiment)]
     if not fitted or not solution.status.converged:
         return []
     stated_misfit = _misfit(fitted)
     if stated_misfit <= NOISE_LEVEL:
-        # The moduli of a harmonic test are those of its kind.
-        oscillates = any(part.transcription.body.memory.oscillates for part in fitted)
-        return [] if oscillates else _kinds_in_doubt(solution)
+        return _kinds_in_doubt(solution)
     fitted.sort(key=lambda part: -_misfit([part]))
     originals = [part.transcription.experiment for part in fitted]
     experiments = [_thinned(each, most_samples=REFITTED_SAMPLES) for each in originals]
@@ -150,6 +153,35 @@ def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
         if any(each.strength > CERTAIN for each in hypotheses):
             break
     return hypotheses
+
+
+def exchanged_moduli(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that storage and loss modulus of a harmonic test are exchanged, if the
+    storage modulus falls with the frequency, which that of no relaxation does, and the loss modulus
+    does not.
+    """
+    if not experiment.body.memory.oscillates:
+        return
+    amplitude = specimen_strains(experiment)[0][1::2]
+    (gauge,) = experiment.readings
+    # From the highest frequency to the lowest.
+    sigma_pa = gauge.value_sigmas[0] / amplitude
+    stress_pa = gauge.measured_values[:, 0]
+    of_storage, of_loss = (
+        _largest_decrease(modulus_pa[::-1], sigma_pa[::-1])
+        for modulus_pa in (stress_pa[1::2] / amplitude, -stress_pa[2::2] / amplitude)
+    )
+    if of_storage > DECREASE > of_loss:
+        of = f"'{experiment.name}'"
+        yield Hypothesis("specimen-moduli", of, strength=of_storage)
+
+
+def _largest_decrease(values: Array, sigmas: Array) -> float:
+    """Return the largest decrease of successive values (F,) over their standard deviations."""
+    is_known = np.isfinite(values)
+    known = values[is_known]
+    decrease = np.maximum.accumulate(known) - known
+    return float((decrease / sigmas[is_known]).max(initial=0.0))
 
 
 def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
@@ -285,8 +317,6 @@ def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
     evenly chosen by index, without markers and without sensors that have no value there.
     """
     count = len(experiment.t_s)
-    if experiment.body.memory.oscillates:
-        return experiment  # each sample is a quarter of a period after the one before
     chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
     readings = [
         replace(
@@ -355,9 +385,6 @@ def likely_mistakes(
     experiment: Experiment, other_slopes_pa: Sequence[float]
 ) -> Iterator[Deviation]:
     """Yield the likely mistakes about a specimen. The name of a row is the code of its hypothesis."""
-    if experiment.body.memory.oscillates:
-        yield _mistake("specimen-moduli", _with_exchanged_moduli)
-        return
     yield _mistake("specimen-true-stress", _of_engineering_stress)
     yield _mistake("specimen-compression", _compressed)
     yield _mistake("specimen-gap", _of_undeformed_gap)
@@ -397,16 +424,6 @@ def _of_engineering_stress(experiment: Experiment) -> Correction:
     if areas is None or not np.ptp(areas) or is_unloading(strain):
         return None
     return _with_stress(experiment, areas), {}
-
-
-def _with_exchanged_moduli(experiment: Experiment) -> Correction:
-    """Return the experiment of a harmonic test, see `Specimen.harmonic`, with storage and loss modulus
-    exchanged.
-    """
-    (gauge,) = experiment.readings
-    values = gauge.measured_values.copy()
-    values[1::2], values[2::2] = -gauge.measured_values[2::2], -gauge.measured_values[1::2]
-    return replace(experiment, readings=[replace(gauge, values=values)]), {}
 
 
 def _of_ratios(experiment: Experiment) -> Correction:
