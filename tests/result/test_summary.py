@@ -25,6 +25,7 @@ from collocation_sysid.result.run_summary import next_step, run_summary
 from collocation_sysid.runs.misspecifications import NO_CAUSE
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.discretisation_error import DiscretisationError
+from collocation_sysid.statistics.concerns import Concern
 
 MOST_LINES = 16
 
@@ -87,6 +88,20 @@ def test_everything_else_is_in_the_details():
         assert words in told
     for note in solved().notes:
         assert note in told
+
+
+def test_of_many_reasons_the_gravest_are_shown_and_the_others_counted():
+    concerns = [
+        Concern(
+            "specimen/outlier", "doubtful", data={"number": k, "deviations": 9.0, "percent": 30.0}
+        )
+        for k in range(7)
+    ]
+    result = replace(solved(), trust=replace(solved().trust, concerns=concerns))
+    shown = [line for line in lines(result) if line.startswith("  ")]
+    assert sum("sigma" in line for line in shown) == 4
+    assert any("3 further reasons" in line for line in shown)
+    assert sum("of the sum of squared" in line for line in lines(result, details=True)) == 7
 
 
 def test_tests_of_causes_state_that_they_found_none():
