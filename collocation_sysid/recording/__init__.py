@@ -24,7 +24,7 @@ them. `alignment`, `sample_times`, `frame_times`, `gap_interpolation` and `rigid
 one time grid, sample times, samples of lost or jittered frames, interpolation between consecutive
 samples, rigid fits. `experiment_refinement` and
 `experiment_coarsening` move an experiment to a finer or coarser mesh by `experiment_on_body`,
-`grasp_rotation` finds the fastest rotation of its grasps, `measurement_selection` copies it with a
+`rotation_per_step` finds the fastest rotation of its grasps, `measurement_selection` copies it with a
 part of its measurements, and `node_selection` checks selections of nodes.
 """
 

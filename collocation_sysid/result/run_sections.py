@@ -40,8 +40,8 @@ from ..statistics.assessment import Assessment
 from ..statistics.budget.uncertainty_budget import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
 from ..statistics.remedies import remedy_for
+from .alternative_sentences import alternative_sentences, origin_sentences
 from .picture_captions import captioned_pictures
-from .precision_sentences import alternative_sentences, origin_sentences
 from .probe_sections import (
     DEEPER_CHECK_ADVICE,
     STIFFNESS_NAMES,

@@ -27,7 +27,7 @@ from ..runs.result_content import Result
 from ..statistics.budget.uncertainty_budget import source_label
 from ..statistics.combinations import precision_text
 from ..statistics.remedies import remedy_for
-from .precision_sentences import alternative_sentences
+from .alternative_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,
     is_deeper_check_worthwhile,

@@ -16,8 +16,8 @@ from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
-from ..recording.grasp_rotation import DOUBTFUL_ANGLE_RAD
 from ..recording.nuisance import TIME
+from ..recording.rotation_per_step import DOUBTFUL_ANGLE_RAD
 from ..statistics.assessment import (
     clock_concerns,
     fit_concerns,

@@ -21,8 +21,8 @@ from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
 from ..recording.deviation import Deviation, in_readable_unit
 from ..recording.experiment import Experiment
-from ..recording.grasp_rotation import WARNING_ANGLE_RAD, fastest_rotation
 from ..recording.hysteresis import branch_differences
+from ..recording.rotation_per_step import WARNING_ANGLE_RAD, fastest_rotation
 from .budget.discretisation_error import Refinement
 from .budget.systematic_effects import DEVIATIONS
 from .budget.uncertainty_budget import source_label
@@ -33,7 +33,7 @@ from .instrument_misfit import InstrumentMisfit
 from .misspecification.misspecification_hypothesis import Hypothesis
 from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
 from .probes.routine_probes import is_alarming, is_routine_assumption
-from .residuals.autocorrelation import PERSISTENT, Dependence
+from .residuals.autocorrelation import Dependence
 from .residuals.noise_level import NoiseLevel
 from .residuals.residual_diagnostics import MOST_WILD
 from .thresholds import (
@@ -56,6 +56,7 @@ from .thresholds import (
     MOVED,
     OWN_ONSET,
     PERIOD_ERROR,
+    PERSISTENT,
     PREDICTION,
     RARE,
     ROLLOUT,

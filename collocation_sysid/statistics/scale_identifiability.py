@@ -170,7 +170,7 @@ def _common_scaling(
 
 
 # Probability that noise of a motionless marker is taken for motion.
-RARE = 1e-3
+FALSE_MOTION = 1e-3
 # Displacement of grasped nodes up to which they count as motionless, over sigma_m.
 LEAST_RESTRAINT = 2.0
 
@@ -180,7 +180,7 @@ def is_motionless(experiment: Experiment) -> bool:
     the markers.
 
     False if a grasp begins or ends within the recording. Markers count as motionless unless a χ²
-    test at the level `RARE` finds their deviations from their means larger than σ; grasped nodes
+    test at the level `FALSE_MOTION` finds their deviations from their means larger than σ; grasped nodes
     may move by `LEAST_RESTRAINT` times the median σ.
     """
     markers = experiment.markers
@@ -203,7 +203,7 @@ def is_motionless(experiment: Experiment) -> bool:
     deviations = np.where(present, markers.positions_m - mean, 0.0) / markers.sigma_m[:, None]
     # Of a mean of n samples, the deviations have n − 1 degrees of freedom.
     freedom = float(np.maximum(present.sum(axis=0) - 1, 0).sum())
-    return bool(np.sum(deviations**2) <= chi2_isf(RARE, max(freedom, 1.0)))
+    return bool(np.sum(deviations**2) <= chi2_isf(FALSE_MOTION, max(freedom, 1.0)))
 
 
 def static_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:

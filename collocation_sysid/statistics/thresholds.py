@@ -50,6 +50,11 @@ GROSS_MISFIT = Threshold(
 MARKER_MISFIT = Threshold(
     2.0, "Factor by which one marker may be noisier than the others.", study="verdict_reliability"
 )
+PERSISTENT = Threshold(
+    0.2,
+    "Autocorrelation from which on residuals are not noise, if it is significant.",
+    study="verdict_reliability",
+)
 CLEARLY_PERSISTENT = Threshold(
     0.8,
     "Autocorrelation of residuals of more than `GROSS_MISFIT` that are not noise, although "

@@ -29,7 +29,7 @@ from wrong_videos import PAIR_FAULTS, PLACE_FAULTS, VIDEO_FAULTS
 
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.features.cameras.feature import depth_image_hypotheses, may_be_images
-from collocation_sysid.features.wrenches.causes import wrench_mistakes
+from collocation_sysid.features.wrenches.mistakes import wrench_mistakes
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem

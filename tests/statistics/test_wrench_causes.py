@@ -11,7 +11,7 @@ from kit.problems import GUESS
 from kit.wrench_fits import UNKNOWN, swung
 from wrong_twins import WRENCH_FAULTS
 
-from collocation_sysid.features.wrenches.causes import wrench_causes, wrench_mistakes
+from collocation_sysid.features.wrenches.mistakes import wrench_causes, wrench_mistakes
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate

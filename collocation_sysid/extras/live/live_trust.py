@@ -14,7 +14,7 @@ from ...statistics.assessment import GROSS_MISFIT, HARDLY_TAME, MISFIT, WILD
 from ...statistics.concerns import Concern, concern_if
 from ...statistics.distributions import chi2_sf, student_ppf
 from ...statistics.estimates import Estimate
-from ...statistics.residuals.autocorrelation import PERSISTENT
+from ...statistics.thresholds import PERSISTENT
 
 # Distance from the linearisation point, in standard errors, above which estimates may still change.
 LARGEST_SETTLED_DISTANCE = 0.5

@@ -29,7 +29,7 @@ from ...recording.experiment import Experiment
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...recording.sample_times import TIME_TOLERANCE_S
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
-from ...statistics.thresholds import LEAST_IMPROVEMENT, MISFIT
+from ...statistics.thresholds import CERTAIN, LEAST_IMPROVEMENT, MISFIT, ONE_OF_MANY
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_IMAGES = {
@@ -68,14 +68,10 @@ INITIAL_GATE = 0.35
 GRAZING = 0.3
 # Distance over the diagonal that interpolated shapes and noise explain.
 ROUGHLY = 0.003
-# Factor of the misfit from which on a correction may leave more.
-CERTAIN = 4.0
 # Standard deviations of the prior of its pose by which a camera may be off.
 LARGEST_POSE_DEVIATION = 5.0
 # Distance, in those of `ROUGHLY`, up to which an alignment found the body.
 ALIGNED = 6.0
-# Additional factor for each of many variants of one mistake.
-ONE_OF_MANY = 1.05
 # Ratios of image sizes that are tried.
 SIZE_RATIOS = (2.0, 0.5)
 

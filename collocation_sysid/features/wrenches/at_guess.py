@@ -23,7 +23,7 @@ from ...statistics.axes import with_other_axes
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 
 # Message of the offset by the code of its concern; those of other hypotheses are in
-# `causes`.
+# `mistakes`.
 MESSAGE_OF_OFFSET = {
     "description/wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
     "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "

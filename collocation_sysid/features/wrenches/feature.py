@@ -9,7 +9,7 @@ from ...statistics.misspecification.misspecification_hypothesis import Hypothesi
 from ...statistics.misspecification.plausibility import load_sign_hypotheses
 from ..feature import Feature, SimulatedCheck
 from .at_guess import MESSAGE_OF_OFFSET, wrench_deviations
-from .causes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
+from .mistakes import CHECKED_SAMPLES, MESSAGES, wrench_causes, wrench_mistakes
 
 # Longest fit of the first samples to the markers that needs no request [s].
 LONGEST_FIT_S = 10.0

@@ -1,7 +1,7 @@
 """Misspecification hypotheses for sensors that a fit misses: sign, unit, axes, zero and clock of
 custom sensors, and of wrenches in recordings without markers.
 
-Of recordings with markers, `features.wrenches.causes` compares wrenches with the prediction of the
+Of recordings with markers, `features.wrenches.mistakes` compares wrenches with the prediction of the
 markers. Here nothing else may be measured, so that each mistake is corrected in a refit.
 """
 

@@ -23,9 +23,8 @@ from ..budget.systematic_effects import ExperimentAtAnswer
 from ..budget.uncertainty_budget import BudgetLine, is_definition
 from ..estimates import Estimate
 from ..linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
-from ..residuals.autocorrelation import PERSISTENT
 from ..residuals.recording_scatter import TELLING
-from ..thresholds import NOISE, RETURN, SUFFICIENT
+from ..thresholds import NOISE, PERSISTENT, RETURN, SUFFICIENT
 from ..uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 DRIFT = "stiffness_drift"

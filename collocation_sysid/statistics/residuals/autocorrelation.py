@@ -36,6 +36,7 @@ from scipy.linalg import matmul_toeplitz
 from ...common.array_types import Array
 from ..distributions import chi2_sf, normal_isf
 from ..linearised import Information, LinearisedFit, ResidualBlock
+from ..thresholds import PERSISTENT
 from .noise_level import ROUNDING
 from .spatial_correlation import estimate_spatial_correlation
 
@@ -243,8 +244,6 @@ SETTLED = 0.01
 SIGNIFICANCE = 0.01
 # Autocorrelation that changes error bars by less than 5 %, significant or not.
 NOTICEABLE = 0.05
-# Autocorrelation from which on the residuals are not noise, if it is significant.
-PERSISTENT = 0.2
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ...common.array_types import Array
 from ..concerns import Concern
 from ..distributions import beta_sf, chi2_isf, normal_isf
 from ..linearised import LinearisedFit, Mask, ResidualBlock, factorise_information
-from ..thresholds import MOST_WILD
+from ..thresholds import MOST_WILD, RARE
 from .noise_level import NoiseLevel, estimate_noise_level
 
 # Level of the tests for patterns.
@@ -285,8 +285,6 @@ def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) 
     )
 
 
-# Probability of reporting any sample of noise as an outlier.
-RARE = 1e-4
 # Smallest share of an outlier in its marker's power.
 MOST = 0.5
 # Largest share of a marker's samples that are outliers.

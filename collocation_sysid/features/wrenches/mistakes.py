@@ -40,6 +40,7 @@ from ...statistics.misspecification.misspecification_hypothesis import (
     corrected_hypothesis,
 )
 from ...statistics.misspecification.sensor_misspecifications import measurement_mistake
+from ...statistics.thresholds import BETTER, FITTED, NOISE_LEVEL, ONE_OF_MANY
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES = {
@@ -69,11 +70,6 @@ MESSAGES = {
     "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
     "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
 }
-# RMS residual in standard deviations that needs an explanation; a correct description must leave
-# less.
-MISFIT = 1.3
-# Factor by which the misfit must decrease.
-BETTER = 1.5
 # RMS residual of the markers in standard deviations above which the prediction is useless.
 MARKERS_MISFIT = 3.0
 # Largest number of sweeps of the fit to the markers, after a solve.
@@ -121,15 +117,11 @@ SAME_POINT_M = 0.005
 # Relative difference up to which a gain is the ratio of the areas of a square and a round section:
 # the accuracy of gains, which a fit with a wrong body distorts.
 LIKE_SECTION = 0.1
-# Additional factor for hypotheses with fitted numbers.
-FITTED = 1.5
-# Additional factor for each of many variants of one mistake.
-ONE_OF_MANY = 1.05
 
 
 def wrench_causes(solution: Solution) -> list[Hypothesis]:
     """Return hypotheses about wrongly described wrenches after a fit; empty if all wrenches fit
-    (`MISFIT`), or if no experiment has markers.
+    (`NOISE_LEVEL`), or if no experiment has markers.
 
     The experiments with markers are fitted again, to their markers alone.
     """
@@ -174,11 +166,11 @@ def wrench_mistakes(collocation: Collocation) -> tuple[list[Hypothesis], list[st
 
 def _misses(part: ExperimentIterate) -> bool:
     """Whether the root mean square of the residuals of any wrench sensor of an experiment exceeds
-    `MISFIT` standard deviations; false without sensors.
+    `NOISE_LEVEL` standard deviations; false without sensors.
     """
     return any(
         float(np.sum(sensor.residuals(observation, part.phi) ** 2))
-        > MISFIT**2 * sensor.is_compared.reshape(-1, 6).sum()
+        > NOISE_LEVEL**2 * sensor.is_compared.reshape(-1, 6).sum()
         for sensor, observation in part.residuals_of(WrenchResidual)
     )
 
@@ -275,11 +267,11 @@ class _OneSensor:
 
     def causes(self) -> Iterator[Hypothesis]:
         """Yield the hypotheses whose correction improves the fit far enough, if the misfit exceeds
-        `MISFIT`; if there are none, that of a large tare.
+        `NOISE_LEVEL`; if there are none, that of a large tare.
         """
         accepted: list[Hypothesis] = []
         misfit = self.misfit(self.declared)
-        if misfit > MISFIT:
+        if misfit > NOISE_LEVEL:
             test = HypothesisTest(misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0)
             accepted = list(test.accepted(self._hypotheses()))
         yield from accepted or self._large_tare()
