@@ -45,7 +45,7 @@ def explain_validation_error(
     where = _fault_location(fault, content, root=root)
     others = {_fault_location(other, content, root=root) for other in faults} - {where}
     if others:
-        message += f" (and {len(others)} more mistakes)"
+        message += f" (and {len(others)} more mistake{'s' if len(others) > 1 else ''})"
     return InputError(message, path, where=where or None)
 
 

@@ -283,9 +283,9 @@ class MotionPlan:
 
     @cached_property
     def half_width_after_recording_m(self) -> float | None:
-        """Largest half width of the 95 % band of a coordinate that would remain if this motion were
-        executed, recorded with the same markers, and included in the identification [m]; None if
-        that is not known. Systematic effects remain.
+        """Largest half width of the 95 % band of a coordinate that counts, that would remain if this
+        motion were executed, recorded with the same markers, and included in the identification [m];
+        None if that is not known. Systematic effects remain.
         """
         body, contributions = self.program.body, self.contributions_m
         places = {
@@ -304,9 +304,11 @@ class MotionPlan:
         information = rows.T @ rows / float(np.median(body.template.markers.sigma_m)) ** 2
         reduced = statistical @ np.linalg.inv(np.eye(len(statistical)) + information @ statistical)
         remaining = self.covariance - statistical + reduced
-        return self.band_factor * max(
-            float(self._std_m(each, remaining).max()) for each in contributions.values()
-        )
+        counted = [
+            self._std_m(contributions[each.name], remaining)[np.isfinite(each.position_m)]
+            for each in self.program.references
+        ]
+        return self.band_factor * float(np.concatenate(counted).max(initial=0.0))
 
     @cached_property
     def band_contributions(self) -> tuple[BandContribution, ...]:

@@ -270,14 +270,12 @@ def _improvement(largest: BandContribution) -> str:
     """Return the line about the largest contribution to the band, and what reduces it."""
     percent = f"{100 * largest.share:.0f} % of the band's variance"
     if largest.constant is None:
-        return (
-            f"{percent} are errors of the description: a finer mesh or another law may reduce them"
-        )
+        return f"{percent} come from errors of the description: a finer mesh or another law may reduce them"
     of_constant = f"the uncertainty of {symbol_of(largest.constant)}"
     if largest.source == UNKNOWN:
-        return f"{percent} are {of_constant}"
+        return f"{percent} come from {of_constant}"
     remedy = remedy_for(largest.source)
-    return f"{percent} are {of_constant} by {largest.source}; to reduce it, {remedy}"
+    return f"{percent} come from {of_constant} by {largest.source}; to reduce it, {remedy}"
 
 
 def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:

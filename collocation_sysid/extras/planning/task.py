@@ -45,33 +45,33 @@ class ReferenceSection(Section):
 
     Attributes
     ----------
-    point
+    point : str, optional
         Name of a marker of the problem.
-    point_m
+    point_m : (3,) list, optional
         Place [x, y, z] of the point on the undeformed body, in place of a marker.
-    name
+    name : str
         Name of the point in files and pictures, for a point given by its place.
-    file
+    file : str, optional
         CSV with t_s and some of x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s; an empty cell or a missing
         column leaves a coordinate free.
-    t_s
+    t_s : list of float, optional
         Times of the reference, in place of a file; the motion begins at 0.
-    position_m
+    position_m : list of (3,) lists, optional
         Position [x, y, z] at each of `t_s`; nan leaves a coordinate free.
-    velocity_m_s
+    velocity_m_s : list of (3,) lists, optional
         Velocity [x, y, z] at each of `t_s`; nan leaves a component free.
-    hold
+    hold : bool
         Whether the point stays where it is before the motion, from `from_s` until `until_s`.
-    relative
+    relative : bool
         Whether positions are relative to the place of the point before the motion.
-    from_s, until_s
+    from_s, until_s : float
         First and last time at which the reference counts; all its times by default.
-    interpolation
+    interpolation : "smooth", "linear" or "none"
         Between the times of the reference: a smooth curve, straight lines, or none, so that the
         reference counts at its times alone.
-    sigma_m
+    sigma_m : float
         Deviation of a coordinate that is acceptable: deviations count in units of it.
-    sigma_m_s
+    sigma_m_s : float
         The same for a component of the velocity.
     """
 
@@ -130,12 +130,12 @@ class EndSection(Section):
 
     Attributes
     ----------
-    at_rest
+    at_rest : bool
         Whether the body is at rest from the end of the motion on, without residual vibration.
-    window_s
+    window_s : float, optional
         Time after the motion over which the body is at rest; by default half a period of its lowest
         natural frequency.
-    sigma_m
+    sigma_m : float
         Amplitude of the residual vibration that is acceptable.
     """
 
@@ -149,20 +149,20 @@ class HandSection(Section):
 
     Attributes
     ----------
-    free
+    free : list of str
         Coordinates that may move: x, y, z of the middle of the grasped nodes (the default), and rx,
         ry, rz of the rotation vector, relative to the initial pose in world axes; none, [], beside
         a tendon or pressure.
-    intervals
+    intervals : int
         Number of equal time intervals of the cubic spline of each coordinate.
-    end_m
+    end_m : (3,) list, optional
         Displacement [x, y, z] of the hand at the end; nan, the default, leaves a component free.
-    end_rotation_deg
+    end_rotation_deg : (3,) list, optional
         Rotation vector [x, y, z] of the hand at the end; nan, the default, leaves a component free.
-    jerk_weight
+    jerk_weight : float
         Weight of the mean square jerk of the hand, in units of ten times the limit of the
         acceleration over the duration.
-    joint_limits
+    joint_limits : table, optional
         Python function of position (3,) [m] and rotation (3, 3) of the hand, in CasADi operations,
         that returns expressions which must not be positive.
     """
@@ -234,15 +234,15 @@ class TendonSection(SignalSection):
 
     Attributes
     ----------
-    name
+    name : str
         Name of the tendon of the recording.
-    tension_n
-        Lowest and highest tension.
-    rate_n_s
+    tension_n : (2,) list
+        Lowest and highest tension, at least 0.
+    rate_n_s : float
         Largest rate at which the tension changes.
-    end_n
+    end_n : float, optional
         Tension at the end of the motion; free by default.
-    jerk_weight
+    jerk_weight : float
         Weight of the mean square third derivative of the tension, in units of 60 times the range over
         the cube of the duration: of the smoothest change over the whole range.
     """
@@ -258,15 +258,15 @@ class PressureSection(SignalSection):
 
     Attributes
     ----------
-    name
+    name : str
         Name of the pressure of the recording.
-    pressure_pa
+    pressure_pa : (2,) list
         Lowest and highest pressure; negative for suction.
-    rate_pa_s
+    rate_pa_s : float
         Largest rate at which the pressure changes.
-    end_pa
+    end_pa : float, optional
         Pressure at the end of the motion; free by default.
-    jerk_weight
+    jerk_weight : float
         Weight of the mean square third derivative of the pressure, in units of 60 times the range
         over the cube of the duration: of the smoothest change over the whole range.
     """
@@ -282,9 +282,9 @@ class AvoidSection(Section):
 
     Attributes
     ----------
-    largest_stretch
+    largest_stretch : float, optional
         Largest principal stretch of an element.
-    clearance_m
+    clearance_m : float, optional
         Smallest distance of the body from the obstacles of the problem.
     """
 
@@ -297,26 +297,26 @@ class Task(Section):
 
     Attributes
     ----------
-    duration_s
+    duration_s : float
         Duration of the motion of the hand [s].
-    largest_error_m
+    largest_error_m : float, optional
         Largest distance of a point from its reference, and of a node from rest at the end, that is
         acceptable. If the plan exceeds it, the duration that would suffice is computed.
-    shortest
+    shortest : bool
         Whether the duration is the shortest with which `largest_error_m` is not exceeded; all times
         of the references are stretched with it.
-    sample_s
+    sample_s : float, optional
         Time between the samples of the plan; that of the recording by default.
-    reference
+    reference : list of tables
         [[reference]] tables: what points of the body shall do.
-    end
+    end : table
         State of the body at the end.
-    hand
+    hand : table
         Motion of the hand.
-    tendon, pressure
+    tendon, pressure : list of tables
         [[tendon]] and [[pressure]] tables: tensions and pressures that the plan chooses; the others
         keep their values before the motion.
-    avoid
+    avoid : table
         Limits of the body.
     """
 
