@@ -359,11 +359,11 @@ def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
     for row in (row for row in ASSUMPTIONS if row.name in names):
         for name in row.list_components():
             error = (row.considered or 0.0) * rng.standard_normal()
-            # Coefficients of the air are not negative, and a negative share of another damping law
+            # Coefficients of the air are not negative, and a negative share of either damping law
             # would add energy where the body is stretched.
             errors[name] = max(error, -0.99) if row.name in AIR else error
             if row.name == "damping_law":
-                errors[name] = abs(error)
+                errors[name] = min(abs(error), 1.0)
     return errors
 
 
