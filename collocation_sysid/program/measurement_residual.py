@@ -384,8 +384,10 @@ class MeasurementResidual(ABC):
         """
         return {}
 
-    def with_samples(self, known_s: Array, t_s: Array, measurements: Array, **changes: Any) -> Self:
-        """Return the model with other samples of its only entity, sharing the generated functions.
+    def with_samples(
+        self, known_s: Array, known_x: Array, t_s: Array, measurements: Array, **changes: Any
+    ) -> Self:
+        """Return the model with other samples, sharing the generated functions.
 
         Every measurement that is not NaN is compared.
 
@@ -393,17 +395,21 @@ class MeasurementResidual(ABC):
         ----------
         known_s : (n,) array
             Times at which the observable is known [s].
+        known_x : (n, 3n') array
+            Positions of the n' nodes at these times [m].
         t_s : (S,) array
             Times of the samples [s].
-        measurements : (S, m') array
-            Measurements, NaN where missing; missing columns (m' < m) are padded with NaN.
+        measurements : (S, E m') array
+            Measurements, NaN where missing; missing numbers (m' < m) are padded with NaN.
         **changes
             Other attributes to replace.
         """
-        measured = np.full((len(t_s), 1, self.measured.shape[2]), np.nan)
-        measured[:, 0, : measurements.shape[1]] = measurements
+        _, each, count = self.measured.shape
+        measured = np.full((len(t_s), each, count), np.nan)
+        measurements = measurements.reshape(len(t_s), each, -1)
+        measured[..., : measurements.shape[2]] = measurements
         is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
-        changes |= {"t_s": t_s, "measured": measured, "is_compared": is_compared}
+        changes = {"t_s": t_s, "measured": measured, "is_compared": is_compared} | changes
         other = replace(self.at_samples(known_s, ReactionGrid.from_times(known_s)), **changes)
         # Derivatives of the same expression are generated once.
         vars(other)["_expressions"] = self._expressions

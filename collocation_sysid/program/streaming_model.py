@@ -7,7 +7,7 @@ its first rows have the stencils of the start, and its last row has those of all
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -21,7 +21,7 @@ from ..recording.experiment import Experiment
 from ..recording.poses import Poses, PoseSequence
 from .collocation import Collocation
 from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
-from .custom_sensor_residual import CustomSensorResidual, observed_points
+from .custom_sensor_residual import CustomSensorResidual
 from .forward.newton_solver import NewtonOptions, NewtonSolver
 from .least_squares import SquareRootInformation
 from .markers.marker_residual import NEIGHBOURS, MarkerResidual
@@ -126,26 +126,55 @@ class StreamingModel:
         still = self.transcription.experiment
         return replace(still, grasps=_grasps_at(still, poses))
 
-    def with_marker_places(self, tracks_m: Array, x: Array) -> StreamingModel:
-        """Return the model with unknown marker places set from the first frame; self if no unknown
-        marker is in the frame.
+    def with_first_frame(
+        self, tracks_m: Array, values: Mapping[int, Array], x: Array
+    ) -> StreamingModel:
+        """Return the model with unknown places of markers and of points in images, and poses of
+        cameras, found from the first frame; self if there are none.
 
         Parameters
         ----------
         tracks_m : (M, 3)
             Marker positions of the first frame [m], NaN where missing.
+        values : mapping of int to (m,) array
+            Samples of custom sensors in the first frame, by the number of the instrument, from 1.
         x : (3n,)
             Node positions of the start [m].
+
+        Raises
+        ------
+        InputError
+            If the first frame does not determine the pose of a camera.
         """
-        unknown = ~self.transcription.experiment.markers.located & np.isfinite(tracks_m).all(axis=1)
-        if not unknown.any():
+        collocation = self.collocation
+        still = self.transcription.experiment
+        if self.transcription.reassociable:
+            t_s = still.t_s
+            sampled = {
+                each: each.with_samples(t_s, np.tile(values[number], (len(t_s), 1)))
+                for number, each in enumerate(still.readings, 1)
+                if number in values and np.isfinite(values[number]).any()
+            }
+            seen = still.with_measurements([sampled.get(m, m) for m in still.measurements])
+            collocation = replace(collocation, experiments=[seen])
+            rows = np.tile(x, (collocation.transcriptions[0].count_rows_to_place(), 1))
+            collocation, _ = collocation.place_unknown_markers(collocation.guess_p, [rows])
+        unknown = ~still.markers.located & np.isfinite(tracks_m).all(axis=1)
+        if unknown.any():
+            transcription = collocation.transcriptions[0]
+            places_m = transcription.marker_places_m(transcription.compute_guess_phi())
+            places_m[unknown] = transcription.association.markers.places_of_points(
+                x.reshape(-1, 3), tracks_m[unknown]
+            )
+            collocation = collocation.with_marker_places([places_m])
+        if collocation is self.collocation:
             return self
-        places_m = self.transcription.marker_places_m(self.transcription.compute_guess_phi())
-        nodes_m = x.reshape(-1, 3)
-        places_m[unknown] = self.transcription.association.markers.places_of_points(
-            nodes_m, tracks_m[unknown]
-        )
-        return replace(self, collocation=self.collocation.with_marker_places([places_m]))
+        for old, new in zip(
+            self.transcription.reassociable, collocation.transcriptions[0].reassociable, strict=True
+        ):
+            # Generated functions are the same for all places.
+            vars(new)["_expressions"] = old._expressions
+        return replace(self, collocation=collocation)
 
     @cached_property
     def transcription(self) -> Transcription:
@@ -266,7 +295,6 @@ class StreamingModel:
         instruments = []
         place = len(self.experiment.markers.names)
         step_s = self.transcription.dynamics.step_s
-        points = iter(self.observed_points)
         sensors = self.transcription.residuals_of(CustomSensorResidual)
         for reading in (*sensors, *self.transcription.residuals_of(WrenchResidual)):
             channel = reading.observable
@@ -279,12 +307,32 @@ class StreamingModel:
                     clock_error = channel.compute_clock_limit_s() / step_s
                     stencil = stencil._replace(neighbours=TIMES_PER_SAMPLE, clock_error=clock_error)
             else:
-                points_of_sensor = next(points)
-                reading = replace(reading, observable=points_of_sensor)
-                observable = slice(place, place + points_of_sensor.vector_count)
-                place += points_of_sensor.vector_count
+                observable = slice(place, place + channel.vector_count)
+                place += channel.vector_count
             instruments.append(StreamInstrument(reading, stencil, observable=observable))
         return tuple(instruments)
+
+    def huber_of(self, instrument: int) -> float | None:
+        """Return the threshold of Huber's loss of an instrument, 0 for the markers."""
+        if not instrument:
+            return self.collocation.huber
+        return self.instruments[instrument - 1].reading.huber
+
+    @cached_property
+    def judged_instruments(self) -> Sequence[int]:
+        """Numbers of the instruments whose residuals are judged: the markers (0) if there are any,
+        else all others.
+        """
+        return [0] if self.experiment.markers.names else range(1, 1 + len(self.instruments))
+
+    @property
+    def judged_residuals(self) -> Sequence[MeasurementResidual]:
+        """Sensor models of `judged_instruments`."""
+        each = (
+            self.instruments[k - 1].reading if k else self.marker_model
+            for k in self.judged_instruments
+        )
+        return tuple(each)
 
     @cached_property
     def largest_delay_rows(self) -> int:
@@ -299,9 +347,10 @@ class StreamingModel:
         """Points that custom sensors observe, one entry for each custom sensor of points; those of
         grasps have none.
         """
-        still = self.transcription.experiment
-        gauges = [gauge for gauge in still.readings if gauge.grasp is None]
-        return tuple(observed_points(still, gauge, rows=GAUGE_NEIGHBOURS) for gauge in gauges)
+        channels = (
+            each.observable for each in self.transcription.residuals_of(CustomSensorResidual)
+        )
+        return tuple(each for each in channels if isinstance(each, PointPositions))
 
     @cached_property
     def reaction_sensors(self) -> tuple[Sensor, ...]:

@@ -28,7 +28,7 @@ from .forward.newton_solver import NewtonFailure, simulation_error
 from .forward.scheme_simulation import RowEquations, extrapolate, solve_row
 from .least_squares import SquareRootInformation
 from .measurement_residual import huber_as_least_squares, lagrange_weights
-from .observables import ObservableDerivatives, ObservedMotion
+from .observables import ObservableDerivatives, ObservedMotion, PointPositions
 from .reactions.grasp_reactions import DELAY_STEPS, GraspReactions
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
@@ -634,24 +634,29 @@ class StreamingSweep:
         needed_rows = range(
             stencil.rows_of_sample(min(at)).start, stencil.rows_of_sample(max(at)).stop
         )
-        _, point_columns, resultants = zip(
+        stored_rows, point_columns, resultants = zip(
             *(self.read[k + stencil.delay - self.row] for k in needed_rows), strict=True
         )
+        x = np.array([each.x for each in stored_rows])
         step_s = model.experiment.timestep_s / model.collocation.substeps
         begins_s = float(model.experiment.t_s[0])
         known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (needed_rows, at))
         sensor = reading.with_samples(
-            known_s, t_s, measurements=np.array([sample.values for sample, _ in pairs])
+            known_s, x, t_s, measurements=np.array([sample.values for sample, _ in pairs])
         )
-        if isinstance(observable, slice):
-            columns = self.moving
+        points = sensor.observable
+        if isinstance(observable, slice) and isinstance(points, PointPositions):
             place = slice(3 * observable.start, 3 * observable.stop)
             values = np.array(point_columns)[:, place]
+            slopes = points.derivatives_from(
+                x, points.shape_functions(self.phi), columns=self.moving, changes=values[..., 1:]
+            )
+            values = values.reshape(len(values), -1, 3, values.shape[2])
         else:
             columns = np.arange(model.parameter_count)
             values = np.array(resultants)[:, observable]
-        values = values.reshape(len(needed_rows), -1, 3, 1 + len(columns))
-        slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
+            values = values.reshape(len(values), -1, 3, 1 + len(columns))
+            slopes = ObservableDerivatives.without_own(columns, values[..., 1:])
         residual, slope = sensor.linearise(
             values[..., 0], slopes, phi=self.phi, size=model.parameter_count
         )
@@ -719,13 +724,17 @@ class StreamingSweep:
 
         With Huber's loss, residuals are weighted by their values at the parameters of this pass.
         """
-        if not residuals:
-            return known
-        at_zero = np.concatenate([each.at_zero for each in residuals])
-        is_present = np.isfinite(at_zero)
-        rows_present = is_present.any(axis=1)
-        slopes = np.concatenate([each.slope for each in residuals])[rows_present]
-        is_present = is_present[rows_present]
-        residual = np.where(is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0)
-        rows, slopes = huber_as_least_squares(residual, slopes, huber=self.model.collocation.huber)
-        return known.with_rows(rows[is_present], slopes[is_present], parameters=self.transformed)
+        hubers = [self.model.huber_of(each.instrument) for each in residuals]
+        for huber in dict.fromkeys(hubers):
+            alike = [each for each, own in zip(residuals, hubers, strict=True) if own == huber]
+            at_zero = np.concatenate([each.at_zero for each in alike])
+            is_present = np.isfinite(at_zero)
+            rows_present = is_present.any(axis=1)
+            slopes = np.concatenate([each.slope for each in alike])[rows_present]
+            is_present = is_present[rows_present]
+            residual = np.where(is_present, at_zero[rows_present] + slopes @ self.transformed, 0.0)
+            rows, slopes = huber_as_least_squares(residual, slopes, huber=huber)
+            known = known.with_rows(
+                rows[is_present], slopes[is_present], parameters=self.transformed
+            )
+        return known

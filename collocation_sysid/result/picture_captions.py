@@ -12,6 +12,7 @@ PICTURE_CAPTIONS = {
     "force_displacement": "Force over displacement: measured, fitted and simulated.",
     "depth": "Points of a depth camera with the outline of the fitted surface, at up to four samples, "
     "and the distance of each point behind the surface; grey points are not compared.",
+    "outline": "Edge of the masks (grey) and contour of the fitted body (red) in up to four images.",
     "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
@@ -46,6 +47,7 @@ LEADING_PICTURES = (
     "force_displacement",
     "reading",
     "depth",
+    "outline",
 )
 
 

@@ -32,7 +32,12 @@ ARRAYS_FILE = "trajectory.npz"
 # Prefix of arrays of wrenches, before the number of the sensor, from 1.
 WRENCH_PREFIX = "wrench_"
 # Prefixes of arrays of the attributes that are mappings, before the name.
-GROUP_PREFIXES = {"readings": "reading_", "fields": "field_", "visible_points": "visible_"}
+GROUP_PREFIXES = {
+    "readings": "reading_",
+    "fields": "field_",
+    "visible_points": "visible_",
+    "outlines": "outline_",
+}
 # Prefix of the unit of a custom sensor, before its name.
 UNIT_PREFIX = "unit_"
 # Arrays of the body, the same for all experiments of a run but specimens, which have their own.
@@ -146,6 +151,9 @@ class MotionRecord:
     # position in the world [m] from column 5, and rows of outlines; `camera_overlays` describes
     # them completely.
     visible_points: Mapping[str, Array] = field(default_factory=dict)
+    # mapping of name to (k, 4): for each camera with outlines, of a few images: time [s], 0 for the
+    # edge of the mask and 1 for the fitted contour of the body, and pixel u, v.
+    outlines: Mapping[str, Array] = field(default_factory=dict)
     # mapping of name to str: units of the custom sensors that state one, and of image coordinates,
     # see `image_key`.
     reading_units: Mapping[str, str] = field(default_factory=dict)
@@ -167,7 +175,7 @@ class MotionRecord:
     ) -> MotionRecord:
         """Return the motion of an experiment; obstacles' nodes are left out.
 
-        `fields` and `visible_points` stay empty.
+        `fields`, `visible_points` and `outlines` stay empty.
 
         Parameters
         ----------
@@ -413,11 +421,13 @@ def _require_shapes(arrays: Mapping[str, Any]) -> None:
         "readings": lambda shape: len(shape) == 2 and shape[0] and shape[1] % 3 == 1 < shape[1],
         "fields": lambda shape: shape == (elements, 4),
         "visible_points": lambda shape: shape[1:] == (8,),
+        "outlines": lambda shape: shape[1:] == (4,),
     }
     shape_texts = {
         "readings": "(samples, 1 + 3 k) with k > 0",
         "fields": f"({elements}, 4)",
         "visible_points": "(points, 8)",
+        "outlines": "(pixels, 4)",
     }
     for group, front in GROUP_PREFIXES.items():
         for name, array in arrays[group].items():

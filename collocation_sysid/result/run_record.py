@@ -24,6 +24,8 @@ from ..common.serialisation import as_json
 from ..errors import InputError
 from ..features.contact.feature import contact_fields
 from ..features.measurements import recorded_series
+from ..features.outlines.outline_residual import OutlinesResidual
+from ..features.outlines.outlines import edge_pixels
 from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
@@ -35,6 +37,8 @@ from .replay import MotionRecord
 from .run_writers import replaced_folder, write_frames
 
 REFINEMENT_FILE = "refinement.json"
+# Number of images of a camera whose masks are drawn.
+MAX_OUTLINED_IMAGES = 4
 
 
 def write_run(
@@ -282,7 +286,10 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _visible_points(finished, experiment)
-            collected.append(replace(replay, fields=of_cells, visible_points=of_cameras))
+            contours = _outlines(finished, experiment.name)
+            collected.append(
+                replace(replay, fields=of_cells, visible_points=of_cameras, outlines=contours)
+            )
     return collected
 
 
@@ -295,6 +302,26 @@ def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str
     from .camera_overlays import visible_points  # which needs matplotlib
 
     return visible_points(finished, experiment)
+
+
+def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
+    """Return the edges of masks and the fitted contours (k, 4) of each camera of an experiment, as
+    `MotionRecord.outlines`, in at most `MAX_OUTLINED_IMAGES` images.
+    """
+    part = finished.solution.part_of(experiment)
+    rows_by_camera = {}
+    for residual in part.transcription.residuals_of(OutlinesResidual) if part is not None else ():
+        contours = residual.contours_px(part.x, part.phi)
+        masks = residual.sensor.all_masks[: len(contours)]
+        shown = [k for k, mask in enumerate(masks) if mask is not None]
+        few = np.linspace(0, len(shown) - 1, MAX_OUTLINED_IMAGES).round().astype(int)
+        rows = [np.zeros((0, 4))]
+        for k in (shown[n] for n in np.unique(few) if shown):
+            for kind, pixels in enumerate((edge_pixels(masks[k]), contours[k])):
+                column = np.ones((len(pixels), 1))
+                rows.append(np.hstack([residual.t_s[k] * column, kind * column, pixels]))
+        rows_by_camera[residual.sensor.name] = np.vstack(rows)
+    return rows_by_camera
 
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:

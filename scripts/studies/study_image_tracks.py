@@ -1,4 +1,4 @@
-"""Coverage and accuracy of E and γ_r from image tracks of one, two and three cameras, for twins.
+"""Coverage and accuracy of constants from image tracks of one, two and three cameras, for twins.
 
 A bar of 120 x 30 x 20 mm is swung at one end for 0.4 s and filmed at 100 Hz. Seven points are
 tracked with 0.5 pixels of noise. Poses, focal lengths, principal points and clocks of the cameras,
@@ -7,7 +7,8 @@ capture of the same points with 0.5 mm of noise and places of the same accuracy.
 projected here, without the package's model of tracks.
 
     python scripts study_image_tracks [--twins 24] [--first 0] [--places known|unknown]
-        [--turn-deg 1] [--shift-m 0.005] [--outliers 0] [--rate-hz 100] [--cameras 1,2,3,0]
+        [--turn-deg 1] [--shift-m 0.005] [--focal 0.005] [--centre-px 2] [--outliers 0]
+        [--rate-hz 100] [--cameras 1,2,3,0] [--constants young_pa,gamma_r_s]
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import collocation_sysid as cs
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.1}
+GUESSES = {"young_pa": 1e5, "poisson": 0.4, "gamma_r_s": 4e-3, "gamma_m_1_s": 0.2}
 MATRIX = np.array([[900.0, 0.0, 640.0], [0.0, 905.0, 360.0], [0.0, 0.0, 1.0]])
 DISTORTION = [-0.1, 0.02, 1e-3, -5e-4, 0.0]
 # Cameras, in the order in which they are added [m], and the point at which they look.
@@ -48,8 +50,6 @@ LONG_S = 0.01 * np.arange(-3, 45)
 NOISE_PX = 0.5
 NOISE_M = 5e-4
 PLACE_M = 1e-3
-FOCAL = 5e-3
-CENTRE_PX = 2.0
 DELAY_S = 5e-3
 OUTLIER_PX = 30.0
 
@@ -110,8 +110,8 @@ def film(
     turn = Rotation.from_rotvec(np.deg2rad(options.turn_deg) * rng.normal(size=3))
     own = turn.apply(own.reshape(-1, 3)).reshape(own.shape) + options.shift_m * rng.normal(size=3)
     matrix = MATRIX.copy()
-    matrix[:2, :2] *= 1 + FOCAL * rng.normal()
-    matrix[:2, 2] += CENTRE_PX * rng.normal(size=2)
+    matrix[:2, :2] *= 1 + options.focal * rng.normal()
+    matrix[:2, 2] += options.centre_px * rng.normal(size=2)
     pixels = project(own, matrix)
     pixels += NOISE_PX * rng.normal(size=pixels.shape)
     wild = rng.random(pixels.shape[:2]) < options.outliers
@@ -126,11 +126,13 @@ def film(
         places_m=STATED_M[seen] if options.places == "known" else None,
         sigma_px=NOISE_PX,
         pose_sigma=cs.PoseSigma(turn_deg=options.turn_deg, shift_m=options.shift_m),
+        focal_sigma=options.focal,
+        centre_sigma_px=options.centre_px,
     )
 
 
 def identify(cameras: int, number: int, options: argparse.Namespace) -> list[tuple[float, ...]]:
-    """Return estimate and ends of the 95 % interval of E and γ_r over the truth, for a twin."""
+    """Return estimate and ends of the 95 % interval of each constant over the truth, for a twin."""
     rng = np.random.default_rng([number, cameras])
     places_m = true_places_m(rng)
     true_m = cs.simulate(experiment(LONG_S, places_m), TRUTH, "midpoint", substeps=1).markers_m
@@ -144,11 +146,12 @@ def identify(cameras: int, number: int, options: argparse.Namespace) -> list[tup
             T_S, tracks_m, NOISE_M, names=NAMES, places_m=STATED_M, places_sigma_m=PLACE_M
         )
         seen = experiment(T_S, STATED_M, markers=markers)
-    unknown = {**TRUTH, "young_pa": cs.Unknown(1e5), "gamma_r_s": cs.Unknown(4e-3)}
+    names = options.constants.split(",")
+    unknown = TRUTH | {name: cs.Unknown(GUESSES[name]) for name in names}
     solution = cs.solve(cs.Problem([seen], parameters=unknown))
     estimates = uncertainty_at(solution.collocation, solution.z).estimates
     rows = []
-    for name in ("young_pa", "gamma_r_s"):
+    for name in names:
         low, high = estimates[name].statistical95 or (0.0, np.inf)
         rows.append(tuple(np.array([solution.parameters[name], low, high]) / TRUTH[name]))
     return rows
@@ -162,29 +165,32 @@ def main() -> None:
     parser.add_argument("--places", choices=("known", "unknown"), default="known")
     parser.add_argument("--turn-deg", type=float, default=1.0)
     parser.add_argument("--shift-m", type=float, default=5e-3)
+    parser.add_argument("--focal", type=float, default=5e-3)
+    parser.add_argument("--centre-px", type=float, default=2.0)
     parser.add_argument("--rate-hz", type=float)
     parser.add_argument("--outliers", type=float, default=0.0)
     parser.add_argument("--cameras", default="1,2,3,0")
+    parser.add_argument("--constants", default="young_pa,gamma_r_s")
     options = parser.parse_args()
-    print(
-        "| seen by | RMS error of E | E inside | half width of E | γ_r inside | half width of γ_r |"
-    )
-    print("|---|---|---|---|---|---|", flush=True)
+    names = options.constants.split(",")
+    columns = [
+        f"{what} of {name}" for name in names for what in ("RMS error", "inside", "half width")
+    ]
+    print(f"| seen by | {' | '.join(columns)} |")
+    print("|---" * (1 + len(columns)) + "|", flush=True)
     for count in map(int, options.cameras.split(",")):
-        begin_s = time.perf_counter()
+        begin_s = time.process_time()
         numbers = range(options.first, options.first + options.twins)
         values = np.array([identify(count, number, options) for number in numbers])
-        inside = ((values[..., 1] <= 1) & (values[..., 2] >= 1)).sum(axis=0)
-        widths = np.median(values[..., 2] - values[..., 1], axis=0) / 2
-        error = np.sqrt(np.mean((values[:, 0, 0] - 1) ** 2))
-        what = f"{count} camera{'s' * (count > 1)}" if count else "motion capture"
-        print(
-            f"| {what} | {error:.2%} | {inside[0]} of {len(values)} | {widths[0]:.2%} | "
-            f"{inside[1]} of {len(values)} | {widths[1]:.1%} |",
-            flush=True,
-        )
-        each_s = (time.perf_counter() - begin_s) / len(values)
-        print(f"<!-- {each_s:.1f} s each -->", flush=True)
+        cells = [f"{count} camera{'s' * (count > 1)}" if count else "motion capture"]
+        for found, low, high in np.moveaxis(values, 0, -1):
+            inside = np.count_nonzero((low <= 1) & (high >= 1))
+            error = np.sqrt(np.mean((found - 1) ** 2))
+            width = np.median(high - low) / 2
+            cells += [f"{error:.2%}", f"{inside} of {len(found)}", f"{width:.2%}"]
+        print(f"| {' | '.join(cells)} |", flush=True)
+        each_s = (time.process_time() - begin_s) / len(values)
+        print(f"<!-- {each_s:.1f} CPU s each -->", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kit.filmed import swung, tracks_of, unknown_young
 from kit.frames import (
     NO_TIME,
     NOISE_M,
@@ -878,9 +877,3 @@ def test_a_problem_without_a_gripper_frame_has_no_transforms(tiny: Path):
     assert gripper_transforms(problem, "swing", [0]) == [None]
     from_python = replace(problem, origin=None)
     assert gripper_transforms(from_python, "swing", [0]) == [None]
-
-
-def test_image_tracks_are_refused_also_beside_markers() -> None:
-    experiment = replace(swung([tracks_of()]), markers=swung().markers)
-    with pytest.raises(cs.InputError, match="live estimates do not support image tracks"):
-        cs.live.LiveEstimator(cs.Problem([experiment], parameters=unknown_young()))

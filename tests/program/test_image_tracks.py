@@ -34,6 +34,7 @@ from collocation_sysid.features.image_tracks.rays import (
     points_on_surface,
     poses_from_points,
 )
+from collocation_sysid.features.image_tracks.track_feature import notes
 from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
 from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.observables import ObservableDerivatives
@@ -149,6 +150,25 @@ def test_an_unknown_pose_is_found_from_the_body_at_rest() -> None:
     true = filming("front").pose
     away_m = np.linalg.norm(places.translations[0] - true[:3, 3])
     assert away_m < 0.02  # 4 % of the distance of the camera
+    residual = solution.parts[0].transcription.residuals_of(ImageTrackResidual)[0]
+    pose = residual.estimated_pose(solution.parts[0].phi)
+    off = (
+        Rotation.from_matrix(pose[:3, :3]).inv() * Rotation.from_matrix(true[:3, :3])
+    ).magnitude()
+    assert np.linalg.norm(pose[:3, 3] - true[:3, 3]) < 0.01
+    assert np.rad2deg(off) < 1.0
+    assert any("pose of 'front' as found: pose = [[" in note for note in notes(solution.parts[0]))
+
+
+def test_the_estimated_pose_shows_points_where_they_are_predicted() -> None:
+    residual = residual_of(tracks_of())
+    phi = 0.5 * np.random.default_rng(6).normal(size=residual.nuisance.size)
+    phi[residual.nuisance.indices_of_labels([residual.sensor.unknown_label("delay_s")])] = 0.0
+    for name in ("focal_error", "centre_u_px", "centre_v_px"):
+        phi[residual.nuisance.indices_of_labels([residual.sensor.unknown_label(name)])] = 0.0
+    values = residual.observable.evaluate_positions(simulated_m(), phi)
+    seen = projected(filming("front", pose=residual.estimated_pose(phi)), values)
+    np.testing.assert_allclose(residual.predict(values, phi)[..., :2], seen, atol=1e-6)
 
 
 @pytest.mark.long

@@ -31,9 +31,11 @@ import collocation_sysid as cs
 from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
 from collocation_sysid.features.outlines.outline_feature import hypotheses
 from collocation_sysid.features.outlines.outline_residual import OutlinesResidual
-from collocation_sysid.features.outlines.outlines import mask_of
+from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.observables import ObservableDerivatives
+from collocation_sysid.result.picture_captions import captioned_pictures
+from collocation_sysid.result.replay import read_run
 from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 
@@ -70,6 +72,44 @@ def residual_of_pairs(residual: OutlinesResidual, pairs: Any) -> OutlinesResidua
     return replace(
         residual, correspondences=pairs, is_compared=compared(pairs, residual.observable_s)
     )
+
+
+def test_the_contour_of_the_body_is_at_the_edge_of_its_mask() -> None:
+    residual = residual_of(hanging([outlines_of()]))
+    x, phi = hanging_m().reshape(1, -1), np.zeros(residual.nuisance.size)
+    here = residual_of_pairs(residual, residual.reassociated(x, phi))
+    (contour,) = here.contours_px(x, phi)
+    edge = edge_pixels(photograph())
+    assert len(contour) > 50
+    away = np.linalg.norm(contour[:, None] - edge, axis=2).min(axis=1)
+    assert away.max() < 1.5
+    assert photograph()[tuple(edge.astype(int).T[::-1])].all()
+
+
+@pytest.mark.long
+def test_a_run_draws_masks_and_the_fitted_contour(tmp_path: Path) -> None:
+    parameters = {**TRUTH, "young_pa": cs.Unknown(1.5e5)}
+    problem = cs.Problem([hanging([outlines_of()])], parameters=parameters)
+    cs.run(problem, seek_causes=False).save(tmp_path / "run", frames=False)
+    assert (tmp_path / "run" / "outline_hung_front.png").exists()
+    ((shown,),) = (read_run(tmp_path / "run")[1],)
+    rows = shown.outlines["front"]
+    contour, edge = (rows[rows[:, 1] == kind, 2:] for kind in (1, 0))
+    away = np.linalg.norm(contour[:, None] - edge, axis=2).min(axis=1)
+    assert np.sqrt(np.mean(away**2)) < 1.0
+    captions = [picture.caption for picture in captioned_pictures(tmp_path / "run")]
+    assert any(caption.startswith("Edge of the masks") for caption in captions)
+
+
+def test_an_unknown_pose_of_outlines_is_refused_with_a_remedy(tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match="same outline from several sides; expected the pose"):
+        outlines_of(has_known_pose=False)
+    file = folder_with(tmp_path, "front.png")
+    text = file.read_text().replace(f"pose = {camera().pose.tolist()}", 'pose = "unknown"')
+    file.write_text(text)
+    Image.fromarray(photograph()).save(tmp_path / "front.png")
+    with pytest.raises(cs.InputError, match="image_tracks of at least four points with places_m"):
+        cs.Problem.read(file)
 
 
 FREE: dict[str, Any] = {"clock_rate_sigma": 1e-3, "line_delay_s": 2e-5, "line_delay_sigma_s": 5e-6}

@@ -26,6 +26,8 @@ from ...common.array_types import Array
 from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError, SimulationError
+from ...features.image_tracks.tracked_places import TrackedPlaces
+from ...features.image_tracks.tracks import ImageTracks
 from ...pipeline import Run
 from ...problem import Problem
 from ...program.streaming import LoggedRow, Sample, SquareRootInformation, one_blas_thread
@@ -34,7 +36,7 @@ from ...statistics.assessment import GROSS_MISFIT, Assessment
 from ...statistics.concerns import concern_if
 from ...statistics.estimates import Estimate, user_estimates
 from ...statistics.linearised import AT_BOUND
-from .frame_buffer import LARGEST_GAP, BufferedFrame, FrameBuffer
+from .frame_buffer import LARGEST_GAP, TIME_TOLERANCE_SAMPLES, BufferedFrame, FrameBuffer
 from .frames import (
     Frame,
     Pose,
@@ -148,6 +150,8 @@ class LiveUpdate:
     marker_distances_m : (M,) array
         Distance of each marker of the last sample from the estimate's; NaN where missing, empty if
         there is no sample.
+    pixel_rms : float
+        Root mean square of a coordinate of the residuals of image tracks [pixels]; NaN without any.
     """
 
     t_s: float
@@ -158,6 +162,7 @@ class LiveUpdate:
     latency_s: float
     relinearised: int
     marker_distances_m: Array = field(default_factory=lambda: np.zeros(0))
+    pixel_rms: float = float("nan")
 
     def __repr__(self) -> str:
         values = ", ".join(f"{name} = {each.value:.4g}" for name, each in self.estimates.items())
@@ -182,8 +187,8 @@ class LiveEstimator:
     Parameters
     ----------
     problem : Problem
-        One experiment; of its recording only the grasps, the markers and the sampling rate are
-        used.
+        One experiment; of its recording only the grasps, the sampling rate, and what its markers,
+        cameras and sensors are, are used.
     options : LiveOptions
         Window and computing time.
     clock : callable
@@ -275,7 +280,7 @@ class LiveEstimator:
         self,
         t_s: float,
         pose: Pose | Mapping[str, Pose] | None,
-        markers: ArrayLike | Mapping[str, ArrayLike],
+        markers: ArrayLike | Mapping[str, ArrayLike] | None = None,
         wrench: Any = None,
         readings: Mapping[str, Any] | None = None,
     ) -> LiveUpdate:
@@ -291,15 +296,16 @@ class LiveEstimator:
         pose : 4×4 matrix, (position, quaternion x y z w), or None
             Pose of the moving grasp, None if it is missing; for several grasps a mapping by their
             number, as text from "1" on, or a list in the order of the problem.
-        markers : (M, 3) array, or mapping of name to (3,)
+        markers : (M, 3) array, or mapping of name to (3,), optional
             Marker positions [m]; NaN, or omitted, where missing.
         wrench : (6,) or (3,) array, optional
             Wrench of the grasp on the body: fx, fy, fz [N], tx, ty, tz [N m], at the time of the
             frame; or a mapping with ``t_s`` and ``values``, or a list of such mappings; for several
             sensors a mapping by the number of their grasp, as text. NaN, or None, where missing.
         readings : mapping of name to numbers, optional
-            Values of custom sensors at the time of the frame; or mappings with ``t_s`` and
-            ``values``, or lists of such mappings. NaN, or None, where missing.
+            Values of custom sensors, and pixels (N, 2) of image tracks or mappings of point to
+            pixel, at the time of the frame; or mappings with ``t_s`` and ``values``, or lists of
+            such mappings. NaN, or None, where missing.
 
         Raises
         ------
@@ -359,13 +365,13 @@ class LiveEstimator:
         notes += buffered.notes
         self.budget.start_frame()
         caught_up = self._catch_up(began, notes)
-        squares = []
+        squares, pixel_squares = [], []
         before = self.clock()
         while rows:
-            done, new_notes = self._compute_rows(rows, squares)
+            done, new_notes = self._compute_rows(rows, squares, pixel_squares)
             notes = notes + new_notes
             rows = rows[done:]
-        notes += self._add_samples(buffered.late_samples, squares)
+        notes += self._add_samples(buffered.late_samples, squares, pixel_squares)
         self._update_estimate()
         if self.first_pass is not None and not self.first_pass.has_failed and self.search is None:
             self._relinearise_if_moved(
@@ -375,9 +381,6 @@ class LiveEstimator:
         done = self._repeat_rows(began, notes, done=caught_up)
         before = self.clock()
         self._drop_old_rows()
-        squared_distances = np.concatenate([*squares, np.zeros(0)])
-        squared_distances = squared_distances[np.isfinite(squared_distances)]
-        rms_m = float(np.sqrt(squared_distances.mean())) if len(squared_distances) else float("nan")
         estimates, trust = self._estimates_and_trust(frame.t_s)
         self.budget.record_remainder(self.clock() - before)
         latency_s = self.clock() - began
@@ -385,11 +388,12 @@ class LiveEstimator:
             frame.t_s,
             estimates,
             trust=trust,
-            marker_rms_m=rms_m,
+            marker_rms_m=_root_mean(squares),
             notes=tuple(notes),
             latency_s=latency_s,
             relinearised=done,
             marker_distances_m=np.sqrt(squares[-1]) if squares else np.zeros(0),
+            pixel_rms=_root_mean(pixel_squares),
         )
         return self.last
 
@@ -512,7 +516,7 @@ class LiveEstimator:
         )
 
     def _compute_rows(
-        self, rows: Sequence[LoggedRow], squares: list[Array]
+        self, rows: Sequence[LoggedRow], squares: list[Array], pixel_squares: list[Array]
     ) -> tuple[int, list[str]]:
         """Compute and log new rows with the first pass, as many as possible at once, with their
         samples.
@@ -526,12 +530,12 @@ class LiveEstimator:
         first_pass = self.first_pass
         try:
             if first_pass is None:
-                self._start_pass(rows[0])
+                notes += self._start_pass(rows)
             elif not first_pass.has_failed:
                 done = first_pass.add_rows(
                     [row.poses for row in rows[: first_pass.count_remaining_rows()]]
                 )
-        except SimulationError as error:
+        except (SimulationError, InputError) as error:
             if first_pass is None:
                 self.intake.reset()
                 return 1, [f"the initial state of the motion cannot be computed: {error}"]
@@ -539,13 +543,19 @@ class LiveEstimator:
             notes = [f"the body cannot be simulated with these parameters: {error}"]
         for k, row in enumerate(rows[:done], 1):
             self.log.append(LoggedRow(row.poses, []))
-            notes += self._add_samples(row.samples, squares, rows=done - k)
+            notes += self._add_samples(row.samples, squares, pixel_squares, rows=done - k)
         return done, notes
 
     def _add_samples(
-        self, readings: Sequence[Sample], squares: list[Array], rows: int = 0
+        self,
+        readings: Sequence[Sample],
+        squares: list[Array],
+        pixel_squares: list[Array],
+        rows: int = 0,
     ) -> list[str]:
-        """Add samples to the first pass and to the log, and return notes on outliers."""
+        """Add samples to the first pass and to the log, and return notes on outliers; squared
+        distances of markers and squared residuals of pixels are added to the two lists.
+        """
         first_pass = self.first_pass
         if first_pass is None:
             return []
@@ -568,6 +578,11 @@ class LiveEstimator:
                     linearised.at_zero[outliers] = residual[outliers] = np.nan
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
                 squares.append(squared)
+            elif (
+                sensor := self.model.instruments[reading.instrument - 1].reading
+            ).measurement.counts_pixels:
+                residual = linearised.evaluate_at(self.model.transformed(self.p))[:, :2]
+                pixel_squares.append(np.ravel((residual * sensor.sigmas[:, None]) ** 2))
             self.log[-1].samples.append(reading)
         first_pass.add_residuals(all_linearised)
         return notes
@@ -612,12 +627,19 @@ class LiveEstimator:
         poses = self.model.first_poses
         moving_poses = tuple(poses[k] for k in self.model.moving_grasps)
         no_markers = np.full((len(self.names), 3), np.nan)
-        no_markers[0] = 0.0
+        no_markers[:1] = 0.0
+        # Points in the middle of the rows that they need.
+        pixels = [
+            Sample(each.stencil.neighbours // 2, np.zeros(each.reading.measured[0, :, :2].size), k)
+            for k, each in enumerate(self.model.instruments, 1)
+            if each.reading.measurement.counts_pixels
+        ]
         try:
             trial = WindowPass(self.model, self.p, prior=self.prior, block_rows=self._block_rows)
-            row = LoggedRow(moving_poses, [Sample(0.0, no_markers)])
+            row = LoggedRow(moving_poses, [Sample(0.0, no_markers)] if self.names else [])
             for _ in range(self.model.template_rows + 2):
                 trial.repeat_rows([row])
+            trial.repeat_rows([row._replace(samples=[*row.samples, *pixels])])
         except SimulationError:
             return None
         self._estimates_at(trial.sweep.information, self.p)
@@ -640,15 +662,18 @@ class LiveEstimator:
             took_s[count] = min(took_s.get(count, np.inf), self.clock() - began)
         return TimeBudget.from_times(took_s[1], took_s[most], many=most)
 
-    def _start_pass(self, row: LoggedRow) -> None:
-        """Start the first pass with the first row, and set unknown marker places from its markers.
+    def _start_pass(self, rows: Sequence[LoggedRow]) -> list[str]:
+        """Start the first pass with the first of some rows, and set unknown places of markers and
+        of points in images, and poses of cameras, from its samples; return notes on them.
 
         The initial guess of the positions is that of the start of the problem's recording, moved
-        rigidly with the pose, if there is a single grasp. If marker places are set, `model`, the
+        rigidly with the pose, if there is a single grasp. If places or poses are set, `model`, the
         bounds, the nuisance parameters in `p` and `prior` are replaced, and the row is computed
-        again. `first_pass` is set; the samples of the row are not added to it.
+        again; they are kept after a restart, whose prior refers to them. `first_pass` is set; the
+        samples of the row are not added to it.
         """
         model = self.model
+        row, notes = rows[0], []
         guesses = []
         poses = model.all_poses(row.poses)
         if self._rest is not None and len(poses) == 1:
@@ -660,10 +685,21 @@ class LiveEstimator:
             ]
         first_pass = WindowPass(model, self.p, prior=self.prior, block_rows=self._block_rows)
         first_pass.add_rows([row.poses], guesses)
-        marker_samples = [reading.values for reading in row.samples if not reading.instrument]
-        first = marker_samples[0] if marker_samples else np.full((len(self.names), 3), np.nan)
-        self.model = model.with_marker_places(first, first_pass.blocks[0].stored_rows[0].x)
+        if not self.prior.row_count:
+            first = {
+                of: values
+                for of, samples, values in self.intake.all_samples(rows)
+                if abs(samples) <= TIME_TOLERANCE_SAMPLES
+            }
+            for number, camera in enumerate(model.experiment.readings, 1):
+                is_seen = number in first and np.isfinite(first[number]).any()
+                if isinstance(camera, ImageTracks) and not is_seen:
+                    raise InputError(f"the first frame has no pixels of '{camera.name}'")
+            tracks_m = first.pop(0, np.full((len(self.names), 3), np.nan))
+            x = first_pass.blocks[0].stored_rows[0].x
+            self.model = model.with_first_frame(tracks_m, first, x)
         if self.model is not model:
+            notes = self._note_unplaced()
             self._set_bounds()
             places = self.model.collocation.guess_p[model.collocation.nq :]
             self.p = np.concatenate([self.p[: model.collocation.nq], places])
@@ -672,8 +708,23 @@ class LiveEstimator:
                 self.model, self.p, prior=self.prior, block_rows=self._block_rows
             )
             first_pass.add_rows([row.poses], guesses)
+            if self.search is not None:
+                self.search = self._new_search()
         self.first_pass = first_pass
         self._combined = CombinedPasses.from_passes(first_pass, None)
+        return notes
+
+    def _note_unplaced(self) -> list[str]:
+        """Return a note on the points in images whose first rays do not meet the body."""
+        absent = [
+            f"{name} in {each.tracks.name}"
+            for each in self.model.transcription.association.correspondences
+            if isinstance(each, TrackedPlaces)
+            for name, is_placed in zip(each.tracks.names, each.is_placed, strict=True)
+            if not is_placed
+        ]
+        words = "points left out, because the first frame does not show them on the body"
+        return [f"{words}: {', '.join(absent)}"] if absent else []
 
     def _restart(self) -> None:
         """Keep the information of all samples so far as a prior, discard passes, log and frames,
@@ -820,10 +871,19 @@ class LiveEstimator:
             estimates_only = {name: Estimate(v) for name, v in values.items()}
             return estimates_only, Assessment.from_concerns(grave)
         if self.counts["looked"] % SCATTER_INTERVAL_FRAMES == 0:
-            self.scatter = self._combined.scatter(self.model.transformed(self.p))
+            self.scatter = self._combined.scatter(
+                self.model.transformed(self.p), self.model.judged_instruments
+            )
         self.counts["looked"] += 1
         estimates = self._estimates_at(self._combined.information, self.p)
-        grave += data_concerns(self.scatter, self.counts, samples=self.samples)
+        judged = self.model.judged_residuals
+        grave += data_concerns(
+            self.scatter,
+            self.counts,
+            samples=self.samples,
+            sigma_key=judged[0].sigma_key,
+            errs_slowly=any(each.errs_slowly for each in judged),
+        )
         grave += estimate_concerns(estimates, self.distance_from_linearisation())
         return estimates, Assessment.from_concerns(grave)
 
@@ -1032,7 +1092,7 @@ class LiveEstimator:
             if was_search:
                 notes.append("continued from another initial stiffness")
             self.scatter = CombinedPasses.from_passes(second_pass, None).scatter(
-                second_pass.sweep.transformed
+                second_pass.sweep.transformed, self.model.judged_instruments
             )
         else:
             reach = self.model.collocation.compute_reach_p()
@@ -1073,3 +1133,10 @@ class LiveEstimator:
             if len(self.log) <= most:
                 break
             del self.log[: self.first_pass.drop_oldest_block()]
+
+
+def _root_mean(squares: Sequence[Array]) -> float:
+    """Return the root of the mean of squares, without missing ones; NaN without any."""
+    known = np.concatenate([*squares, np.zeros(0)])
+    known = known[np.isfinite(known)]
+    return float(np.sqrt(known.mean())) if len(known) else float("nan")

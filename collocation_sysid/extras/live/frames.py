@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import reprlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
+from ...features.image_tracks.tracks import ImageTracks
 from ...problem import Problem
 from ...problem.gripper_transforms import gripper_transforms
 from ...program.streaming import StreamingModel
@@ -133,7 +135,12 @@ def _parse_single_pose(pose: Pose) -> tuple[Array, Array]:
     return matrix[:3, 3], Rotation.from_matrix(matrix[:3, :3]).as_quat()
 
 
-def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence[str]) -> Array:
+def parse_markers(
+    markers: ArrayLike | Mapping[str, Any] | None,
+    names: Sequence[str],
+    size: int = 3,
+    what: str = "marker",
+) -> Array:
     """Return marker positions (M, 3) [m], NaN where missing.
 
     A marker of which any coordinate is None or NaN is missing as a whole.
@@ -145,6 +152,8 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
         markers that are omitted or None are missing.
     names : sequence of str
         Names of the M markers.
+    size, what : int, str
+        Number of coordinates, and what messages call a marker: two for points in images.
 
     Raises
     ------
@@ -152,7 +161,7 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
         For unknown markers, another shape, text, or coordinates beyond `LARGEST_NUMBER` in
         magnitude, such as infinity.
     """
-    tracks = np.full((len(names), 3), np.nan)
+    tracks = np.full((len(names), size), np.nan)
     if markers is None:
         return tracks
     if not isinstance(markers, Mapping):
@@ -161,10 +170,10 @@ def parse_markers(markers: ArrayLike | Mapping[str, Any] | None, names: Sequence
         for name, place in markers.items():
             if name not in names:
                 raise InputError(
-                    f"found a marker {reprlib.repr(name)}; expected one of {', '.join(names)}"
+                    f"found a {what} {reprlib.repr(name)}; expected one of {', '.join(names)}"
                 )
             if place is not None:
-                tracks[list(names).index(name)] = _parse_array(place, (3,))
+                tracks[list(names).index(name)] = _parse_array(place, (size,))
     return np.where(np.isfinite(tracks).all(axis=1, keepdims=True), tracks, np.nan)
 
 
@@ -177,9 +186,10 @@ def parse_custom_readings(
     Parameters
     ----------
     readings : mapping of name to samples, or None
-        Samples of each sensor: its m values (or a number, if there is one), a mapping with exactly
-        the keys "t_s" and "values", or a list of such mappings. None, also as values, for no
-        sample; single values that are None or NaN are missing and become NaN.
+        Samples of each sensor: its m values (or a number, if there is one; of image tracks pixels
+        (N, 2), or pixels by point), a mapping with exactly the keys "t_s" and "values", or a list
+        of such mappings. None, also as values, for no sample; single values that are None or NaN
+        are missing and become NaN.
     gauges : sequence of CustomSensor
         Custom sensors of the problem; instrument k is the k-th of them, from 1.
     t_s : float
@@ -206,11 +216,11 @@ def parse_custom_readings(
             )
             raise InputError(f"found a reading {reprlib.repr(name)}; expected {known}")
         number = names.index(name)
-        count = gauges[number].measured_values.shape[1]
-        what = f"the reading '{name}'"
-        collected += [
-            (number + 1, *sample) for sample in _parse_samples(samples, what, count=count, t_s=t_s)
-        ]
+        gauge, what = gauges[number], f"the reading '{name}'"
+        counts = (gauge.measured_values.shape[1],)
+        points = gauge.names if isinstance(gauge, ImageTracks) else ()
+        parsed = _parse_samples(samples, what, counts, t_s=t_s, names=points)
+        collected += [(number + 1, *sample) for sample in parsed]
     return tuple(collected)
 
 
@@ -262,9 +272,7 @@ def parse_wrenches(
     for name, samples in wrench_data.items():
         measured = wrenches[int(name)].measured_components
         what = f"the wrench of grasp {name}"
-        for at_s, values in _parse_samples(
-            samples, what, count=len(measured), t_s=t_s, alternative_count=3
-        ):
+        for at_s, values in _parse_samples(samples, what, (len(measured), 3), t_s=t_s):
             wrench_values = np.where(measured, np.pad(values, (0, 6 - len(values))), np.nan)
             wrench_values[len(values) :] = np.nan
             collected.append((instruments_before + known[name] + 1, at_s, wrench_values))
@@ -272,31 +280,37 @@ def parse_wrenches(
 
 
 def _parse_samples(
-    samples: Any, what: str, count: int, t_s: float, alternative_count: int = 0
+    samples: Any, what: str, counts: Sequence[int], t_s: float, names: Sequence[str] = ()
 ) -> Iterator[tuple[float, Array]]:
-    """Yield time [s] and values of the samples of one instrument; missing samples are skipped."""
+    """Yield time [s] and values of the samples of one instrument, whose number is one of `counts`,
+    or pixels (2N,) of points with `names`, by name or (N, 2); missing samples are skipped.
+    """
     several = isinstance(samples, Sequence) and any(isinstance(s, Mapping) for s in samples)
     for sample in samples if several else [samples]:
         at_s = t_s
         values = sample
-        if isinstance(sample, Mapping):
+        if isinstance(sample, Mapping) and not (names and set(sample).isdisjoint(_SAMPLE_KEYS)):
             if set(sample) != set(_SAMPLE_KEYS):
                 keys = ", ".join(map(reprlib.repr, sample)) or "nothing"
                 raise InputError(f"a sample of {what} has the keys {keys}; expected t_s and values")
             at_s = parse_time(sample["t_s"])
             values = sample["values"]
-        one = isinstance(values, (int, float)) and not isinstance(values, bool)
-        few = np.shape(values) == (alternative_count,)
         if values is not None:
             try:
-                yield (
-                    at_s,
-                    _parse_array(
-                        [values] if one else values, (alternative_count if few else count,)
-                    ),
-                )
+                if names:
+                    yield at_s, parse_markers(values, names, size=2, what="point").ravel()
+                else:
+                    yield at_s, _parse_numbers(values, counts)
             except InputError as error:
                 raise InputError(f"{what}: {error.message}") from error
+
+
+def _parse_numbers(values: Any, counts: Sequence[int]) -> Array:
+    """Return values (m,), whose number is one of `counts`; messages expect the first."""
+    one = isinstance(values, (int, float)) and not isinstance(values, bool)
+    size = np.shape(values)
+    is_known = len(size) == 1 and size[0] in counts
+    return _parse_array([values] if one else values, size if is_known else (counts[0],))
 
 
 def _parse_array(raw_values: Any, shape: tuple[int, ...]) -> Array:
@@ -476,7 +490,7 @@ class FrameReader:
         return Frame(
             t_s,
             pose,
-            tracks_m=parse_markers(tracks, self.names),
+            tracks_m=parse_markers(tracks or None, self.names),
             instrument_samples=tuple(instrument_samples),
         )
 
@@ -488,11 +502,16 @@ class FrameReader:
     def _list_instrument_columns(self) -> list[Sequence[str]]:
         """Return the column names of each instrument: custom sensors, then the six of each sensor
         of a grasp, "fx_n" to "tz_nm"; the latter with the number of the grasp and a dot in front if
-        there are several.
+        there are several, and columns that several cameras have with the name of the camera.
         """
         before = ["" if len(self.wrenches) == 1 else f"{number}." for number in self.wrenches]
         of_wrenches = [[each + name for name in WRENCH_COLUMNS] for each in before]
-        return [*(gauge.columns for gauge in self.gauges), *of_wrenches]
+        counts = Counter(column for gauge in self.gauges for column in gauge.columns)
+        of_gauges = [
+            [f"{gauge.name}.{c}" if counts[c] > 1 else c for c in gauge.columns]
+            for gauge in self.gauges
+        ]
+        return [*of_gauges, *of_wrenches]
 
     def _checked_header(self, columns: list[str]) -> list[str]:
         """Return the columns of a header, as they are."""

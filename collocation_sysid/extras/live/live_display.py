@@ -71,6 +71,9 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
         the history.
     """
     last = updates[-1]
+    error_text = f"marker error {millimetres(last.marker_rms_m)}"
+    if np.isfinite(last.pixel_rms) and not np.isfinite(last.marker_rms_m):
+        error_text = f"pixel error {last.pixel_rms:.2g} px"
     rows = []
     for name, estimate in last.estimates.items():
         error = (
@@ -81,8 +84,7 @@ def display_of(updates: Sequence[LiveUpdate]) -> list[Shown]:
         history = sparkline([update.estimates[name].value for update in updates[-COLUMNS:]])
         rows.append((name, f"{estimate.value:.5g}", error, unit_of(name), history))
     return [
-        f"t = {last.t_s:.2f} s   marker error {millimetres(last.marker_rms_m)} RMS   latency "
-        f"{1e3 * last.latency_s:.1f} ms",
+        f"t = {last.t_s:.2f} s   {error_text} RMS   latency {1e3 * last.latency_s:.1f} ms",
         Table("", ("", "estimate", "±", "unit", "history"), rows=tuple(rows), names=5),
         verdict_section(last.trust, max_reasons=SHOWN_REASONS),
     ]

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import InputError
+from ...features.image_tracks.tracks import ImageTracks
 from ...methods.reduced_space import ReducedSpace
 from ...methods.starts.stiffness_scan import typical_parameters
 from ...model.point_forces import law_function
@@ -94,8 +95,14 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
         "none",
     )
     yield ("depth cameras, because frames do not contain their images", experiment.depths, "none")
+    tracks = [each for each in experiment.readings if isinstance(each, ImageTracks)]
     filmed = [each for each in experiment.readings if each.counts_pixels]
-    yield "image tracks and outlines, which follow the estimates", filmed, "markers"
+    outlines = len(filmed) > len(tracks)
+    yield "outlines, because frames do not contain masks", outlines, "image tracks or markers"
+    carried = any(each.camera.poses is not None for each in tracks)
+    yield "a camera that moves, because frames do not contain its poses", carried, "one at rest"
+    drifts = any(each.drift_px(experiment) for each in tracks)
+    yield "drifts of tracks that are estimated", drifts, "drift_sigma_px = 0"
     following = [each for each in experiment.readings if isinstance(each, FollowingSensor)]
     yield "sensors whose nodes follow the estimates", following, "sensors of fixed points"
     delayed = experiment.obstacles and nuisance.obstacle_time_s
@@ -105,7 +112,8 @@ def _unsupported_features(experiment: Experiment) -> Iterator[tuple[str, object,
     laws = (law_function(each.force, each.points.dofs) for each in body.placed_forces)
     depends_on_time = any(law.depends_on_datum(0) for law in laws)
     yield "a force that depends on time", depends_on_time, "one that does not"
-    yield ("an experiment without markers", not experiment.markers.names, "markers")
+    nothing = not experiment.markers.names and not experiment.readings
+    yield "an experiment of wrenches alone", nothing, "markers, image tracks or readings"
     is_temporary = any(np.isfinite([g.from_s, g.until_s]).any() for g in grasps)
     yield (
         "a grasp that holds during a part of the recording",
@@ -134,7 +142,7 @@ def recording_from_log(
     three are within the rows, or all are NaN, the sensor is left out. Missing markers are NaN.
     Samples after the last row are left out.
 
-    None if there are fewer than three sample times or no measured marker, or if markers were
+    None if there are fewer than three sample times or nothing is measured, or if markers were
     measured between samples.
 
     Parameters
@@ -155,7 +163,7 @@ def recording_from_log(
             return None
         if round(when) < len(t_s):
             tracks_m[round(when)] = tracks
-    if len(t_s) < FEWEST or np.isnan(tracks_m).all():
+    if len(t_s) < FEWEST:
         return None
     grasps = list(experiment.grasps)
     for k, number in enumerate(model.moving_grasps):
@@ -180,6 +188,11 @@ def recording_from_log(
         is_measured = len(inside) >= FEWEST and bool(np.isfinite(values).any())
         at_s = t_s[0] + model.experiment.timestep_s * np.array(inside)
         measurements.append(sensor.with_samples(at_s, values) if is_measured else None)
+    has_markers = np.isfinite(tracks_m).any()
+    if not has_markers and (
+        experiment.markers.names or not any(each is not None for each in measurements)
+    ):
+        return None
     return experiment.with_measurements(measurements, t_s=t_s, grasps=grasps)
 
 

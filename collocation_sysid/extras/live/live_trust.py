@@ -94,7 +94,13 @@ def variance_factor(
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile
 
 
-def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) -> list[Concern]:
+def data_concerns(
+    scatter: ResidualScatter,
+    counts: Counter[str],
+    samples: int,
+    sigma_key: str = "sigma_m",
+    errs_slowly: bool = False,
+) -> list[Concern]:
     """Return the concerns due to residuals, outliers and restarts; empty if there are none.
 
     They are residuals larger than σ, correlated residuals, a large share of outliers among
@@ -110,15 +116,22 @@ def data_concerns(scatter: ResidualScatter, counts: Counter[str], samples: int) 
     samples : int
         Number of marker positions measured so far, each marker of each frame counted once; may be
         0.
+    sigma_key : str
+        Key of σ in a problem file.
+    errs_slowly : bool
+        Whether errors within σ may be correlated, see `MeasurementResidual`.
     """
     outlier_share = counts["wild"] / max(1, samples)
     restarts = counts["begun anew"]
-    size = {"factor": scatter.rms, "stated": "sigma_m"}
+    size = {"factor": scatter.rms, "stated": sigma_key}
     times = "once" if restarts == 1 else f"{restarts} times"
     return [
         *concern_if(scatter.rms > MISFIT, scatter.rms > GROSS_MISFIT, code="noise/larger", **size),
         *concern_if(
-            scatter.lag1 > PERSISTENT, False, code="residuals/persist", autocorrelation=scatter.lag1
+            scatter.lag1 > PERSISTENT and not (errs_slowly and scatter.rms <= 1),
+            False,
+            code="residuals/persist",
+            autocorrelation=scatter.lag1,
         ),
         *concern_if(
             outlier_share > WILD,

@@ -176,9 +176,9 @@ def update_as_json(update: LiveUpdate) -> str:
     """Return an update as one line of JSON, without line break.
 
     The keys are "t_s", "parameters" (by name "value", "statistical_std_error" and
-    "statistical95"), "trust" ("verdict" and "reasons"), "marker_rms_m", "latency_s" (rounded to
-    microseconds) and "notes". Standard errors and intervals that are None, and a NaN marker
-    error, are null; `relinearised` is left out.
+    "statistical95"), "trust" ("verdict" and "reasons"), "marker_rms_m", "pixel_rms", "latency_s"
+    (rounded to microseconds) and "notes". Standard errors and intervals that are None, and errors
+    that are NaN, are null; `relinearised` is left out.
     """
     parameters = {
         name: {
@@ -188,13 +188,14 @@ def update_as_json(update: LiveUpdate) -> str:
         }
         for name, each in update.estimates.items()
     }
-    rms_m = update.marker_rms_m
+    rms_m, rms_px = update.marker_rms_m, update.pixel_rms
     return json.dumps(
         {
             "t_s": update.t_s,
             "parameters": parameters,
             "trust": {"verdict": update.trust.verdict, "reasons": update.trust.reasons},
             "marker_rms_m": rms_m if np.isfinite(rms_m) else None,
+            "pixel_rms": rms_px if np.isfinite(rms_px) else None,
             "latency_s": round(update.latency_s, 6),
             "notes": update.notes,
         },

@@ -362,14 +362,20 @@ class CombinedPasses(NamedTuple):
             points=points,
         )
 
-    def scatter(self, transformed: Array) -> ResidualScatter:
-        """Return RMS and autocorrelation of the residuals of all marker samples at transformed
-        parameters (P,), to first order; other instruments do not count.
+    def scatter(self, transformed: Array, instruments: Sequence[int]) -> ResidualScatter:
+        """Return RMS and autocorrelation of the residuals of some instruments, the largest of each,
+        at transformed parameters (P,), to first order.
         """
-        return ResidualScatter.from_residuals(
-            [
-                residual.evaluate_at(transformed)
-                for residual in self.residuals
-                if not residual.instrument
-            ]
+        scatters = [
+            ResidualScatter.from_residuals(
+                [
+                    residual.evaluate_at(transformed)
+                    for residual in self.residuals
+                    if residual.instrument == instrument
+                ]
+            )
+            for instrument in instruments
+        ]
+        return ResidualScatter(
+            max(each.rms for each in scatters), max(each.lag1 for each in scatters)
         )

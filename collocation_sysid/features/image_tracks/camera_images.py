@@ -212,8 +212,9 @@ class CameraImagesResidual(CorrespondingSensorResidual):
         neighbouring times from the image [s], the time since the first image over that of the last
         one, and the duration [s], the rotation (S, 3, 3) of the camera by rows, its translation [m].
         """
-        since_s = self.t_s - self.t_s[0]
-        duration_s = max(float(since_s[-1]), 1e-12)
+        first_s, last_s = self.sensor.sample_times_s[[0, -1]]
+        since_s = self.t_s - first_s
+        duration_s = max(float(last_s - first_s), 1e-12)
         return np.column_stack(
             [
                 self.observable_s[self._times] - self.t_s[:, None],

@@ -150,6 +150,12 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             f"points of '{tracks.name}' deviate by {rms:.3g} pixels (RMS of a coordinate); left out: "
             f"{'; '.join(left) or 'none'}"
         )
+        if not tracks.has_known_pose:
+            rows = [
+                "[" + ", ".join(f"{number:.4f}" for number in row) + "]"
+                for row in reading.estimated_pose(part.phi).tolist()
+            ]
+            yield f"pose of '{tracks.name}' as found: pose = [{', '.join(rows)}]"
         if places.mirror_ratio < SIMILAR_POSES:
             yield (
                 f"the pose of '{tracks.name}' was found from points that a mirrored pose explains "

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -25,6 +26,7 @@ from ...program.custom_sensor_residual import is_within
 from ...program.measurement_model import CorrespondenceModel
 from ...program.measurement_residual import GROUP, RowStencil
 from ...program.observables import PointPositions
+from ...recording.nuisance import cayley_rotation
 from .camera_images import POSE_UNKNOWNS, CameraImagesResidual
 from .tracked_places import TrackedPlaces
 from .tracks import WALK_TERMS, ImageTracks, place_labels
@@ -103,6 +105,19 @@ class ImageTrackResidual(CameraImagesResidual):
             pixels = np.where(is_hidden[: len(pixels)], np.nan, pixels)
         return pixels.reshape(len(pixels), -1)
 
+    def estimated_pose(self, phi: Array) -> Array:
+        """Return the pose (4, 4) of the camera in the frame that carries it at φ (k,)."""
+        errors = np.zeros(6)
+        names = list(self.sensor.camera_unknowns(self.experiment))
+        places = self.correspondences.pose_parameters
+        estimated = [POSE_UNKNOWNS.index(name) for name in names if name in POSE_UNKNOWNS]
+        errors[estimated] = (phi * self.nuisance.scales)[places]
+        turned = np.array(ca.DM(cayley_rotation(ca.SX(ca.DM(errors[:3])))))
+        pose = self.correspondences.pose.copy()
+        pose[:3, 3] -= pose[:3, :3] @ turned.T @ errors[3:]
+        pose[:3, :3] = pose[:3, :3] @ turned.T
+        return pose
+
     @property
     def observable_sigmas(self) -> Array:
         """Standard deviations (3N,) of the positions of the points, see `position_sigmas_m`."""
@@ -116,6 +131,27 @@ class ImageTrackResidual(CameraImagesResidual):
         """
         places = self.correspondences
         return 2 * int(np.sum(self.sensor.is_seen & places.is_placed & ~places.is_visible))
+
+    def with_samples(
+        self, known_s: Array, known_x: Array, t_s: Array, measurements: Array, **changes: Any
+    ) -> Self:
+        """Return the model with other images of the camera at rest, in which the points that are
+        visible in the shapes `known_x` (n, 3n') [m] at the times `known_s` (n,) [s] are compared.
+        """
+        other = super().with_samples(known_s, known_x, t_s, measurements, **changes)
+        places, count = self.correspondences, len(t_s)
+        rotations, translations = (
+            np.repeat(each[:1], count, axis=0) for each in (places.rotations, places.translations)
+        )
+        seen = other.is_compared[..., :2].all(axis=2)
+        visible = places.visible_points(
+            other._shapes(known_x), translations, np.ones_like(seen), seen
+        )
+        vars(other).update(
+            is_compared=other.is_compared & (seen & visible & places.is_placed)[..., None],
+            correspondences=replace(places, rotations=rotations, translations=translations),
+        )
+        return other
 
     # Correspondences --------------------------------------------------------------------------
 

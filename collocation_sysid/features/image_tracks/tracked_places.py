@@ -215,6 +215,7 @@ class TrackedPlaces(Correspondences):
     # (N, F): faces that an unknown place may enter across a crease, those that look at the cameras in
     # the first images of the point; none for stated places.
     enterable: NDArray[np.bool_]
+    pose: Array  # (4, 4): pose of the camera in the frame that carries it
     # (S, 3, 3) and (S, 3): pose of the camera at each image, from its frame to the world.
     rotations: Array
     translations: Array
@@ -257,6 +258,7 @@ class TrackedPlaces(Correspondences):
             surface_association(body, places, sigmas, faces),
             faces,
             enterable,
+            camera.pose,
             rotations,
             translations,
             is_placed,
@@ -328,27 +330,35 @@ class TrackedPlaces(Correspondences):
         count = len(shapes_m)
         if not count:
             return self
+        before, seen = self.is_visible[:count], self.tracks.is_seen[:count]
+        visible = self.visible_points(shapes_m, self.translations[:count], before, seen)
+        changes = np.sum(visible != before)
+        if is_settled and changes <= SETTLED * np.sum(before & seen):
+            return self
+        return replace(self, is_visible=np.concatenate([visible, self.is_visible[count:]]))
+
+    def visible_points(
+        self, shapes_m: Array, eyes_m: Array, before: NDArray[np.bool_], seen: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which points (s, N) are visible in shapes (s, n, 3) [m] from cameras at (s, 3) [m]
+        if those of `before` were; points without pixels in `seen` may be hidden by others.
+        """
         body = self.association.body
         triangles = shapes_m[:, body.mesh.surface]
         corners = triangles[:, self.faces]
         points = np.einsum("nc,snci->sni", self._shares, corners)
-        eyes = self.translations[:count]
-        cosines = facing(corners, points, eyes[:, None])
-        before = self.is_visible[:count]
+        cosines = facing(corners, points, eyes_m[:, None])
         visible = np.where(before, cosines > TURNS_HIDDEN, cosines > TURNS_VISIBLE)
         margin_m = OCCLUSION_EDGES * self._mean_edge_m
-        used = np.flatnonzero((visible & self.tracks.is_seen[:count]).any(axis=0) & self.is_placed)
-        hidden = is_occluded(points[:, used], eyes, triangles, margin_m)
-        for k in range(count if self.obstacles else 0):
-            eye = np.tile(eyes[k], (len(used), 1))
+        used = np.flatnonzero((visible & seen).any(axis=0) & self.is_placed)
+        hidden = is_occluded(points[:, used], eyes_m, triangles, margin_m)
+        for k in range(len(shapes_m) if self.obstacles else 0):
+            eye = np.tile(eyes_m[k], (len(used), 1))
             for obstacle in self.obstacles:
                 distance = obstacle_distance(obstacle, body, shapes_m[k])
                 hidden[k] |= is_behind(points[k, used], eye, distance, margin_m)
         visible[:, used] &= ~hidden
-        changes = np.sum(visible != before)
-        if is_settled and changes <= SETTLED * np.sum(before & self.tracks.is_seen[:count]):
-            return self
-        return replace(self, is_visible=np.concatenate([visible, self.is_visible[count:]]))
+        return visible
 
     @cached_property
     def _mean_edge_m(self) -> float:

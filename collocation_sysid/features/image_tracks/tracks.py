@@ -151,6 +151,10 @@ class ImageTracks(CameraImages):
         pixels = None if values is None else np.asarray(values, dtype=float).reshape(-1, count, 2)
         return replace(self, t_s=t_s, pixels=pixels)
 
+    def with_zeros_at(self, t_s: ArrayLike) -> Self:
+        """Return a copy without pixels at the times `t_s` (S,) [s]: zeros would be rays of places."""
+        return self.with_samples(t_s, None)
+
     @property
     def known_places_m(self) -> Array:
         """Places (N, 3) on the undeformed body as stated [m]; NaN where unknown."""

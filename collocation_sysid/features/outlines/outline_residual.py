@@ -304,6 +304,18 @@ class OutlinesResidual(CameraImagesResidual):
             shapes.append(np.tensordot(weights, nodes_m[self._times[k]], 1))
         return np.reshape(shapes, (known, *nodes_m.shape[1:]))
 
+    def contours_px(self, x: Array, phi: Array) -> list[Array]:
+        """Return the compared points of the contour (P, 2) [pixels] in each image that rows x (rows,
+        3n) reach, at φ (k,).
+        """
+        pairs, errors = self.correspondences, self._errors(phi)
+        contours = []
+        for k, shape_m in enumerate(self._late_shapes(x, errors)):
+            used, view = pairs.is_compared[k], pairs._view(k, errors)
+            at_m = np.einsum("pa,pai->pi", pairs.weights[k, used], shape_m[pairs.nodes[k, used]])
+            contours.append(view.camera.distorted_pixels(view.to_camera_m(at_m)))
+        return contours
+
     def reassociated(self, x: Array, phi: Array) -> OutlinePairs:
         """Return the pairs for the shapes that the first rows reach."""
         errors = self._errors(phi)

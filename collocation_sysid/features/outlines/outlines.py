@@ -81,7 +81,11 @@ class Outlines(CameraImages):
         where = f"the outlines '{self.name}'"
         times = self._checked_times(where)
         if not self.has_known_pose:
-            raise InputError(f"the pose of {where} is unknown; expected the pose of the camera")
+            raise InputError(
+                f"the pose of {where} is unknown, and a body may have the same outline from several "
+                "sides; expected the pose of the camera, such as that which a solve with image_tracks "
+                "of at least four points in the same images notes"
+            )
         masks: list[Mask | None] = [None] * len(times)
         if self.masks is not None:
             if len(self.masks) != len(times):
@@ -228,6 +232,13 @@ class Outlines(CameraImages):
             for k, t_s in zip(nearest, self.sample_times_s, strict=True)
         ]
         return json.dumps([encoded(mask) for mask in masks])
+
+
+def edge_pixels(mask: Mask) -> Array:
+    """Return the pixels u, v (P, 2) of a mask (rows, columns) beside which the body ends."""
+    inner = np.pad(mask, 1)
+    inner = inner[:-2, 1:-1] & inner[2:, 1:-1] & inner[1:-1, :-2] & inner[1:-1, 2:]
+    return np.argwhere(mask & ~inner)[:, ::-1].astype(float)
 
 
 def mask_of(

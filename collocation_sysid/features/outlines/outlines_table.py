@@ -66,8 +66,9 @@ class OutlinesSection(MeasurementSection, of=Outlines):
         """
         if self.camera.pose == "unknown":
             raise InputError(
-                'found "unknown"; expected the pose of the camera, for outlines also that which '
-                "tracks of the same camera have found",
+                'found "unknown", but a body may have the same outline from several sides; expected '
+                "the pose of the camera, such as that which a solve with image_tracks of at least "
+                "four points with places_m in the same images notes",
                 where=f"{where}.camera.pose",
             )
         camera = self.camera.read(folder, f"{where}.camera")

@@ -1,5 +1,5 @@
 """Points of a depth camera over outlines of the body's surface, and their distances from the
-surface.
+surface; edges of masks and contours of the body.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from ...common.array_types import Array
 from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
 from ..replay import MotionRecord, image_key
 
-# Beginning of the names of pictures; `features.cameras.feature` has their caption.
+# Beginnings of the names of pictures.
 KIND = "depth"
+OUTLINE_KIND = "outline"
 # Name of the points in the legend of a film.
 LEGEND_ENTRY = "depth image"
 # Millimetres in an inch, the unit of lengths in Matplotlib.
@@ -40,10 +41,36 @@ OUTLINE_MARGIN = 0.5
 
 
 def camera_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
-    """Yield name and picture of the images of each camera, named "depth_<experiment>_<camera>"."""
+    """Yield name and picture of the images of each camera, named "depth_<experiment>_<camera>", or
+    "outline_<experiment>_<camera>" for masks.
+    """
     for name, rows in replay.visible_points.items():
         unit = replay.reading_units.get(image_key(name), "")
         yield f"{KIND}_{replay.name}_{name}", depth_picture(rows, unit)
+    for name, rows in replay.outlines.items():
+        yield f"{OUTLINE_KIND}_{replay.name}_{name}", outline_picture(rows)
+
+
+def outline_picture(rows: Array) -> Figure:
+    """Return a figure of the edges of masks (grey) and the contour of the body (red), side by side
+    for all images; `rows` (k, 4) are those of `MotionRecord.outlines`.
+    """
+    times = np.unique(rows[:, 0])
+    if not len(times):
+        return _sentence_figure("no image has a mask")
+    axes, dot = _new_panels(rows[:, [0, 2, 3]], times, rows=1)
+    for panel, t_s in zip(axes[0], times, strict=True):
+        here = rows[rows[:, 0] == t_s]
+        for kind, colour in enumerate(("0.6", VERMILION)):
+            pixels = here[here[:, 1] == kind, 2:]
+            panel.scatter(*pixels.T, s=dot * (1 + kind), color=colour, linewidths=0)
+        panel.invert_yaxis()
+        panel.set(aspect="equal", title=f"t = {t_s:.4g} s" if len(times) > 1 else "")
+        panel.title.set_fontsize(SMALL_PT)
+        panel.tick_params(labelsize=SMALL_PT, width=0.6)
+        panel.set_xlabel("u [px]", fontsize=SMALL_PT)
+    axes[0, 0].set_ylabel("v [px]", fontsize=SMALL_PT)
+    return axes[0, 0].figure
 
 
 def depth_picture(rows: Array, unit: str = "") -> Figure:
