@@ -48,7 +48,12 @@ from .runs.solving import (
     with_workers,
 )
 from .runs.warm_start import WarmStart
-from .statistics.assessment import WITHIN_BUDGET, fit_concerns, rotation_step_concerns
+from .statistics.assessment import (
+    WITHIN_BUDGET,
+    fit_concerns,
+    impact_step_concerns,
+    rotation_step_concerns,
+)
 from .statistics.budget.consider_analysis import (
     ResidualChanges,
     changes_of_assumptions,
@@ -294,16 +299,19 @@ def _with_problem_notes(answer: Run) -> Run:
     """
     problem = answer.problem
     substeps = answer.solution.collocation.substeps
-    rotations = (
+    coarse = (
         concern.message
         for experiment in problem.experiments
-        for concern in rotation_step_concerns(experiment, substeps)
+        for concern in (
+            *rotation_step_concerns(experiment, substeps),
+            *impact_step_concerns(experiment, substeps),
+        )
     )
     tests = one_kind_notes(problem.experiments, problem.parameters)
     impacts = ()
     if problem.substeps == "auto" and problem.choose_first_substeps() > 1:
         impacts = (IMPACT_NOTE.format(substeps),)
-    return replace(answer, notes=(*rotations, *impacts, *tests, *answer.notes))
+    return replace(answer, notes=(*coarse, *impacts, *tests, *answer.notes))
 
 
 def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:

@@ -22,6 +22,7 @@ from ..statistics.assessment import (
     clock_concerns,
     fit_concerns,
     forward_simulation_concerns,
+    impact_step_concerns,
     nuisance_concerns,
     onset_concerns,
     outlier_share_concerns,
@@ -81,6 +82,8 @@ def solution_concerns(
     status = solution.status
     yield from body_concerns(solution)
     if not status.converged:
+        for transcription in solution.collocation.transcriptions:
+            yield from impact_step_concerns(transcription.experiment, solution.collocation.substeps)
         yield Concern("solve/lost", "doubtful", data={"why": solution.message})
         return
     if status is Status.ACCEPTABLE:

@@ -399,6 +399,9 @@ TOPICS: dict[str, Topic] = {
             f"from {MODE}, which makes the estimated damping too high: {{remedy}}",
             "coarse": f"{MODE} has only {{steps:.1f}} time steps per period, which makes its "
             "period {error:.0%} too long: {remedy}",
+            "impacts": "with {stated} time steps per sample the body of '{experiment}' moves by much "
+            "more than the noise of its markers in each of them, and may strike an obstacle: leave "
+            "out transcription.substeps, or state {needed}",
             "turn": f"{TURN}: raise transcription.substeps",
             "turns": f"{TURN} at t = {{time_s:.4g}} s ({{rate_rad_s:.3g}} rad/s). Steps follow "
             "the chord of a rotation instead of its arc, which biases the estimates, especially "

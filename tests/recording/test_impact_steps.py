@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.recording.impact_steps import MOST_IMPACT_STEPS, impact_steps
+from collocation_sysid.statistics.assessment import impact_step_concerns
 
 SIGMA_M = 1e-3
 DOWN_M_S = np.array([0.0, 0.0, -1.0])
@@ -60,3 +62,13 @@ def test_a_problem_uses_these_steps_unless_it_states_others():
     assert cs.Problem([fall], law, substeps=2).collocation().substeps == 2
     free = replace(fall, grasps=())
     assert cs.Problem([free], law).collocation().substeps == 1
+
+
+def test_few_stated_steps_are_a_note_and_the_first_reason_of_a_failed_search():
+    fall = passing(0.975 * DOWN_M_S)
+    assert impact_step_concerns(fall, 5) == []
+    law = {"young_pa": cs.Unknown(1e5), "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}
+    run = cs.run(cs.Problem([fall], law, substeps=2), method=ReducedSpace(max_iterations=1))
+    assert run.trust.concerns[0].code == "scheme/impacts"
+    assert "or state 10" in run.trust.reasons[0]
+    assert run.trust.reasons[0] in run.notes
