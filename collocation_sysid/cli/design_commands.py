@@ -151,12 +151,15 @@ def plan(
     """
     from ..extras.planning import Task, plan_motion
     from ..extras.planning.plan_folder import PLAN_FILE, plan_json, plan_summary, write_plan
+    from ..extras.planning.trajectory_log import require_trajectory_packages
 
     if rate is not None and not 0 < rate < float("inf"):
         raise InputError(
             f"found {rate:g}; expected a number of hertz above 0", None, where="--rate"
         )
     folder = out or Path("runs") / f"{run_name(source)}-plan"
+    if mcap:
+        require_trajectory_packages()
     followed, allowed = Task.read(task), None if limits is None else Limits.read(limits)
     require_possible(folder)
     require_replaceable(folder, marker_file=PLAN_FILE, content_word="plan")

@@ -618,7 +618,7 @@ def prediction_concerns(
     size: str = "",
 ) -> list[Concern]:
     """Return a concern if a prediction, for which nothing was fitted, differs from the measurements
-    by more than chance and a limit; else an empty list.
+    by more than chance and a limit, or is much closer to them than their noise; else an empty list.
 
     Parameters
     ----------
@@ -638,17 +638,25 @@ def prediction_concerns(
     size : str
         Root mean square difference with its unit, for the message; "" leaves it out.
     """
-    is_chance = float(chi2_sf(count * robust_sigmas**2, count)) > RARE
-    return concern_if(
-        robust_sigmas > MISFIT and not is_chance,
-        robust_sigmas > GROSS_MISFIT,
-        code="prediction/misses",
-        experiment=name,
-        what=what,
-        stated=sigma_key,
-        sigmas=sigmas,
-        size=f"{size}, " if size else "",
-    )
+    squares = count * robust_sigmas**2
+    is_chance = float(chi2_sf(squares, count)) > RARE
+    is_closer = 0 < robust_sigmas < 1 / GROSS_MISFIT and 1 - float(chi2_sf(squares, count)) < RARE
+    data = {
+        "experiment": name,
+        "what": what,
+        "stated": sigma_key,
+        "sigmas": sigmas,
+        "size": f"{size}, " if size else "",
+    }
+    return [
+        *concern_if(
+            robust_sigmas > MISFIT and not is_chance,
+            robust_sigmas > GROSS_MISFIT,
+            code="prediction/misses",
+            **data,
+        ),
+        *concern_if(is_closer, False, code="prediction/closer", **data),
+    ]
 
 
 def stability_concerns(instabilities: Iterable[Instability]) -> list[Concern]:

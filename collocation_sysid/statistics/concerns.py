@@ -478,7 +478,10 @@ TOPICS: dict[str, Topic] = {
         "parameter.",
         messages={
             "misses": "the prediction of '{experiment}' deviates from {what} by {size}{sigmas:.2g} "
-            "times {stated}: check the stated parameters, {stated}, and what the model lacks"
+            "times {stated}: check the stated parameters, {stated}, and what the model lacks",
+            "closer": "the prediction of '{experiment}' deviates from {what} by {size}only "
+            "{sigmas:.2g} times {stated}: measurements scatter more; are these the predicted values, "
+            "or is {stated} too large?",
         },
     ),
     "memory": Topic(

@@ -1266,6 +1266,12 @@ def test_mistakes_in_task_files_are_explained(tmp_path: Path, line, instead, mes
     assert "task.toml" in str(caught.value)
 
 
+def path(*places: tuple[float, float, float]) -> dict:
+    """A reference of the tip through some places, at times from zero on."""
+    ends = [*places, *places][:2]
+    return {"point": "tip", "t_s": [0.0, 0.8], "position_m": ends}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -1285,6 +1291,14 @@ def test_mistakes_in_task_files_are_explained(tmp_path: Path, line, instead, mes
         (
             {"reference": [{"point_m": (1.0, 0.0, 0.0), "hold": True}]},
             "away from the body",
+        ),
+        (
+            {"reference": [path((0.3, 0.0, 0.0))], "largest_error_m": 1e-3},
+            "begins .* m away, but the point rests at .*relative = true",
+        ),
+        (
+            {"reference": [path((0.0, 0.0, 0.0), (50.0, 0.0, 0.0)) | {"relative": True}]},
+            "found positions 50 m away .*millimetres",
         ),
     ],
 )  # fmt: skip

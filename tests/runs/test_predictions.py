@@ -81,6 +81,16 @@ def test_few_numbers_that_are_off_by_chance_are_no_concern():
     assert grades(6.0, 1000, tame=1.2) == []  # a few wild points
 
 
+def test_measurements_that_are_the_predicted_values_are_noticed():
+    def codes(sigmas: float, numbers: int) -> list[str]:
+        how = sigmas, sigmas, numbers
+        return [c.code for c in prediction_concerns("a", "the markers", "sigma_m", *how)]
+
+    assert codes(0.04, 1000) == ["prediction/closer"]
+    assert codes(0.5, 1000) == []  # sigma is known to a factor of two at best
+    assert codes(0.04, 2) == []  # two numbers may be so close by chance
+
+
 # Depth --------------------------------------------------------------------------------------------
 
 BAR_TRUTH = {"young_pa": 1.5e5, "poisson": 0.3, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}

@@ -39,7 +39,15 @@ from .body_limits import BodyLimits
 from .planned_body import PlannedBody
 from .signals import Signal, task_signals
 from .spline_motion import HAND, LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
-from .task import AXES, Reference, Task, point_names, point_places, sampled_references
+from .task import (
+    AXES,
+    Reference,
+    Task,
+    point_names,
+    point_places,
+    require_reachable_starts,
+    sampled_references,
+)
 
 # Fewest and largest numbers of samples of a plan.
 FEWEST_SAMPLES, MOST_SAMPLES = 10, 20_000
@@ -228,6 +236,8 @@ class PlannedProgram:
         index = {name: k for k, name in enumerate(points)}
         first = started[[index[name] for name in names]] if names else np.zeros((0, 3))
         references = sampled_references(task, since_s, places, first)
+        size_m = float(np.ptp(start.reshape(-1, 3), axis=0).max())
+        require_reachable_starts(task, references, first, size_m)
         hand = experiment, driven, space, start, references, lowest_hz, signals
         program = cls(body, task, limits, *hand, pose_limits)
         program.require_start_within_limits()

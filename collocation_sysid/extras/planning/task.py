@@ -38,6 +38,8 @@ AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 VELOCITY_COLUMNS = ("vx_m_s", "vy_m_s", "vz_m_s")
 Row = tuple[Boundless, Boundless, Boundless]
+# Distance of a reference from the body in sizes of the body beyond which it has another unit.
+MOST_BODIES = 20.0
 
 
 class ReferenceSection(Section):
@@ -549,7 +551,8 @@ def sampled_references(
             if times[0] < -1e-9 or times[-1] > t_s[-1] + 1e-9:
                 raise InputError(
                     f"the reference runs from {times[0]:g} s to {times[-1]:g} s, but the plan from "
-                    f"0 to {t_s[-1]:g} s; expected times within, or a longer duration_s",
+                    f"0 to {t_s[-1]:g} s (duration_s = {task.duration_s:g}, and a window of rest if the "
+                    "end is at rest); expected times within, or a longer duration_s",
                     None,
                     where=f"reference {number}: t_s",
                 )
@@ -570,6 +573,39 @@ def sampled_references(
             Reference(name, place_m, position, velocity, each.sigma_m, each.sigma_m_s)
         )
     return references
+
+
+def require_reachable_starts(
+    task: Task, references: list[Reference], start_m: Array, size_m: float
+) -> None:
+    """Raise an `InputError` for a reference that no plan can follow: it begins farther from the
+    resting point than the task's largest error, or is many bodies away.
+
+    Parameters
+    ----------
+    start_m : (P, 3) array
+        Positions of the points before the motion [m].
+    size_m : float
+        Largest extent of the body [m].
+    """
+    for number, (each, first_m) in enumerate(zip(references, start_m, strict=True), 1):
+        away_m = np.linalg.norm(np.nan_to_num(each.position_m - first_m), axis=1)
+        resting = f"the point rests at {np.round(first_m, 4).tolist()} m"
+        if away_m.max(initial=0.0) > MOST_BODIES * size_m:
+            raise InputError(
+                f"found positions {away_m.max():.4g} m away from where {resting}, of a body of "
+                f"{size_m:.2g} m; expected metres: are these millimetres?",
+                None,
+                where=f"reference {number}: position_m",
+            )
+        if task.largest_error_m is not None and away_m[0] > task.largest_error_m:
+            raise InputError(
+                f"the reference begins {away_m[0]:.4g} m away, but {resting}, and the largest error "
+                f"is to be {task.largest_error_m:g} m; expected a path that begins there, relative = "
+                "true for positions relative to that, or a later from_s",
+                None,
+                where=f"reference {number}: position_m",
+            )
 
 
 def _interpolated(values: Array, times: Array, t_s: Array, kind: str) -> Array:

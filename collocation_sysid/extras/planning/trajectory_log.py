@@ -20,6 +20,13 @@ TRAJECTORY_TOPIC, POSE_TOPIC, COMMAND_TOPIC = "/hand_trajectory", "/hand_pose", 
 FRAME, JOINT = "world", "hand"
 
 
+def require_trajectory_packages() -> None:
+    """Raise an `InputError` with installation instructions if a package is missing that writes a
+    trajectory.
+    """
+    require_packages("rosbags", "mcap")
+
+
 def write_trajectory_mcap(plan: MotionPlan, path: str | Path, t_s: Array) -> None:
     """Write a file with one trajectory_msgs/MultiDOFJointTrajectory on /hand_trajectory, at time 0,
     and at each of the times (P,) since the start [s] a geometry_msgs/PoseStamped on /hand_pose and
@@ -34,7 +41,7 @@ def write_trajectory_mcap(plan: MotionPlan, path: str | Path, t_s: Array) -> Non
     InputError
         If the package rosbags is not installed.
     """
-    require_packages("rosbags", "mcap")
+    require_trajectory_packages()
     from rosbags.rosbag2 import Writer
     from rosbags.rosbag2.enums import StoragePlugin
     from rosbags.typesys import Stores, get_typestore

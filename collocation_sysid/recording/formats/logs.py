@@ -21,12 +21,12 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.files import reason, require_regular
-from ...errors import InputError, hint_at
+from ...errors import InputError, hint_at, listed
 
 TOPIC_SEPARATOR = "#"
 # Of the positions of joints.
 ANGLE_UNITS = ("rad", "deg")
-_NEEDS = "reading logs needs {}: pip install 'collocation-sysid[logs]'"
+_NEEDS = "logs and trajectories of robots need {}: pip install 'collocation-sysid[logs]'"
 
 
 @dataclass(frozen=True)
@@ -169,9 +169,8 @@ def require_packages(*modules: str) -> None:
     """Raise an `InputError` with installation instructions if a package is missing; packages are
     not imported.
     """
-    for module in modules:
-        if find_spec(module) is None:
-            raise InputError(_NEEDS.format(module))
+    if missing := [module for module in modules if find_spec(module) is None]:
+        raise InputError(_NEEDS.format(listed(missing)))
 
 
 class _Bag:
