@@ -24,7 +24,13 @@ from .command_options import (
     command,
     option,
 )
-from .common import EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console, shown_progress
+from .common import (
+    EXIT_INTERRUPTED,
+    EXIT_NOT_CONVERGED,
+    error_console,
+    interruption_exit,
+    shown_progress,
+)
 
 commands = typer.Typer()
 
@@ -178,6 +184,12 @@ def plan(
                     f"iteration {number}, objective {value:.4g} (Ctrl-C keeps the best)"
                 ),
             )
+        except KeyboardInterrupt:
+            raise interruption_exit(
+                f"nothing was written to {folder}, because no plan was found, or it was not simulated "
+                "to its end",
+                continues=False,
+            ) from None
         except InputError as error:
             if error.source is not None:
                 raise

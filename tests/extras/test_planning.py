@@ -1543,6 +1543,23 @@ def test_a_point_is_held_still_while_the_hand_moves():
     assert plan.tracking_error(plan.program.references[0]).largest_m < 3e-3
 
 
+def test_an_interrupt_before_a_plan_is_simulated_writes_nothing(tmp_path, monkeypatch):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(motion_plan, "simulate", interrupt)
+    problem = write_problem(tmp_path, {"swing": 10})
+    (tmp_path / "task.toml").write_text(GOOD)
+    (tmp_path / "limits.toml").write_text(LIMITS_TEXT)
+    outcome = run_command(
+        "plan", problem, tmp_path / "task.toml", "--limits", tmp_path / "limits.toml",
+        "--out", tmp_path / "plan", "-q",
+    )  # fmt: skip
+    assert outcome.code == 130
+    assert "interrupted: nothing was written to" in outcome.err
+    assert not (tmp_path / "plan").exists()
+
+
 @pytest.mark.long
 def test_the_folder_of_a_plan_checks_its_execution_and_identifies_from_it(tmp_path: Path):
     problem = write_problem(tmp_path, {"swing": 10})

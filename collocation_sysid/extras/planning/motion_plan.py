@@ -93,7 +93,7 @@ class BindingLimit(NamedTuple):
     gain_per_percent: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MotionPlan:
     """Planned motion.
 
@@ -117,6 +117,13 @@ class MotionPlan:
     fine: Trajectory
     seconds: float
     sufficient_duration_s: float | None = None
+
+    def __repr__(self) -> str:
+        errors = (self.tracking_error(each) for each in self.program.references)
+        return (
+            f"<MotionPlan of {self.program.task.duration_s:.3g} s, {self.answer.status}, largest error "
+            f"{1e3 * max((each.largest_m for each in errors), default=0.0):.3g} mm>"
+        )
 
     @property
     def interrupted(self) -> bool:
