@@ -165,6 +165,23 @@ def test_a_gripper_that_holds_less_of_the_body_leaves_a_longer_bar():
     assert expected == pytest.approx(simulated, rel=0.2)
 
 
+def test_the_edge_of_a_gripper_that_surrounds_a_part_of_the_body_is_where_it_ends():
+    short, long = hanging_bar(15), hanging_bar(16)
+    held = np.flatnonzero(long.body.nodes_m[:, 2] > 0.075 - 1e-9)
+    surrounded = replace(long, grasps=[Grasp(held, PoseSequence.fixed())])
+    np.testing.assert_allclose(
+        changed(surrounded, "grasp_edge_m"), changed(short, "grasp_edge_m"), rtol=1e-6, atol=1e-9
+    )
+
+
+def test_the_effect_of_an_edge_does_not_jump_where_the_gripper_lets_go():
+    held = swung()
+    (grasp,) = held.grasps
+    released = replace(held, grasps=[replace(grasp, until_s=float(held.t_s[16]))])
+    after = np.abs(changed(released, "grasp_edge_m"))[17:].max()
+    assert 0 < after < np.abs(changed(held, "grasp_edge_m")).max()
+
+
 def test_the_edge_of_a_platen_is_the_face_of_the_specimen():
     assert changed(block("xyz"), "grip_layer_m").any()
     assert not changed(block("xyz"), "grasp_edge_m").any()

@@ -344,18 +344,17 @@ class ExperimentAtAnswer:
 
     @cached_property
     def effect_of_grips(self) -> Effect | None:
-        """Effect of grippers that hold the body at one metre outside the faces that they hold, while
-        they hold it; None without such faces. A grasp that prescribes some axes only is a platen or
-        a plane of symmetry, not a gripper.
+        """Effect of grippers that hold the body at one metre outside the faces that they hold; None
+        without such faces. The body is longer there before and after they hold it, too.
+
+        A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
         """
-        experiment = self.iterate.transcription.experiment
-        grippers = [each for each in experiment.body_grasps if len(each.axes) == len(_AXES)]
-        if not grippers:
+        holding = self.iterate.transcription.experiment.body_grasps
+        gripped = [grasp.nodes for grasp in holding if len(grasp.axes) == len(_AXES)]
+        if not gripped:
             return None
         body = self.body
-        is_held = np.isin(
-            np.arange(len(body.nodes_m)), np.concatenate([each.nodes for each in grippers])
-        )
+        is_held = np.isin(np.arange(len(body.nodes_m)), np.concatenate(gripped))
         cells = body.mesh.tetrahedra
         faces, _ = boundary_of(cells[~is_held[cells].all(axis=1)])
         faces = faces[is_held[faces].all(axis=1)]
@@ -365,18 +364,7 @@ class ExperimentAtAnswer:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         if not length.any():
             return None
-        np.divide(normals, length, out=normals, where=length > 0)
-        force_n = np.zeros_like(self.iterate.x)
-        displacement_m = np.zeros_like(self.grasp_force_n)
-        for grasp in grippers:
-            is_own = np.isin(np.arange(len(normals)), grasp.nodes)
-            effect = shape_effect(self, np.where(is_own[:, None], normals, 0.0))
-            assert effect.force_n is not None
-            assert effect.displacement_m is not None
-            active = grasp.is_active(self.dynamics.t_s[: len(force_n)])
-            force_n[active] += effect.force_n[active]
-            displacement_m += effect.displacement_m
-        return Effect(force_n, displacement_m=displacement_m)
+        return shape_effect(self, np.divide(normals, length, out=normals, where=length > 0))
 
     @cached_property
     def proportional_s(self) -> Array:
