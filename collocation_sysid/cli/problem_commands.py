@@ -243,7 +243,8 @@ def check(
     out: Annotated[
         Path | None,
         option(
-            "Folder for pictures of the cameras' images; runs/<problem>_check by default.", "DIR"
+            "Folder for pictures of the images of depth cameras; runs/<problem>_check by default.",
+            "DIR",
         ),
     ] = None,
     source: ProblemOptions,
@@ -255,7 +256,7 @@ def check(
     of a solve and a simulation at the guess follow. If a simulation of the complete recordings
     would take more than ten seconds, only their first samples are simulated.
 
-    For each camera, a picture shows the first image and the undeformed body. The pictures are
+    For each depth camera, a picture shows the first image and the undeformed body. The pictures are
     written into runs/NAME_check by default; with --json no pictures are written.
 
     The exit code is 0, and 1 if derivatives disagree or the description is probably wrong, 2 for

@@ -259,14 +259,16 @@ def main(arguments: list[str] | None = None) -> None:
     """Track the points of a video and write their table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("video", type=Path, help="video, or folder of images")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True, help="table of tracks, CSV")
     parser.add_argument("--mask", type=Path, help="image that is not black where the body is")
-    parser.add_argument("--most", type=int, default=30)
-    parser.add_argument("--points", default="")
-    parser.add_argument("--tags", default="")
-    parser.add_argument("--rate-hz", type=float)
-    parser.add_argument("--lost", type=float, default=2.0)
-    parser.add_argument("--film", type=Path)
+    parser.add_argument("--most", type=int, default=30, help="largest number of corners")
+    parser.add_argument("--points", default="", help='stated points, "tip=612,388;hook=540,401"')
+    parser.add_argument("--tags", default="", help="dictionary of ArUco or AprilTag markers")
+    parser.add_argument("--rate-hz", type=float, help="frame rate; that of the video by default")
+    parser.add_argument(
+        "--lost", type=float, default=2.0, help="pixels by which the way back may miss a point"
+    )
+    parser.add_argument("--film", type=Path, help="film with the points drawn into the video")
     options = parser.parse_args(arguments)
     cv2 = opencv()
     if options.tags:

@@ -88,6 +88,7 @@ WIDE = "t_s,low_u,low_v,mid_u,mid_v,mid_likelihood\n" + "".join(
     for k in range(8)
 )
 FRAMES = WIDE.replace("t_s", "frame", 1)
+EXCHANGED = WIDE.replace("_u", "_x").replace("_v", "_u").replace("_x", "_v").replace("600", "1000")
 
 
 def test_unlikely_pixels_are_missing(filmed: Path) -> None:
@@ -109,6 +110,13 @@ def test_unlikely_pixels_are_missing(filmed: Path) -> None:
             r"0 .* multiply the first two rows of the matrix by 0.5",
         ),
         ("", "", WIDE.replace("600", "2600"), r"file: .* of the pixels are outside of the images"),
+        ("", "", EXCHANGED, r"file: .* u and v fit if they are exchanged"),
+        (
+            "size_px = [1280, 720]",
+            "",
+            WIDE.replace("600", "2600"),
+            r"file: .* state size_px, the size of the video",
+        ),
         ("", "", FRAMES, r"frame_rate_hz: missing, but swing_reading_front.csv has no times"),
         ("size_px = [1280, 720]", "frame_rate_hz = 30", WIDE, r"frame_rate_hz: found a frame rate"),
         ("low = [0.02", "lower = [0.02", WIDE, r"places_m: found 'lower', which is not in swing"),

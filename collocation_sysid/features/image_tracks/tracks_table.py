@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -249,15 +250,25 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
                 f"is for {size[0]} x {size[1]}; expected the same size: {remedy}",
                 where=f"{where}.size_px",
             )
-        known = np.isfinite(pixels).all(axis=2)
-        with np.errstate(invalid="ignore"):
-            outside = known & ((pixels < -0.5) | (pixels > np.array(size) - 0.5)).any(axis=2)
-        share = outside.sum() / max(1, known.sum())
+        share = share_outside(pixels, size)
         if share > MOST_OUTSIDE:
             largest = np.nanmax(pixels, axis=(0, 1))
+            remedy = ""
+            if share_outside(pixels[..., ::-1], size) <= MOST_OUTSIDE:
+                remedy = ": u and v fit if they are exchanged"
+            elif self.size_px is None:
+                remedy = "; state size_px, the size of the video, which may be another one"
             raise InputError(
                 f"{share:.0%} of the pixels are outside of the images of {size[0]} x {size[1]} "
                 f"pixels of the calibration (largest u, v: {largest[0]:.0f}, {largest[1]:.0f}); "
-                "expected tracks of images of this size, with u to the right and v downwards",
+                f"expected tracks of images of this size, with u to the right and v downwards{remedy}",
                 where=f"{where}.file",
             )
+
+
+def share_outside(pixels: Array, size_px: Sequence[int]) -> float:
+    """Return the share of the known pixels (…, 2) that are outside of images of a size."""
+    known = np.isfinite(pixels).all(axis=-1)
+    with np.errstate(invalid="ignore"):
+        outside = known & ((pixels < -0.5) | (pixels > np.array(size_px) - 0.5)).any(axis=-1)
+    return float(outside.sum() / max(1, known.sum()))
