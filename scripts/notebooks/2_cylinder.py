@@ -29,6 +29,7 @@
 #   interior-point method;
 # - a forward simulation verifies a solution;
 # - the time integration scheme affects the estimates of a finite element model;
+# - an ordinary camera replaces motion capture;
 # - to write a problem file for your own data, check it, and solve it.
 #
 # **Prerequisites:** part 1, or familiarity with direct collocation and finite elements.
@@ -281,8 +282,65 @@ assert abs(solutions["midpoint", 2].parameters["gamma_m_1_s"] / 1.5 - 1) < 0.1
 # biased. The RMS distance of about twice the noise indicates the error. With four substeps the
 # moduli are nearly correct. The estimate of $\gamma_r$ is still too small, and the RMS distance
 # no longer indicates this error.
+
+# %% [markdown]
+# ## 2.5 A camera instead of motion capture
 #
-# ## 2.5 Bring your own data
+# An ordinary camera measures pixels, not positions. `cs.Camera` states its calibration and pose,
+# and `cs.ImageTracks` the pixels of points that a program has tracked in the video. Here a camera
+# at a distance of 0.6 m films 22 dots on the side of the cylinder that it sees. Their pixels are
+# simulated with the true parameters, and noise of 0.5 pixels is added:
+
+# %%
+(swing,) = problem.experiments
+nodes_m = swing.body.nodes_m
+dots_m = nodes_m[(nodes_m[:, 1] > 0.02) & (nodes_m[:, 2] > 0.01)]
+names = [f"dot_{number}" for number in range(len(dots_m))]
+camera_pose = np.eye(4)  # x to the right, y downwards, z forward
+camera_pose[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T
+camera_pose[:3, 3] = [0.02, -0.6, -0.08]
+camera = cs.Camera(
+    [[1000, 0, 640], [0, 1000, 360], [0, 0, 1]], pose=camera_pose, size_px=(1280, 720)
+)
+film = cs.ImageTracks("phone", camera, swing.t_s, None, names, places_m=dots_m, sigma_px=0.5)
+filmed = replace(swing, markers=None, readings=[film])
+true_parameters = {name: TRUE_VALUES[name] for name in solution.parameters if name in TRUE_VALUES}
+simulated = cs.simulate(filmed, true_parameters, "midpoint", substeps=2)
+pixels = simulated.custom_sensor_values[0].reshape(len(swing.t_s), len(names), 2)
+pixels = pixels + np.random.default_rng(2).normal(scale=0.5, size=pixels.shape)
+
+# %%
+figure, axes = plt.subplots(figsize=(3.4, 2.6))
+axes.plot(*pixels.transpose(2, 0, 1), color=SKY, linewidth=0.6)
+axes.plot(*pixels[0].T, ".", color=BLUE, label="first image")
+axes.plot(*pixels[-1].T, ".", color=VERMILION, label="last image")
+axes.set(xlabel="u [px]", ylabel="v [px]", aspect="equal", title="Tracks of 22 dots in the video")
+axes.invert_yaxis()
+axes.legend()
+plt.show()
+
+# %% [markdown]
+# The tracks replace the markers. What is uncertain about a camera is estimated with the parameters:
+# here the pose (1°, 5 mm), the focal length (0.5 %), the principal point (2 pixels), the clock
+# (5 ms) and the places of the dots (1 mm).
+
+# %%
+tracked = replace(filmed, readings=[replace(film, pixels=pixels)])
+by_camera = cs.solve(replace(problem, experiments=(tracked,)), "reduced-space")
+assert by_camera.status.converged
+print("            true   markers    camera")
+for name, value in true_parameters.items():
+    markers_value, camera_value = (each.parameters[name] for each in (solution, by_camera))
+    print(f"{name:11} {value:5.4g} {markers_value:9.4g} {camera_value:9.4g}")
+assert abs(by_camera.parameters["mu_pa"] / TRUE_VALUES["mu_pa"] - 1) < 0.05
+
+# %% [markdown]
+# In a problem file the tracks are a table `[[experiment.image_tracks]]`; the page
+# [From a phone video to a modulus](../../docs/howto/image_tracks.md) leads from filming to the
+# answer, also where neither the places of the points nor the pose of the camera are known.
+
+# %% [markdown]
+# ## 2.6 Bring your own data
 #
 # Three data files and a problem file are needed:
 #
