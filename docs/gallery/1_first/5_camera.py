@@ -5,6 +5,9 @@ One camera, no motion capture
 A bar hangs from a hand that swings it, and one ordinary camera films it. Ten points on its skin are
 tracked in the film; where they are on the body, nobody has measured. The stated pose of the camera
 is wrong by about 1° and 5 mm.
+
+The film is simulated here. ``collocation-sysid new bar --kind video`` writes a problem with a video
+that MuJoCo has rendered and ``track_video`` has tracked, programs that this page does not need.
 """
 
 # sphinx_gallery_thumbnail_path = 'pictures/5_camera.png'
