@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,9 @@ from kit.problems import smooth_poses, times
 import collocation_sysid as cs
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.result.run_summary import effect_of_remedy
+from collocation_sysid.runs import expected_precision
 from collocation_sysid.runs.expected_precision import added_measurements
+from collocation_sysid.runs.result_builder import build_result
 from collocation_sysid.statistics.combinations import find_combinations, lone_constants
 
 TRUTH = {"young_pa": 800.0, "poisson": 0.33, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -72,8 +75,8 @@ def short_swing(name, rng, count=12, force=False):
     return replace(swing, grasps=[grasp], markers=replace(markers, positions_m=seen_m))
 
 
-def half_width(run):
-    lower, upper = run.estimates["gamma_m_1_s"].combined95
+def half_width(run, name="gamma_m_1_s"):
+    lower, upper = run.estimates[name].combined95
     return np.log(upper / lower) / 2
 
 
@@ -92,6 +95,72 @@ def test_a_swing_may_be_recorded_again_and_held_longer():
     np.testing.assert_allclose(longer.t_s, 0.01 * np.arange(9))
     rotations, _ = longer.grasps[0].poses.at(longer.t_s)
     np.testing.assert_allclose(rotations[4:], np.broadcast_to(rotations[4], (5, 3, 3)))
+
+
+@pytest.mark.long
+def test_a_longer_recording_determines_what_it_promises(monkeypatch):
+    rng = np.random.default_rng(2)
+    run = run_of([short_swing("first", rng)])
+    (found,), solution = run.combinations, run.solution
+    (longer,) = (
+        (what, each)
+        for what, each in added_measurements(solution.collocation, solution.z)
+        if what.endswith("held as long again at its end")
+    )
+    monkeypatch.setattr(expected_precision, "added_measurements", lambda *_: [longer])
+    (promised,) = expected_precision.with_measurements(
+        [replace(found, fixes=())], solution.collocation, solution.z, run.problem.assumed_deviations
+    )
+    *_, added = longer[1]
+    seen_m = cs.simulate(added, TRUTH).markers_m
+    seen_m = seen_m + SIGMA_M * rng.normal(size=seen_m.shape)
+    recorded = replace(added, markers=replace(added.markers, positions_m=seen_m))
+    followed = run_of([run.problem.experiments[0], recorded])
+    assert half_width(followed) == pytest.approx(np.log(promised.fixes[0].factor), rel=0.3)
+    assert half_width(followed) < 0.8 * half_width(run)
+
+
+@pytest.mark.long
+def test_a_known_value_determines_what_it_promises():
+    truth = {"lambda_pa": 1e5, "mu_pa": 1e5}
+    strain = np.linspace(0.02, 0.2, 9)
+    blank = cs.Specimen("uniaxial", strain, 0 * strain, 1.0, area_error=0.0, strain_zero=0.0)
+    (stress_pa,) = cs.simulate(blank.experiment("neo-hookean"), truth).custom_sensor_values
+    sigma_pa = 0.01 * np.abs(stress_pa).max()
+    noise_pa = sigma_pa * np.random.default_rng(3).normal(size=len(strain))
+    pulled = replace(blank, stress_pa=stress_pa[:, 0] + noise_pa, sigma_pa=sigma_pa)
+    options = cs.UncertaintyOptions(noise="given", assumptions=cs.Assumptions.exact())
+
+    def tested(**unknown):
+        both = {name: cs.Unknown(value) for name, value in truth.items()} | unknown
+        return cs.run(cs.Problem([pulled.experiment("neo-hookean")], both, uncertainty=options))
+
+    run = tested()
+    (found,) = run.combinations
+    (fix,) = (each for each in found.fixes if each.what.endswith("known to 5%"))
+    (known,) = {"lambda_pa", "mu_pa"} - {fix.name}
+    value = run.solution.parameters[known]
+    followed = tested(**{known: cs.Unknown(value, prior=(value, 0.05))})
+    assert half_width(followed, fix.name) == pytest.approx(np.log(fix.factor), rel=0.1)
+
+
+@pytest.mark.long
+def test_an_assumption_that_is_known_has_the_stated_effect():
+    swing = short_swing("first", np.random.default_rng(4), count=24)
+
+    def run_with(**deviations):
+        assumptions = replace(cs.Assumptions.exact(), **deviations)
+        options = cs.UncertaintyOptions(noise="given", assumptions=assumptions)
+        unknown = {"young_pa": cs.Unknown(700.0)}
+        return cs.run(cs.Problem([swing], TRUTH | unknown, uncertainty=options))
+
+    doubtful = run_with(mass=0.6, density_gradient=0.05)
+    result = build_result(doubtful)
+    assert not result.collect_estimates()["young_pa"].is_determined
+    assert next(iter(result.budget["young_pa"])) == "mass"
+    (stated,) = re.findall(r"±([\d.]+) %", effect_of_remedy(result, "young_pa"))
+    followed = half_width(run_with(density_gradient=0.05), "young_pa")
+    assert 100 * np.expm1(followed) == pytest.approx(float(stated), rel=0.2)
 
 
 @pytest.mark.long
