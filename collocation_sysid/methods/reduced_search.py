@@ -28,6 +28,7 @@ from .trajectory_sweeps import FitSummary
 
 if TYPE_CHECKING:
     from ..program.collocation import Collocation
+    from ..program.transcription import Transcription
     from .experiment_executors import ExperimentExecutor
 
 # Largest infeasibility of a trial over the length of its step.
@@ -132,6 +133,12 @@ class SearchOptions(MethodOptions):
     rung_prior: Positive = 2.3
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     factorisation: Choice = "auto"
+
+
+def _oscillates(transcription: Transcription) -> bool:
+    """Return whether the recording is a table of moduli over frequency, for several branches."""
+    body = transcription.body
+    return body.memory.oscillates and any(len(part.prony) > 1 for part in body.parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,8 +285,16 @@ class ReducedSearch:
             self.trajectories = self.point = None
             return None
 
+    @property
+    def ladder(self) -> Shares:
+        """Shares of the recordings that are solved one after another: only the last one of the
+        options for tables of moduli over frequency, of which a part determines few branches.
+        """
+        complete = all(map(_oscillates, self.collocation.transcriptions))
+        return self.options.ladder[-1:] if complete else self.options.ladder
+
     def horizon_of_share(self, share: float) -> Horizon:
-        """Return the problem on a share of the recording, one of the `ladder` of the options."""
+        """Return the problem on a share of the recording, one of `ladder`."""
         rows = [
             samples_in_share(transcription.grid_times, share)
             for transcription in self.collocation.transcriptions

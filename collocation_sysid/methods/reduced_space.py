@@ -116,7 +116,7 @@ class ReducedSpace(SearchOptions):
             with time_limit(self.max_time_s):
                 status = search.solve_from_start()
                 is_started = status is not None
-                for share in () if is_started else self.ladder:
+                for share in () if is_started else search.ladder:
                     horizon = search.horizon_of_share(share)
                     search.extend_to(horizon)
                     status = search.minimise(horizon, share == self.ladder[-1])

@@ -33,6 +33,7 @@ from ...program.forward.newton_solver import NewtonOptions
 from ...program.transcription import Transcription
 from ..method_options import SHARES, samples_in_share
 from .initial_trajectories import simulate_trajectories
+from .memory_start import memory_start
 from .power_law import power_law_start
 
 # Largest Young's modulus of the scan [Pa].
@@ -121,7 +122,8 @@ def start_problem(
     "" if there was none.
 
     Specimens of laws in powers of the stretches without a guess start from `power_law_start`; the
-    note states which constants their measurements do not determine, which are then fixed.
+    note states which constants their measurements do not determine, which are then fixed. Tables of
+    moduli over frequency or time start from `memory_start`, unless the guesses are as good.
 
     Given guesses are kept, unless the body cannot be simulated with them, or it fits worse than an
     undeformed one and the scan finds initial values that fit clearly better (`CLEARLY_BETTER`).
@@ -138,6 +140,9 @@ def start_problem(
         If a modulus has no guess and the body cannot be simulated at any stiffness, or with
         `is_complete` to the end at none from the best one on.
     """
+    usual = typical_parameters(collocation.parameters, SOFT_PA)
+    if (of_memory := memory_start(collocation, usual)) is not None:
+        return collocation.with_parameters(of_memory), None, ""
     unguessed = collocation.parameters.list_names_without_guess()
     start = power_law_start(collocation) if unguessed else None
     if start is not None:
