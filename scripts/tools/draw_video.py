@@ -1,7 +1,5 @@
 """Draw the picture of the page on image tracks: the bar of the video template, rendered at rest by
 MuJoCo (EGL), with the tracks that the template has.
-
-    python scripts draw_video
 """
 
 from __future__ import annotations
@@ -13,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 from scipy.interpolate import CubicSpline
+from script_arguments import require_no_arguments
 
 from collocation_sysid.result.figure_style import SKY, VERMILION
 
@@ -48,4 +47,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    require_no_arguments(__doc__)
     main()

@@ -26,7 +26,7 @@ from kit.filmed import (
 
 import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
-from collocation_sysid.features.image_tracks.track_feature import track_hypotheses
+from collocation_sysid.features.image_tracks.track_feature import places_off_body, track_hypotheses
 from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
 
 TEMPLATE = Path(cs.__file__).parent / "problem/templates/video/problem.toml"
@@ -219,6 +219,20 @@ def test_lost_tracks_are_named(fault: str) -> None:
     found = [*track_hypotheses(residual, true, "'front'")]
     assert [each.code for each in found] == [f"image-track/{fault}"]
     assert words in found[0].message
+
+
+def test_a_place_that_is_estimated_off_the_body_is_named() -> None:
+    tracks = tracks_of(known=False)
+    program = cs.Problem([swung([tracks])], parameters=unknown_young()).collocation()
+    transcription = program.transcriptions[0]
+    (residual,) = transcription.residuals_of(ImageTrackResidual)
+    phi = transcription.compute_guess_phi()
+    assert not list(places_off_body(residual, phi, "'front'"))
+    place = residual.correspondences.coordinate_parameters[NAMES.index("tip_top")]
+    phi[place] += 0.1 / transcription.nuisance.scales[place]
+    (found,) = places_off_body(residual, phi, "'front'")
+    assert found.data["point"] == "tip_top"
+    assert found.data["off_mm"] > 6.0
 
 
 def test_good_tracks_are_not_doubted() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
+from ...recording.placement import nearest_points_of_triangles
 from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
 from ..feature import Feature
 from . import stated_cameras
@@ -24,6 +25,9 @@ EXPLAINED = 3.0
 STUCK = 0.25
 # Samples on each side of a jump.
 FEWEST_BESIDE = 3
+# Distance of an estimated place from the surface over the diagonal of the body, beyond which it is off
+# the body: wrong solutions of twins with unknown places had 0.06 to 0.2.
+OFF_BODY = 0.05
 # Ratio of the errors of two poses of a camera below which the second is nearly as good.
 SIMILAR_POSES = 2.0
 
@@ -35,6 +39,9 @@ MESSAGES = stated_cameras.MESSAGES | {
     "points",
     "description/image-track/jumps": "the track {point} jumps by {jump_px:.3g} pixels at {t_s:.4g} s: "
     "the tracker has lost the point; delete the samples after it",
+    "description/image-track/off-body": "the estimated place of the track {point} is {off_mm:.3g} mm "
+    "beyond the end of a side of the body, so that this is a wrong solution: state places_m of some "
+    "points, or a more accurate pose of the camera",
     "description/image-track/drifts": "the track {point} deviates by {sigmas:.2g} sigma_px (RMS), the "
     "others by {others:.2g}: the tracker has lost the point, or it is not on the body; leave it out "
     "with points",
@@ -50,7 +57,27 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
             if isinstance(reading, ImageTrackResidual):
                 predicted = reading.predict(values, part.phi)[..., :2]
                 of = f"'{reading.sensor.name}' of '{name}'"
+                yield from places_off_body(reading, part.phi, of)
                 yield from track_hypotheses(reading, predicted, of)
+
+
+def places_off_body(reading: ImageTrackResidual, phi: Array, of: str) -> Iterator[Hypothesis]:
+    """Yield the point of one camera whose estimated place at φ (k,) is farthest from the body, if it
+    is off the body.
+    """
+    places, body = reading.correspondences, reading.experiment.body
+    corners = body.nodes_m[body.mesh.surface]
+    size_m = float(np.linalg.norm(np.ptp(body.nodes_m, axis=0)))
+    off_m = np.zeros(len(places.is_placed))
+    for k in np.flatnonzero(places.is_placed).tolist():
+        place = places.places_m(phi)[k]
+        nearest = nearest_points_of_triangles(place, corners)
+        off_m[k] = np.linalg.norm(nearest - place, axis=1).min()
+    worst = int(off_m.argmax())
+    if off_m[worst] > OFF_BODY * size_m:
+        data = {"point": reading.sensor.names[worst], "off_mm": 1e3 * float(off_m[worst])}
+        strength = float(off_m[worst]) / (OFF_BODY * size_m)
+        yield Hypothesis("image-track/off-body", of, data=data, strength=strength)
 
 
 def track_hypotheses(
