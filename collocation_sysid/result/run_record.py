@@ -313,11 +313,11 @@ def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
     for residual in part.transcription.residuals_of(OutlinesResidual) if part is not None else ():
         contours = residual.contours_px(part.x, part.phi)
         masks = residual.sensor.all_masks[: len(contours)]
-        shown = [k for k, mask in enumerate(masks) if mask is not None]
+        shown = [(k, mask) for k, mask in enumerate(masks) if mask is not None]
         few = np.linspace(0, len(shown) - 1, MAX_OUTLINED_IMAGES).round().astype(int)
         rows = [np.zeros((0, 4))]
-        for k in (shown[n] for n in np.unique(few) if shown):
-            for kind, pixels in enumerate((edge_pixels(masks[k]), contours[k])):
+        for k, mask in (shown[n] for n in np.unique(few).tolist() if shown):
+            for kind, pixels in enumerate((edge_pixels(mask), contours[k])):
                 column = np.ones((len(pixels), 1))
                 rows.append(np.hstack([residual.t_s[k] * column, kind * column, pixels]))
         rows_by_camera[residual.sensor.name] = np.vstack(rows)
