@@ -18,6 +18,7 @@ from ..common.array_types import Array, Index
 from ..fem.laws.constants import GAMMA_M, without_region
 from ..model.dynamics import StencilRow
 from ..recording.experiment import Experiment
+from ..recording.measurement import Measurement
 from ..recording.poses import Poses, PoseSequence
 from .collocation import Collocation
 from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
@@ -150,7 +151,7 @@ class StreamingModel:
         still = self.transcription.experiment
         if self.transcription.reassociable:
             t_s = still.t_s
-            sampled = {
+            sampled: dict[Measurement, Measurement] = {
                 each: each.with_samples(t_s, np.tile(values[number], (len(t_s), 1)))
                 for number, each in enumerate(still.readings, 1)
                 if number in values and np.isfinite(values[number]).any()

@@ -309,8 +309,10 @@ def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
     `MotionRecord.outlines`, in at most `MAX_OUTLINED_IMAGES` images.
     """
     part = finished.solution.part_of(experiment)
+    if part is None:
+        return {}
     rows_by_camera = {}
-    for residual in part.transcription.residuals_of(OutlinesResidual) if part is not None else ():
+    for residual in part.transcription.residuals_of(OutlinesResidual):
         contours = residual.contours_px(part.x, part.phi)
         masks = residual.sensor.all_masks[: len(contours)]
         shown = [(k, mask) for k, mask in enumerate(masks) if mask is not None]

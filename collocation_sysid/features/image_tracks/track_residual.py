@@ -143,7 +143,7 @@ class ImageTrackResidual(CameraImagesResidual):
         rotations, translations = (
             np.repeat(each[:1], count, axis=0) for each in (places.rotations, places.translations)
         )
-        seen = other.is_compared[..., :2].all(axis=2)
+        seen = np.all(other.is_compared[..., :2], axis=2)
         visible = places.visible_points(
             other._shapes(known_x), translations, np.ones_like(seen), seen
         )
