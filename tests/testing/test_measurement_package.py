@@ -38,10 +38,12 @@ eyelet_m = [0.0, 0.3, 0.0]
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The package in tests/packages is installed."""
+    """The package in tests/packages is installed, and not imported yet."""
     monkeypatch.syspath_prepend(PACKAGES)
+    sys.modules.pop("string_potentiometer", None)
     registered_tables.cache_clear()
     yield
+    sys.modules.pop("string_potentiometer", None)
     registered_tables.cache_clear()
 
 
