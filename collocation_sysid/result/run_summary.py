@@ -52,7 +52,7 @@ from .run_sections import (
 # Derived moduli in the summary; others are in the details.
 SHOWN_MODULI = ("young_pa", "poisson", INSTANTANEOUS.name)
 # Reasons of the verdict in the summary, gravest first.
-SHOWN_REASONS = 4
+SHOWN_REASONS = 5
 # Sources of uncertainty in the summary, and the smallest share of a variance that counts.
 SHOWN_SOURCES = 3
 SMALLEST_SHOWN_SHARE = 0.01
