@@ -119,7 +119,7 @@ class ReducedSpace(SearchOptions):
                 for share in () if is_started else search.ladder:
                     horizon = search.horizon_of_share(share)
                     search.extend_to(horizon)
-                    status = search.minimise(horizon, share == self.ladder[-1])
+                    status = search.minimise(horizon, share == search.ladder[-1])
                     if status is Status.ITERATION_LIMIT:
                         break
             status = status or Status.CONVERGED

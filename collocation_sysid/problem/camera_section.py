@@ -69,6 +69,9 @@ class DepthSection(MeasurementSection, of=Depth):
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> Depth:
         """Return the images or clouds within the times t_s (T,) of the experiment [s], and note how
         many are used.
+
+        Images are converted to clouds of points. What the table states about the camera replaces
+        what the file contains.
         """
         content, at_s = self._read_images(folder, where)
         camera = self._camera(folder, content, where=f"{where}.camera")

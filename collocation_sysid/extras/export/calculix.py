@@ -97,7 +97,8 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
             fibres = part.material.energy.fibres
             if for_abaqus:
                 card, limitation = _abaqus_fibre_card(region, fibres)
-                sections = _fibre_sections(body, part, k, name, _local_directions(region, fibres))
+                directions = region.fibre_directions(fibres.families).tolist()
+                sections = _fibre_sections(body, part, k, name, directions)
             elif fibres.is_dispersed:
                 limitation = f"{limitation}; {DISPERSED}".removeprefix("; ")
             else:
@@ -126,10 +127,9 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
     head = comment_lines(body, limits, start="** ")
     obstacles = faceted_obstacles(body)
     steps = ""
+    totals = "YES" if for_abaqus else "ONLY"
     for t_s in _step_times_s(body):
-        steps += _step_card(body, obstacles, t_s=t_s, is_linear=linear)
-    if for_abaqus:
-        steps = steps.replace("TOTALS=ONLY", "TOTALS=YES")
+        steps += _step_card(body, obstacles, t_s, linear, totals)
     deck = f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"
     return deck, tuple(limits)
 
@@ -176,10 +176,14 @@ def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) 
 
 
 def _step_card(
-    body: IdentifiedBody, obstacles: Sequence[FacetedObstacle], t_s: float, is_linear: bool
+    body: IdentifiedBody,
+    obstacles: Sequence[FacetedObstacle],
+    t_s: float,
+    is_linear: bool,
+    totals: str,
 ) -> str:
     """Return the text of one step: prescribed nodes and obstacles at their places at `t_s`,
-    gravity, and the node loads of the first sample.
+    gravity, and the node loads of the first sample; `totals` is the option of printed forces.
     """
     displacements_m = [body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m]
     displacements_m += [wall.points_at_m(t_s) - wall.start_points_m for wall in obstacles]
@@ -188,7 +192,7 @@ def _step_card(
     boundary = "".join(
         f"{n + 1},{a + 1},{a + 1},{_format_values(float(rows[n, a]))}\n" for n, a in prescribed
     )
-    prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS=ONLY\nRF\n" for k in range(len(obstacles)))
+    prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS={totals}\nRF\n" for k in range(len(obstacles)))
     loaded = np.argwhere(body.node_loads_n)
     loads = "".join(
         f"{n + 1},{a + 1},{_format_values(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
@@ -322,19 +326,12 @@ def _compression(fibres: FibreLaw) -> str:
     return "; they carry no compression, while the identified ones do"
 
 
-def _local_directions(region: IdentifiedRegion, fibres: FibreLaw) -> list[tuple[float, ...]]:
-    """Return the direction of each family in the axes of the fibres."""
-    angle = region.constants.get(FIBRE_ANGLE.name, 0.0)
-    sides = (1, -1)[: fibres.families]
-    return [(float(np.cos(angle)), side * float(np.sin(angle)), 0.0) for side in sides]
-
-
 def _fibre_sections(
     body: IdentifiedBody,
     part: BodyPart,
     number: int,
     name: str,
-    directions: Sequence[tuple[float, ...]] = (),
+    directions: Sequence[Sequence[float]] = (),
 ) -> str:
     """Return an orientation, an element set and a section for each direction of the fibres of a
     part. Local axes for CalculiX are the normal of the fibres, across them, and against them. With

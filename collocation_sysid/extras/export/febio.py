@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ...common.array_types import Array, Index
-from ...fem.laws.constants import FIBRE_ANGLE, FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
+from ...fem.laws.constants import FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
 from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
 from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
@@ -135,9 +135,8 @@ def _fibre_solids(region: IdentifiedRegion, fibres: FibreLaw, axes: Array) -> It
     of its components, which is 1 where none is stated.
     """
     c = region.constants
-    angle = c.get(FIBRE_ANGLE.name, 0.0)
-    sides = (1, -1)[: fibres.families]
-    along = [axes @ np.array([np.cos(angle), side * np.sin(angle), 0.0]) for side in sides]
+    directions = region.fibre_directions(fibres.families)
+    along = directions @ axes.T
     k1 = c[FIBRE_STIFFNESS.name] / 4
     exponent = c.get(FIBRE_EXPONENT.name, 0.0)
     if not fibres.is_dispersed:
@@ -149,7 +148,7 @@ def _fibre_solids(region: IdentifiedRegion, fibres: FibreLaw, axes: Array) -> It
     # This law has two families at ± gamma from the first axis: one family is half of each.
     single = len(along) == 1
     first, second = (along[0], np.cross(axes[:, 2], along[0])) if single else axes.T[:2]
-    acute = np.arctan2(abs(np.sin(angle)), abs(np.cos(angle)))
+    acute = np.arctan2(*np.abs(directions[0, 1::-1]))
     constants = {
         "density": 0.0,
         "c": NOTHING * region.mu_pa,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...common.array_types import Array, Index
 from ...errors import InputError, listed, located
 from ...fem.body import Body
+from ...fem.laws.constants import FIBRE_ANGLE
 from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
 from ...fem.regions import BodyPart
@@ -60,6 +61,12 @@ class IdentifiedRegion:
     def kappa_pa(self) -> float:
         """Bulk modulus κ = λ + ⅔ μ [Pa]."""
         return self.lambda_pa + 2 / 3 * self.mu_pa
+
+    def fibre_directions(self, families: int) -> Array:
+        """Return the direction (families, 3) of each family of fibres, in the axes of the fibres."""
+        angle = self.constants.get(FIBRE_ANGLE.name, 0.0)
+        sides = (1, -1)[:families]
+        return np.array([[np.cos(angle), side * np.sin(angle), 0.0] for side in sides])
 
     @property
     def power_terms(self) -> tuple[tuple[float, float, float], ...]:

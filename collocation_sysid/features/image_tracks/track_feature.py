@@ -68,11 +68,11 @@ def places_off_body(reading: ImageTrackResidual, phi: Array, of: str) -> Iterato
     places, body = reading.correspondences, reading.experiment.body
     corners = body.nodes_m[body.mesh.surface]
     size_m = float(np.linalg.norm(np.ptp(body.nodes_m, axis=0)))
-    off_m = np.zeros(len(places.is_placed))
+    places_m = places.places_m(phi)
+    off_m = np.zeros(len(places_m))
     for k in np.flatnonzero(places.is_placed).tolist():
-        place = places.places_m(phi)[k]
-        nearest = nearest_points_of_triangles(place, corners)
-        off_m[k] = np.linalg.norm(nearest - place, axis=1).min()
+        nearest = nearest_points_of_triangles(places_m[k], corners)
+        off_m[k] = np.linalg.norm(nearest - places_m[k], axis=1).min()
     worst = int(off_m.argmax())
     if off_m[worst] > OFF_BODY * size_m:
         data = {"point": reading.sensor.names[worst], "off_mm": 1e3 * float(off_m[worst])}

@@ -627,7 +627,7 @@ def _grasp_edge(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """
     if at.iterate.transcription.experiment.is_static and _is_driven(at).any():
         return None
-    return _grip(at, 0)
+    return at.effect_of_grips
 
 
 def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
