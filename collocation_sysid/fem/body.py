@@ -333,9 +333,7 @@ class Body(Discretisation):
         return other
 
     def _geometry_at(self, positions_m: Array) -> Array:
-        """Return the geometry (E, q, 3·nodes + 1), shape gradients and volumes, of elements whose
-        nodes are at other positions (n, 3) [m] than in the mesh.
-        """
+        """Shape gradients and volumes (E, q, 3·nodes + 1) with nodes at other positions (n, 3)."""
         count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
         G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
@@ -383,9 +381,7 @@ class Body(Discretisation):
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
-        """Return the lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the
-        part.
-        """
+        """Lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the part."""
         volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
         volume = np.zeros(len(self.nodes_m))
         np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
@@ -553,9 +549,7 @@ class Body(Discretisation):
 
     @cached_property
     def _mass_slopes(self) -> list[dict[int, Array]]:
-        """For each part the derivatives of its masses (3n,) by entries of θ, by the index in θ:
-        [m³] by a free density, [kg] by coefficients of a density field.
-        """
+        """For each part ∂mass (3n,) by index in θ: [m³] by a density, [kg] by a field."""
         slopes: list[dict[int, Array]] = []
         places = zip(self._gamma_m_indices, self.field_slices, strict=True)
         for part, (gamma, modes), volume in zip(self.parts, places, self._lumped_m3, strict=True):
@@ -606,9 +600,7 @@ class Body(Discretisation):
         )
 
     def _part_masses(self, theta: Theta) -> list[Array]:
-        """Return for each part the mass of every dof (3n,) [kg], without tied masses; zero outside
-        the part.
-        """
+        """Mass of every dof (3n,) [kg] of each part, without tied masses."""
         masses = []
         for part, volume, slopes in zip(
             self.parts, self._lumped_m3, self._mass_slopes, strict=True
@@ -869,9 +861,7 @@ class Body(Discretisation):
     def _apply_stiffening_chain_rule(
         self, by_theta: Array, memory_input: MemoryInput | None
     ) -> None:
-        """Replace derivatives by the stiffening s of each part by derivatives by the constants of
-        its memory, in place.
-        """
+        """From derivatives by s of each part to those by its memory constants, in place."""
         for first, columns in self._memory_columns:
             if memory_input is None:
                 by_theta[..., columns] = 0.0
@@ -881,9 +871,7 @@ class Body(Discretisation):
 
     @cached_property
     def _memory_columns(self) -> list[tuple[int, slice]]:
-        """For each part with memory, in their order: the index in θ of its first branch constant,
-        and the slice of θ with all its branch constants, two for each branch.
-        """
+        """For each part with memory: index in θ of its first branch constant, slice of all."""
         firsts = [s + p.law_constant_count for p, s in zip(self.parts, self.starts, strict=False)]
         counts = [2 * len(part.prony) for part in self.parts]
         return [(f, slice(f, f + n)) for f, n in zip(firsts, counts, strict=True) if n]
@@ -952,9 +940,7 @@ class Body(Discretisation):
         return curvature
 
     def _curvature_views(self, rows: Array) -> SecondDerivatives:
-        """Return result rows (T, width) of the kernel "curvature" as views by their meaning,
-        without derivatives by fields; ∂²φ/∂v² is empty.
-        """
+        """Rows (T, width) of the kernel "curvature" as views by meaning, without fields."""
         count = len(rows)
         size = self.pattern.size
         entries = self.pattern.entry_count
@@ -976,9 +962,7 @@ class Body(Discretisation):
         )
 
     def _set_field_curvature(self, curvature: SecondDerivatives, rows: Array, theta: Theta) -> None:
-        """Set the derivatives by coefficients of fields, in place, from those by the logarithm of
-        each cell.
-        """
+        """Set derivatives by coefficients of fields from those by the logarithms of cells."""
         for number, outputs in self._field_outputs("curvature", rows):
             columns = self.field_slices[number]
             spread = self.field_assemblies[number]
@@ -1006,9 +990,7 @@ class Body(Discretisation):
     def _apply_stiffening_to_curvature(
         self, curvature: SecondDerivatives, memory_input: MemoryInput | None
     ) -> None:
-        """Replace first and second derivatives by the stiffening of each part by those by the
-        constants of its memory, in place; see `_apply_stiffening_chain_rule`.
-        """
+        """As `_apply_stiffening_chain_rule`, for first and second derivatives."""
         theta_theta = curvature.theta_theta
         for values in (
             curvature.position_theta,
@@ -1039,9 +1021,7 @@ class Body(Discretisation):
         return np.sum([theta[k] * share for k, share in self.tied_shares.items()], axis=0)
 
     def _damped_masses(self, theta: Theta, tied_kg: Array | None) -> Iterator[tuple[int, Array]]:
-        """Yield for each part the index in θ of its γ_m, and the mass (3n,) or (T, 3n) [kg] damped
-        by it.
-        """
+        """Yield for each part the index in θ of its γ_m and the mass (3n,) or (T, 3n) [kg]."""
         for k, damped in enumerate(self._part_masses(theta)):
             if tied_kg is not None:
                 damped = damped + self._tied_shares[k] * tied_kg
@@ -1055,28 +1035,21 @@ class Body(Discretisation):
         return [part.density_kg_m3 * volume / total_kg for part, volume in parts]
 
     def _damping_coefficients(self, theta: Theta, tied_kg: Array | None) -> Array:
-        """Return the coefficients Σ γ_m M of mass-proportional damping [N·s/m] at θ (k,): (3n,), or
-        (T, 3n) if `tied_kg` is; see `_damped_masses` for the tied masses.
-        """
+        """Return Σ γ_m M [N·s/m], (3n,) or, if `tied_kg` is, (T, 3n)."""
         # `numpy.sum` of a list takes longer than the products.
         return reduce(np.add, (theta[k] * mass for k, mass in self._damped_masses(theta, tied_kg)))
 
     def _damping_derivatives(
         self, theta: Theta, tied_kg: Array | None
     ) -> Iterator[tuple[int, Array]]:
-        """Yield index in θ and derivative, (3n,) or (T, 3n), of `_damping_coefficients` at `theta`
-        by each γ_m and by each constant of a density; an index can occur more than once, then
-        derivatives add up. `tied_kg` is that of `_damped_masses`.
-        """
+        """Yield index in θ and derivative of Σ γ_m M by it; those of an index add up."""
         yield from self._damped_masses(theta, tied_kg)
         for gamma, own in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
             yield from ((place, theta[gamma] * slope) for place, slope in own.items())
 
 
 def _with_weights_appended(memory_input: MemoryInput) -> MemoryInput:
-    """Return the memory with rows (T, 2 width) of H, then σ, as the kernel "curvature" reads them;
-    σ is zero where no stress weights are given.
-    """
+    """Return rows (T, 2 width) of H, then of the stress weights σ, zero where not given."""
     weights = memory_input.stress_weights
     if weights is None:
         weights = np.zeros_like(memory_input.overstress)

@@ -116,9 +116,7 @@ class ChainRule:
         by: ca.SX,
         direction: ca.SX,
     ) -> ca.SX:
-        """Return the derivatives (i,) of partial derivatives of a function by symbols `by` (k,)
-        along a `direction` (k,), as expressions in symbols of the function.
-        """
+        """Return derivatives (i,) of partial derivatives by symbols `by` along `direction` (k,)."""
         argument_rates = ca.jtimes(function.arguments, by, direction)
         arguments = sorted(set(ca.sparsify(argument_rates).sparsity().row()))
         return function.shifted(indices, arguments) @ argument_rates[arguments]

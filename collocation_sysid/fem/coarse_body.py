@@ -29,10 +29,6 @@ from .spatial_field import FieldModes
 if TYPE_CHECKING:
     from .body import Body
 
-# Number of elements of the coarse mesh, by the distance of their centres, among which that of a
-# point is looked for.
-NEAREST_CELLS = 24
-
 
 @dataclass(frozen=True, eq=False)
 class CoarseBody:
@@ -73,7 +69,7 @@ class CoarseBody:
         """
         coarse_m = self.coarse.mesh.points_m[self.coarse.mesh.tetrahedra]
         points_m = self.body.nodes.points_m
-        count = min(NEAREST_CELLS, len(coarse_m))
+        count = min(24, len(coarse_m))
         _, near = KDTree(coarse_m.mean(axis=1)).query(points_m, count)
         near = near.reshape(len(points_m), count)
         inverse = np.linalg.inv(coarse_m[:, 1:] - coarse_m[:, :1])
@@ -124,9 +120,7 @@ def coarsen_body(body: Body, node_count: int, node_sets: Sequence[Index]) -> Coa
 
 
 def _own_node_sets(body: Body) -> list[Index]:
-    """Return the nodes of custom forces that act on a part of the nodes, and those held during a
-    scan.
-    """
+    """Return the nodes of custom forces that have some, and those held during a scan."""
     sets = [
         np.unique(placed.points.nodes)
         for placed in body.placed_forces
@@ -162,9 +156,7 @@ def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBod
 
 
 def _transferred_nodes(nodes: Index, meshes: CoarseMesh, coarse_nodes: ElementNodes) -> Index:
-    """Return the nodes of the coarse body that correspond to nodes (k,) of the given one, see
-    `CoarseBody.coarse_nodes`.
-    """
+    """Return the nodes of the coarse body for nodes (k,) of the given one."""
     corners = nodes[nodes < len(meshes.coarse_nodes)]
     chosen = np.zeros(len(meshes.mesh.points_m), dtype=bool)
     chosen[meshes.coarse_nodes[corners]] = True
@@ -184,9 +176,6 @@ def _coarse_force(
 def _coarse_rest_shape(
     body: Body, meshes: CoarseMesh, coarse_nodes: ElementNodes
 ) -> UnderGravity | Literal["stress_free"] | None:
-    """Return the statement about the rest shape for the coarse body: None if the given one has
-    none, "stress_free", or the scan conditions with the held nodes of the coarse body.
-    """
     scan = body.scan_conditions
     if scan is None:
         return None if body.rest_shape is None else "stress_free"
@@ -195,9 +184,7 @@ def _coarse_rest_shape(
 
 
 def _coarse_field(source: BodyPart, part: BodyPart, body: Body, coarse: Body) -> FieldModes | None:
-    """Return the field of a part on the elements of the coarse part, each with the value of the
-    nearest element; None without a field.
-    """
+    """Return the field of a part on the coarse part: values of the nearest elements."""
     modes = source.field
     if modes is None:
         return None

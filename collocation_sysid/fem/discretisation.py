@@ -386,9 +386,7 @@ class Discretisation(ConstantsModel):
     # Assembly -------------------------------------------------------------------------------
 
     def _states(self, *fields: ArrayLike) -> list[Array]:
-        """Return every node field, (n, 3), (T, n, 3) or (T, 3n), as (T, 3n), contiguous; native
-        code relies on these shapes.
-        """
+        """Return every node field as (T, 3n), contiguous; native code relies on these shapes."""
         nodes = len(self.nodes_m)
         arrays = [np.ascontiguousarray(field, dtype=float) for field in fields]
         for array in arrays:
@@ -498,9 +496,7 @@ class Discretisation(ConstantsModel):
         )
 
     def _destinations(self, name: str, number: int, cells: Index, kernel: ElementKernel) -> Index:
-        """Return the position (E, outputs) in a result row of every entry of the outputs of a
-        kernel.
-        """
+        """Return the position (E, outputs) in a result row of every output of a kernel."""
         part = self.parts[number]
         vector, lower = element_destinations(self.pattern, cells)
         total = len(self.constants)
@@ -556,9 +552,7 @@ class Discretisation(ConstantsModel):
         return np.hstack(list(positions.values()))
 
     def _data_columns(self, name: str, number: int, points: int) -> Index:
-        """Return the columns (E, q, m) of the data of each quadrature point in a row of data, see
-        `point_data`; m = 0 if the points have none.
-        """
+        """Return the columns (E, q, m) of each point in a row of data; m = 0 without data."""
         if self.inverse_equilibrium is not None:
             return self.inverse_equilibrium.point_data_columns(number)
         part = self.parts[number]

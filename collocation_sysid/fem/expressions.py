@@ -112,9 +112,7 @@ class PointLaw:
         return stress, slope
 
     def _damping_constants(self, theta: ca.SX) -> dict[str, ca.SX]:
-        """Return the constants of the damping law by name, from θ of the law, where they follow
-        those of the material.
-        """
+        """Return the constants of the damping law by name, from θ of the law."""
         constants = theta[len(self.material.constants) :]
         return {c.name: constants[k] for k, c in enumerate(self.damping.constants)}
 
@@ -179,9 +177,7 @@ def _energy(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return ψ of a point: a symbol of `point.rule` if the material provides one, else an
-    expression.
-    """
+    """Return ψ: a symbol of `point.rule` if the material provides one, else an expression."""
     constants = _material_constants(point, law)
     return law.material.psi_in(point.rule, point.compute_material_gradient(), values=constants)
 
@@ -192,9 +188,7 @@ def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the potential Θ of a point [J], whose negative derivative by x is the internal force:
-    elastic energy, damping potential and, with memory, the energy of the overstress.
-    """
+    """Return Θ [J] of a point: elastic energy, damping potential, energy of the overstress."""
     energy = _energy(point, law)
     damped = energy + _damping_potential(point, law, energy=energy)
     if not law.has_memory:
@@ -257,10 +251,7 @@ def second_piola(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | None:
-    """Return V P_v (9,) of a point and its derivative (9, 9) by F, with the viscous first
-    Piola–Kirchhoff stress P_v and the volume V of the point; None if the damping law has a
-    potential.
-    """
+    """Return V P_v (9,) and its derivative (9, 9) by F; None if the law has a potential."""
     stress_and_slope = law.damping_stress(
         ca.vec(point.compute_material_gradient()),
         point.compute_material_gradient_rate(),

@@ -17,10 +17,6 @@ import scipy.sparse as sp
 from ..common.array_types import Array, Index
 from .pattern import SymmetricPattern, dofs_of
 
-# Number of cached matrices: four for each of the latest eight choices of instances, namely the
-# operator, its transpose, and the assembly of the symmetric and of the skew parts.
-CACHED_MATRICES = 32
-
 
 @dataclass(frozen=True, eq=False)
 class ForcePoints:
@@ -117,7 +113,8 @@ class ForcePoints:
         """Return the columns or rows of a matrix that belong to chosen instances."""
         key = what, None if chosen is None else chosen.tobytes()
         if key not in self._operators:
-            if len(self._operators) >= CACHED_MATRICES:
+            # Operator, transpose, symmetric and skew assembly of the latest eight choices of instances.
+            if len(self._operators) >= 32:
                 self._operators.pop(next(iter(self._operators)), None)
             if what == "operator":
                 rows = slice(None) if chosen is None else _expanded_indices(chosen, self.dofs)
@@ -173,9 +170,7 @@ class ForcePoints:
         return self._assembly_matrix(skew=True)
 
     def _assembly_matrix(self, skew: bool) -> sp.csc_array:
-        """Return the sparse matrix that sums lower triangles (i, d(d + 1)/2) of all instances,
-        stacked column after column, into the entries of the couplings.
-        """
+        """Return the matrix that sums lower triangles (i, d(d + 1)/2) into the couplings."""
         instance, local, dof, weight = self.nonzero_weights
         order = np.argsort(instance, kind="stable")
         instance, local, dof, weight = instance[order], local[order], dof[order], weight[order]

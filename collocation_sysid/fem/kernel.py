@@ -175,10 +175,7 @@ def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -
 
 
 def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
-    """Return a piece multiplied with the shape gradients (nodes, 3), by its contraction `how`:
-    unchanged for "none", the node vectors (3·nodes, k) for "nodes", the lower triangle of the
-    matrix between nodes, stacked column after column, for "pairs".
-    """
+    """Return a piece multiplied with the shape gradients (nodes, 3) by its contraction."""
     if how == "none":
         return piece
     nodes = gradients.shape[0]
@@ -196,9 +193,7 @@ def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
 
 
 def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
-    """Return the columns of `stress` (9, k), conjugate to F, times the shape gradient (1, 3) of one
-    node: (3, k).
-    """
+    """Return `stress` (9, k), conjugate to F, times the shape gradient (1, 3): (3, k)."""
     columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
     return ca.horzcat(*columns)
 

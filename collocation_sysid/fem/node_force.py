@@ -194,9 +194,7 @@ class NodeForce:
     def _evaluate_law(
         self, x: ca.SX, v: ca.SX, before: ca.SX, at: ForceContext, named: dict[str, ca.SX]
     ) -> tuple[ca.SX, ca.SX]:
-        """Return the force (3,) and the internal variables (h,) after the evaluation, empty without
-        memory.
-        """
+        """Return the force (3,) and the new internal variables (h,), empty without."""
         if not self.internal_variable_count:
             force = cast(Column, self.law(x, v, at, **named))
             return _as_column(force), ca.SX.zeros(0)
@@ -244,9 +242,7 @@ class NodeForce:
 
     @cached_property
     def _relative_skew_parts(self) -> tuple[float, float]:
-        """Largest relative skew parts of the derivatives by x and by v, at three random points of a
-        fixed seed; 0 for a derivative that is zero.
-        """
+        """Largest relative skew parts of ∂f/∂x and ∂f/∂v at three random points."""
         rng = np.random.default_rng(0)
         largest = np.zeros(2)
         dofs = self._smallest_dofs

@@ -38,9 +38,6 @@ from .meshes.selection import Selection
 from .regions import BodyPart
 from .rest_point_layout import RestPointLayout
 
-# Number of cached stress-free shapes: of an iterate, of its neighbours for difference quotients,
-# and of the previous iterate.
-CACHED_SHAPES = 16
 # Relative step of the differences of ∂X/∂θ that give ∂²X/∂θ²: the cube root of the rounding error.
 RELATIVE_DIFFERENCE_STEP = 1e-5
 # Largest accepted gravity of a scan [m/s²]: larger values are mistakes of units, such as mm/s².
@@ -336,7 +333,7 @@ class InverseEquilibrium:
         key = constants[self.places].tobytes()
         if key not in self._shapes:
             solution = self._solve(constants)
-            while len(self._shapes) >= CACHED_SHAPES:
+            while len(self._shapes) >= 16:
                 self._shapes.pop(next(iter(self._shapes)), None)
             self._shapes[key] = solution
         return self._shapes[key]
@@ -417,9 +414,7 @@ class InverseEquilibrium:
         return self._newton_step(factor, self._weight_n(constants))
 
     def _fields_at_points(self, fields: Sequence[Array]) -> list[Array]:
-        """Return the data of the points of each part, (1, E · q · `layout.count`) each: G and its
-        derivatives, and their volume logarithms if the layout averages the dilatation.
-        """
+        """Return G and its derivatives at the points of each part."""
         layout = self.layout
         data = []
         for cells, geometry in self._parts:
@@ -433,9 +428,7 @@ class InverseEquilibrium:
         return data
 
     def _volume_logarithms(self, values: Array, geometry: Array) -> Array:
-        """Return the logarithm ρ of each point's volume ratio det G over the mean of its element,
-        with derivatives (E, q, 1 + k + pairs, 1).
-        """
+        """Return ρ of each point with derivatives (E, q, 1 + k + pairs, 1)."""
         layout = self.layout
         shares = geometry[..., -1] / geometry[..., -1].sum(axis=1)[:, None]
         matrices = values.reshape(*values.shape[:3], 3, 3)
@@ -465,9 +458,7 @@ class InverseEquilibrium:
         return (self._logarithm(determinants) - self._logarithm(mean))[..., None]
 
     def _logarithm(self, values: Array) -> Array:
-        """Return the logarithm of positive numbers with its derivatives, from numbers with their
-        first and second derivatives (…, 1 + k + pairs).
-        """
+        """Return the logarithm of numbers with two derivatives (…, 1 + k + pairs)."""
         k = self.layout.input_count
         logarithm = np.empty_like(values)
         logarithm[..., 0] = np.log(values[..., 0])
@@ -486,9 +477,7 @@ class InverseEquilibrium:
     # Newton's method ------------------------------------------------------------------------
 
     def _solve(self, theta: Array) -> RestShape:
-        """Return the stress-free shape at θ (k,) with derivatives, from the latest solution or, if
-        that fails, from the mesh.
-        """
+        """Return the shape at θ, from the latest solution or, if that fails, the mesh."""
         weight = self._weight_n(theta)
         start = self._predict(theta)
         x = None if start is None else self._newton(start, theta, weight_n=weight)
@@ -508,9 +497,7 @@ class InverseEquilibrium:
         return RestShape(x, by_input.reshape(-1, *self.points_m.shape))
 
     def _predict(self, theta: Array) -> Array | None:
-        """Return X (n, 3) [m] at θ to first order from the latest solution; None if there is none,
-        θ differs too much, or an element would be nearly inverted.
-        """
+        """X (n, 3) [m] at θ to first order from the latest solution; None if too far."""
         if not self._shapes:
             return None
         key, shape = next(reversed(self._shapes.items()))
@@ -547,9 +534,7 @@ class InverseEquilibrium:
         return mass_kg * np.tile(self.gravity_m_s2, len(self.points_m))
 
     def _newton(self, start: Array, theta: Array, weight_n: Array) -> Array | None:
-        """Return X (n, 3) [m] at a given weight (3n,) [N], from `start` (n, 3); None if Newton's
-        method does not converge.
-        """
+        """Return X (n, 3) [m] at a weight (3n,) [N], from `start`; None without convergence."""
         x = start.copy()
         for _ in range(OPTIONS.iterations):
             at = self._assemble_forces(x, theta, slopes=True)
@@ -579,9 +564,7 @@ class InverseEquilibrium:
         return None
 
     def _newton_step(self, factor: Any, residual_n: Array) -> Array:
-        """Return the Newton step −(∂r/∂X)⁻¹ r (n, 3) [m] of a residual r (3n,) [N], zero at held
-        nodes; `factor` solves with the factors of ∂r/∂X at the free dofs.
-        """
+        """Return −(∂r/∂X)⁻¹ r (n, 3) [m], zero at held nodes."""
         step = np.zeros(self.points_m.size)
         step[self.free] = -factor.solve(residual_n[self.free])
         return step.reshape(self.points_m.shape)
@@ -595,9 +578,7 @@ class InverseEquilibrium:
             return None
 
     def _is_admissible(self, positions_m: Array) -> bool:
-        """Return whether every element of the stress-free shape (n, 3) has at least the smallest
-        allowed ratio of its volume in the mesh, so that none is inverted.
-        """
+        """Return whether no element has too small a share of its volume in the mesh."""
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             gradients = np.einsum("ean,eqai->eqni", positions_m[cells], slopes)
@@ -643,9 +624,7 @@ class InverseEquilibrium:
         return _AssembledForces(force, by_position, by_theta=by_theta)
 
     def _failure_message(self, theta: Array, reached: float) -> str:
-        """Return the message for a solve at θ that reached only the fraction `reached` of the
-        weight.
-        """
+        """The fraction `reached` of the weight was solved."""
         moduli = ", ".join(
             f"{name + ': ' if name else ''}λ {lam:.4g} Pa, μ {mu:.4g} Pa"
             for name, (lam, mu) in self.body.lame(theta).items()

@@ -63,9 +63,7 @@ class PolylineLength:
 
     @cached_property
     def _pairs(self) -> tuple[Index, Index, Array, Index]:
-        """Contributions of all segments to the second derivatives: rows and columns of pairs of dofs,
-        weights, and entries of the second derivatives by d.
-        """
+        """Second derivatives of all segments: rows, columns, weights, entries by d."""
         segment_parts = []
         for j in range(self._segments):
             segment = self._differences[[j]].tocoo()
@@ -129,9 +127,7 @@ class PolylineLength:
 
 
 def _directions_and_lengths(vectors: Array) -> tuple[Array, Array]:
-    """Return directions (T, J, 3) and lengths (T, J, 1) of vectors; directions of length zero are
-    NaN.
-    """
+    """Return directions (T, J, 3), NaN where zero, and lengths (T, J, 1) of vectors."""
     length = np.linalg.norm(vectors, axis=2, keepdims=True)
     return vectors / length, length
 
@@ -170,9 +166,7 @@ class EnclosedVolume:
 
     @cached_property
     def _terms(self) -> tuple[Index, Index, Index, Array]:
-        """Rows, columns, dofs and factors (M,) of the terms factor · x[dof] of the lower triangle of
-        H(x).
-        """
+        """Rows, columns, dofs and factors (M,) of factor · x[dof] in the lower triangle of H."""
         form = _cubic_form(self.faces.shape[1])
         i, j, k = np.nonzero(np.abs(form) > 1e-14)
         term_parts = []
@@ -238,9 +232,7 @@ class EnclosedVolume:
         return np.asarray(w @ self._hessian_matrix)
 
     def _gradient_from_apex(self, away: Array) -> Array:
-        """Return H x / 2 = 3 Σ A_ijk x_j × x_k of every node i, for positions (T, 3n) relative to
-        the apex.
-        """
+        """Return 3 Σ A_ijk x_j × x_k of every node, from positions (T, 3n)."""
         corners = away.reshape(len(away), -1, 3)[:, self.faces]  # (T, F, k, 3)
         weighted = np.einsum("ijk,tfkc->tfijc", 3 * _cubic_form(self.faces.shape[1]), corners)
         of_faces = np.cross(corners[:, :, None], weighted).sum(axis=3)
@@ -260,9 +252,7 @@ def _cubic_form(nodes: int) -> Array:
 
 
 def _triangle_rule() -> tuple[Array, Array]:
-    """Return points (q, 2) and weights (q,) that integrate polynomials of degree four on a
-    triangle.
-    """
+    """Return points (q, 2) and weights (q,), exact for polynomials of degree four."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     u, v = np.meshgrid((nodes + 1) / 2, (nodes + 1) / 2, indexing="ij")
     area = np.outer(weights, weights) / 4 * (1 - u)

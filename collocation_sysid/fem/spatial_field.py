@@ -39,8 +39,6 @@ from .meshes.mesh import TetMesh
 ALL_MODULI = YOUNG.name
 # Number of random sign vectors for the estimate of a trace (Hutchinson's estimator).
 PROBES = 50
-# Prior standard deviation of the logarithm of the contrast of two phases: a factor of e.
-TWO_PHASE_AMPLITUDE = 1.0
 SMOOTH: Literal["smooth"] = "smooth"
 TWO_PHASE: Literal["two-phase"] = "two-phase"
 Prior = Literal["smooth", "two-phase"]
@@ -92,7 +90,7 @@ class Field:
         negative.
         """
         if self.prior == TWO_PHASE:
-            return self.amplitude or TWO_PHASE_AMPLITUDE
+            return self.amplitude or 1.0
         return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
 
 

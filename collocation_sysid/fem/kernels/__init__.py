@@ -91,9 +91,7 @@ def choose_evaluator(choice: str = "auto") -> str:
 
 
 def _requested_evaluator(choice: str) -> str:
-    """Return the choice, or for "auto" that of the environment variable: "auto" itself if none is
-    set.
-    """
+    """Return the choice; for "auto" that of the environment variable, if it is set."""
     origin = "evaluator"
     if choice == "auto":
         variable = "COLLOCATION_SYSID_EVALUATOR"
@@ -190,9 +188,7 @@ class EvaluatorChoice:
             return make_evaluator(batch, self.name)
 
     def _fall_back_to_casadi(self, error: VectorCodeError) -> None:
-        """Change to CasADi's evaluator with a note, or raise the error if "simd" was requested by
-        name.
-        """
+        """Change to CasADi with a note; raise the error if "simd" was requested."""
         if not self._may_yield:
             message = f"{error.message}; choose evaluator = 'casadi' for this material"
             raise VectorCodeError(message) from error

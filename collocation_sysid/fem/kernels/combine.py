@@ -150,9 +150,6 @@ def _emit() -> Any:
         targets_here, sources_here = (builder.gep(m, [begin]) for m in (targets, sources))
 
         def loop(accumulate: bool) -> None:
-            """Emit the loop over the entries of a task that overwrites the values, or adds to
-            them.
-            """
             with for_range(builder, I64(0), stop=length, name="entry") as i:
                 source = builder.sext(builder.load(builder.gep(sources_here, [i])), I64)
                 target = builder.sext(builder.load(builder.gep(targets_here, [i])), I64)

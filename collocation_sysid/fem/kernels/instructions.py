@@ -41,9 +41,7 @@ def _inverse_error(x: ca.SX) -> ca.SX:
 
 
 def _ratio(coefficients: tuple[tuple[float, ...], ...], z: ca.SX) -> ca.SX:
-    """Return the ratio of two polynomials at z, given by the coefficients (numerator, denominator),
-    the highest power first.
-    """
+    """Return the ratio of two polynomials at z, the highest power first."""
     numerator, denominator = (ca.polyval(ca.SX(part), z) for part in coefficients)
     return numerator / denominator
 
@@ -153,9 +151,7 @@ def _emit_library_call(name: str) -> Emit:
 
 
 def _declare(module: ir.Module, name: str, kind: ir.Type, operands: int) -> ir.Function:
-    """Return the function `name` of the module, declared with results and `operands` arguments of
-    one kind if necessary.
-    """
+    """Return a declared function, with results and `operands` arguments of one kind."""
     declared = module.globals.get(name)
     return declared or ir.Function(module, ir.FunctionType(kind, [kind] * operands), name)
 
@@ -170,9 +166,7 @@ def _emit_comparison(sign: str) -> Emit:
 
 
 def _comparison(b: Builder, sign: str, x: Value, y: Value) -> Value:
-    """Return a comparison of two vectors by a sign such as "<" as a vector of booleans; as in C,
-    NaN differs from everything, itself included.
-    """
+    """Return a vector of booleans; as in C, NaN differs from everything."""
     return (b.fcmp_unordered if sign == "!=" else b.fcmp_ordered)(sign, x, y)
 
 

@@ -36,9 +36,6 @@ DOUBLES = DOUBLE.as_pointer()
 I32S = I32.as_pointer()
 Builder = Value = Any  # llvmlite is not annotated, and what is inferred of it is wrong
 
-# Number of compiled functions kept in memory for further bodies.
-FUNCTIONS_IN_MEMORY = 128
-
 
 @contextmanager
 def for_range(builder: Builder, start: Value, stop: Value, name: str) -> Iterator[Value]:
@@ -80,9 +77,7 @@ def _initialise() -> None:
 
 
 def _target_machine(quickly: bool) -> llvm.TargetMachine:
-    """Return a code generator for this CPU, without optimisation if `quickly`; the engine that uses
-    it owns and frees it.
-    """
+    """Return a code generator for this CPU, owned by the engine that uses it."""
     _initialise()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=llvm.get_host_cpu_name(),
@@ -121,7 +116,7 @@ class NativeCode:
     is_unoptimised: bool = False
 
 
-@lru_cache(FUNCTIONS_IN_MEMORY)
+@lru_cache(128)
 def compile_function(code: NativeCode) -> CompiledFunction:
     """Return the compiled function; the latest 128 are kept, by name, key and signature, and shared
     by all bodies.
@@ -174,9 +169,7 @@ def _object_code(code: NativeCode, machine: llvm.TargetMachine) -> bytes:
 
 @cache
 def _source_digest() -> str:
-    """Return a digest of the source files of this folder, so that changes invalidate cached
-    kernels.
-    """
+    """Return a digest of the sources of this folder: changes invalidate cached kernels."""
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(file.read_bytes())

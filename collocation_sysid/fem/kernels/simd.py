@@ -127,9 +127,7 @@ def _emit_kernel(kernel: ElementKernel, points: int, lanes: int) -> ir.Module:
 
 
 def _block_major(array: NDArray[np.int64], by_block: tuple[int, int]) -> NDArray[np.int32]:
-    """Return an array (blocks · lanes, …) as contiguous 32-bit integers (blocks, k, lanes), where k
-    is the number of entries of a row, for `by_block` = (blocks, lanes).
-    """
+    """Return an array (blocks · lanes, …) as contiguous int32 (blocks, k, lanes)."""
     blocked = array.reshape(*by_block, -1)
     return np.ascontiguousarray(np.swapaxes(blocked, 1, 2), dtype=np.int32)
 
@@ -157,9 +155,7 @@ class _PhaseLayout:
         self.outputs = (first + np.cumsum([0, *outputs])).tolist()
 
     def output_offsets(self, first: int, how: Contraction, step: int) -> list[int]:
-        """Return the offsets in the totals of outputs with a contraction, in steps of `step`
-        entries.
-        """
+        """Return the offsets in the totals of outputs, in steps of `step` entries."""
         return [
             place
             for k, mine in enumerate(self.contractions)
@@ -273,17 +269,13 @@ class _KernelEmitter:
         return self.module
 
     def _buffer(self, count: int, name: str) -> Value:
-        """Allocate memory for `count` vectors in the entry of the function, aligned to 64 bytes and
-        not initialised; `name` appears in the LLVM code only.
-        """
+        """Allocate memory for `count` vectors in the entry of the function."""
         buffer = self.builder.alloca(DOUBLE, size=I64(count * self.lanes), name=name)
         buffer.align = 64
         return buffer
 
     def _clear(self, row: ir.Value, length: ir.Value) -> None:
-        """Set `length` doubles from the pointer `row` on to zero: the outputs of one time step,
-        which stay in the cache while they are summed.
-        """
+        """Set the outputs of one time step to zero; they stay in the cache while summed."""
         b = self.builder
         bytes_ = ir.IntType(8).as_pointer()
         memset = self.module.declare_intrinsic("llvm.memset", (bytes_, I64))
@@ -291,9 +283,7 @@ class _KernelEmitter:
         b.call(memset, [b.bitcast(row, bytes_), ir.IntType(8)(0), size, ir.IntType(1)(0)])
 
     def _pointer(self, base: Value, entry: Value) -> Value:
-        """Return the pointer to the vector with the index `entry` in a buffer that begins at
-        `base`.
-        """
+        """Return the pointer to the vector with the index `entry`, not a constant."""
         b = self.builder
         address = b.gep(base, [b.mul(entry, I64(self.lanes))])
         return b.bitcast(address, self.vector.as_pointer())
@@ -331,9 +321,7 @@ class _KernelEmitter:
                     self._store(value, buffer, entry=b.add(b.mul(node, I64(3)), I64(axis)))
 
     def _scatter(self, value: Value, targets: Value, k: Value, row: Value) -> None:
-        """Emit the addition of the W lanes of one output entry at the destinations of their
-        elements.
-        """
+        """Add the W lanes of one output entry at the destinations of their elements."""
         b = self.builder
         first = b.mul(k, I64(self.lanes))
         for lane in range(self.lanes):
@@ -342,9 +330,7 @@ class _KernelEmitter:
             b.store(b.fadd(b.load(address), b.extract_element(value, I32(lane))), address)
 
     def _load_point_data(self, memory: list, t: Value, point: Value) -> list:
-        """Return the data of a quadrature point of W elements at time step t, a vector for each
-        datum.
-        """
+        """Return the data of a point of W elements at step t, a vector for each datum."""
         b = self.builder
         length, places, rows = memory
         row = b.gep(rows, [b.mul(t, length)])
@@ -377,9 +363,7 @@ class _KernelEmitter:
     def _contract(
         self, phase: _PhaseLayout, pieces: Value, geometry: Value, half: Value, totals: Value
     ) -> None:
-        """Emit the addition of the pieces of one quadrature point to the totals, contracted as in
-        `kernel._contracted`.
-        """
+        """Add the pieces of one point to the totals, contracted as in `kernel._contracted`."""
         b = self.builder
         for k, how in enumerate(phase.contractions):
             piece_base = self._offset_pointer(pieces, phase.pieces[k])
@@ -416,9 +400,7 @@ class _KernelEmitter:
     def _add_node_block(
         self, half: Value, gradient: list, a: Value, node: Value, outputs: Value
     ) -> None:
-        """Emit the addition of the rows of node `a` to the columns of `node` of a lower triangle;
-        if both are the same, only entries on and below the diagonal.
-        """
+        """Add rows of node `a` to columns of `node`; if both agree, the lower triangle."""
         b = self.builder
         for column, row, value in self._at_node(half, 3, gradient):
             if a is node and row < column:
@@ -428,16 +410,12 @@ class _KernelEmitter:
             self._accumulate(value, outputs, entry=b.add(self._column_start(c), r))
 
     def _column_start(self, c: Value) -> Value:
-        """Return c (2 size − c − 1) / 2, the offset of column c in a lower triangle, less its row
-        index.
-        """
+        """Return c (2 size − c − 1) / 2, the offset of column c, less its row index."""
         b = self.builder
         return b.lshr(b.mul(c, b.sub(I64(2 * self.size - 1), c)), I64(1))
 
     def _couple(self, coupling: ca.Function, totals: Value, combined: Value) -> None:
-        """Emit the addition of the coupling of the node vectors to the outputs in `totals`, see
-        `kernel`; `combined` is work space for the products with D.
-        """
+        """Add the coupling of the node vectors to `totals`; `combined` is for products with D."""
         b = self.builder
         for k, columns in enumerate(self._coefficients(coupling, totals)):
             how = self.last.contractions[k]
@@ -461,10 +439,7 @@ class _KernelEmitter:
                         )
 
     def _coefficients(self, coupling: ca.Function, totals: Value) -> list[dict[int, list]]:
-        """Emit the evaluation of the coupling, and return for each output, by the index of the
-        column, a list of pairs: offset of a node vector in `totals`, and its coefficient. Zero
-        coefficients are left out.
-        """
+        """Return for each output, by column, offsets of node vectors and coefficients."""
         outputs = [coupling.sparsity_out(k) for k in range(coupling.n_out())]
         entries = [list(zip(*output.get_triplet(), strict=True)) for output in outputs]
         columns: list[dict[int, list]] = [{} for _ in outputs]
@@ -517,9 +492,7 @@ class _KernelEmitter:
         return [self._load(geometry, self.builder.add(first, I64(axis))) for axis in range(3)]
 
     def _offset_pointer(self, base: Value, entry: int) -> Value:
-        """Return the pointer to the vector with the constant index `entry` of a buffer at
-        `base`.
-        """
+        """Return the pointer to the vector with the constant index `entry`."""
         return self.builder.gep(base, [I64(entry * self.lanes)])
 
     def _accumulate(self, value: Value, base: Value, entry: Value) -> None:

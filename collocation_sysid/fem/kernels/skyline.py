@@ -202,9 +202,7 @@ def _addresses(*arrays: NDArray[Any]) -> list[int]:
 
 
 def _compile(name: str, sides: int) -> CompiledFunction:
-    """Return one of the compiled functions "fill", "factorise" and "solve", for a symmetric matrix
-    (1 of `sides`) or any other (2).
-    """
+    """Return "fill", "factorise" or "solve" for a symmetric matrix (1 side) or any (2)."""
     emit: Callable[[_SkylineEmitter], ir.Module] = getattr(_SkylineEmitter, name)
     integers, *arrays = ARGUMENTS[name]
     lanes = vector_lanes()
@@ -235,9 +233,7 @@ class _SkylineEmitter:
         self.module = ir.Module()
 
     def _begin(self, name: str) -> Sequence[Value]:
-        """Begin a function with the arguments that `ARGUMENTS` states, and return them; `b` becomes
-        its builder.
-        """
+        """Begin a function with the arguments of `ARGUMENTS`; `b` becomes its builder."""
         integers, maps, arrays = ARGUMENTS[name]
         kinds = [I64] * integers + [I64.as_pointer()] * maps + [DOUBLES] * arrays
         function = ir.Function(self.module, ir.FunctionType(ir.VoidType(), kinds), name)
@@ -245,9 +241,7 @@ class _SkylineEmitter:
         return function.args
 
     def fill(self) -> Any:
-        """Return the module of ``fill(entries, source, places, signs, symmetric, skew, lower,
-        upper)``.
-        """
+        """Return the module of ``fill(entries, source, places, signs, symmetric, …)``."""
         count, source, places, signs, symmetric, skew, lower, upper = self._begin("fill")
         b = self.b
         with for_range(b, I64(0), stop=count, name="entry") as k:
@@ -281,9 +275,7 @@ class _SkylineEmitter:
         return self.module
 
     def _eliminate(self, pivots: Sequence[Value]) -> None:
-        """Emit the elimination of consecutive pivots from all rows within their reach, which are
-        read and written once for all of these pivots.
-        """
+        """Emit the elimination of consecutive pivots, with one pass over the rows."""
         b = self.b
         last = b.load(b.gep(self.reach, [pivots[-1]]))
         for p, pivot in enumerate(pivots):
@@ -318,9 +310,7 @@ class _SkylineEmitter:
                 self._store(b.fadd(self._load(grown), change), grown)
 
     def _subtract(self, pivots: Sequence[Value], row: Value, last: Value) -> None:
-        """Emit the subtraction of the contribution of pivots from a row of each side, up to the
-        position `last`.
-        """
+        """Subtract the contribution of pivots from a row of each side, up to `last`."""
         b = self.b
         scales = []
         for pivot in pivots:
@@ -340,9 +330,7 @@ class _SkylineEmitter:
                 self._store(value, target)
 
     def solve(self) -> Any:
-        """Return the module of ``solve(n, width, columns, stride, reach, first, second, pivots,
-        rows)``.
-        """
+        """Return the module of ``solve(n, width, columns, stride, reach, first, second, …)``."""
         (size, self.width, columns, stride, reach, first, second, pivots, rows) = self._begin(
             "solve"
         )

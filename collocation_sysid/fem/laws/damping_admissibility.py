@@ -15,15 +15,11 @@ from .moduli import elastic_names
 
 # Largest relative difference of two stresses that counts as rounding of some thousand operations.
 ROUNDING = 1e-9
-# Size of the random rates [1/s]: large, so that terms of higher order show.
-LARGE_RATE_1_S = 100.0
 # Size of the random strains, at which usual materials are far from their limits.
 STRAIN = 0.05
-# Pairs of a law and a material that are known to be admissible, so that copies of a body are cheap.
-REMEMBERED_LAWS = 64
 
 
-@lru_cache(REMEMBERED_LAWS)
+@lru_cache(64)
 def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
     """Check the names of the constants of a damping law, that it can be evaluated, and that it is
     linear in the rate Ḟ.
@@ -50,7 +46,8 @@ def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
     rng = np.random.default_rng(0)
     deformation = np.eye(3).ravel() + STRAIN * rng.uniform(-1, 1, 9)
     values = [constant.plausible for constant in constants]
-    first, second = LARGE_RATE_1_S * rng.uniform(-1, 1, (2, 9))
+    # Large rates [1/s], so that terms of higher order show.
+    first, second = 100.0 * rng.uniform(-1, 1, (2, 9))
     stresses = [
         function(each, deformation, values).full().ravel()
         for each in (first, second, first + second)
@@ -66,9 +63,7 @@ def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
 
 
 def _require_own_names(damping: DampingLaw, material: Material) -> None:
-    """Raise an `InputError` if two constants of the law have the same name, or one has the name of
-    a constant of the material or the body.
-    """
+    """Raise an `InputError` if a name of the law occurs twice or belongs to others."""
     taken = {
         *(constant.name for constant in material.constants),
         *elastic_names(material),
@@ -133,9 +128,7 @@ def viscous_stress(
 
 
 def _failure(damping: DampingLaw, kind: str, error: Exception) -> str:
-    """Return the message about an error in the function of a law, its `kind` "stress" or
-    "potential".
-    """
+    """Return the message about an error in a function of the law, "stress" or "potential"."""
     arguments = ["psi", "F", "rate", *(c.name for c in damping.constants)]
     return (
         f"the {kind} of the damping law {damping.name!r} cannot be evaluated ({reason(error)}); "

@@ -40,10 +40,6 @@ from .materials import Material
 # Half width of the range of e in which fibres that carry tension only begin to carry it: the
 # energy is smooth, and its second derivative at e = 0 is half of that in tension.
 ENGAGED = 1e-3
-# Largest relative change of the energy of an isotropic material by rounding if F becomes F R.
-ISOTROPIC = 1e-9
-# A normal with a smaller share across the direction is parallel to it.
-PARALLEL = 1e-6
 Direction = Annotated[Text | Vector, ByForm(str)]
 
 
@@ -167,7 +163,7 @@ class Fibres:
         x = _normalised(first, names[0], cells)
         across = normal - np.sum(normal * x, axis=1, keepdims=True) * x
         sizes = [np.linalg.norm(each, axis=1, keepdims=True) for each in (across, normal)]
-        z = _normalised(np.where(sizes[0] > PARALLEL * sizes[1], across, 0.0), names[1], cells)
+        z = _normalised(np.where(sizes[0] > 1e-6 * sizes[1], across, 0.0), names[1], cells)
         return np.stack([x, np.cross(z, x), z], axis=2)
 
 
@@ -326,7 +322,7 @@ def _require_isotropic(matrix: Material) -> None:
     turn = np.array([[0.6, -0.8, 0.0], [0.48, 0.36, -0.8], [0.64, 0.48, 0.6]])
     values = ca.DM([c.plausible for c in matrix.constants])
     energies = [float(ca.DM(ca.evalf(matrix.psi(ca.SX(G), ca.SX(values))))) for G in (F, F @ turn)]
-    if not abs(energies[1] - energies[0]) <= ISOTROPIC * abs(energies[0]):
+    if not abs(energies[1] - energies[0]) <= 1e-9 * abs(energies[0]):
         raise InputError(
             f"the material {matrix.name!r} is not isotropic: its energy density at a deformation "
             f"changes from {energies[0]:.6g} to {energies[1]:.6g} if the body is turned before; "

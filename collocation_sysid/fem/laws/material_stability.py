@@ -18,8 +18,6 @@ from ...common.array_types import Array
 from ..body import Body
 from .materials import MATERIALS, Material
 
-# Number of materials whose Hessian is kept in memory.
-CACHED_HESSIANS = 32
 # Linear elasticity depends on the rotation of the body; energies of users may be anisotropic.
 EXAMINED = tuple(material for name, material in MATERIALS.items() if name != "linear")
 
@@ -98,7 +96,7 @@ def principal_stretches(body: Body, positions: Array, theta: Array) -> Array:
     return stretches
 
 
-@lru_cache(CACHED_HESSIANS)
+@lru_cache(32)
 def _log_strain_hessian(material: Material) -> ca.Function:
     """Return the function from (ε, constants) to ∂²ψ/∂ε∂ε (9,)."""
     strain = ca.SX.sym("strain", 3)

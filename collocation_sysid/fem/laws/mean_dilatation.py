@@ -119,10 +119,7 @@ class _VolumeSums:
         return self.volumes.numel()
 
     def with_stretches(self, pieces: Pieces) -> Pieces:
-        """Return pieces with m replaced by its expression in the sums.
-
-        Symbols of energies are replaced first, because energies depend on m.
-        """
+        """Replace m by its expression in the sums; symbols of energies first."""
         m = _volume_logarithms(self.volumes, self.volume)
         m -= _volume_logarithms(self.own_volumes, self.point.mesh_volume)
         expanded = self.point.rule.eliminate([piece for _, piece in pieces.values()])
@@ -176,9 +173,7 @@ class _ScalarDerivatives:
         return self.shape.point.gradient(self.scalar, self.shape.stack_stretches())
 
     def second_derivative_pieces(self) -> Pieces:
-        """Return the pieces whose sums couple in second derivatives: ∂²g by (m, m), (m, θ), (field,
-        m).
-        """
+        """Return ∂²g by (m, m), (m, θ), (field, m)."""
         point = self.shape.point
         by_m = point.jacobian(self.by_stretch, self.shape.stack_stretches())
         pieces: Pieces = {
@@ -265,9 +260,7 @@ def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _Scal
 def _coupling(
     shape: _VolumeSums, chains: dict[int, _ScalarDerivatives], outputs: Outputs, order: int
 ) -> ca.Function:
-    """Return the coupling of each output as a function of all sums over the points: C of order 1 or
-    D of order 2, see `kernel`.
-    """
+    """Return the coupling of each output by the sums over points: C (order 1) or D (order 2)."""
     count = shape.count
     constants = shape.point.stack_differentiated_constants().numel()
     sums = [shape.volume, shape.volumes, *(chain.slopes for chain in chains.values())]
@@ -334,9 +327,7 @@ def _pair_coupling(
 
 
 def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
-    """Return n: ⅓ ln(v/V), its derivative along the velocities, and the derivatives of both along
-    w.
-    """
+    """Return n: ⅓ ln(v/V), its derivative along v, and the derivatives of both along w."""
     s = ca.SX.sym("s", volumes.numel())
     n = ca.log(s[0] / volume) / 3
     for known in (1, 2):
@@ -346,9 +337,7 @@ def _volume_logarithms(volumes: ca.SX, volume: ca.SX) -> ca.SX:
 
 
 def _logarithm_derivatives(volumes: ca.SX, volume: ca.SX, weights: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return ∂n/∂s and Σ_k weights_k ∂²n_k/∂s² of the function n of `_volume_logarithms`, with s =
-    `volumes`, at the undeformed `volume`.
-    """
+    """Return ∂n/∂s and Σ_k weights_k ∂²n_k/∂s² of the function `_volume_logarithms`."""
     s = ca.SX.sym("s", volumes.numel())
     c = ca.SX.sym("c", volumes.numel())
     n = _volume_logarithms(s, volume)

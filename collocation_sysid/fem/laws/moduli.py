@@ -138,9 +138,7 @@ def find_source(
 
 
 def _elastic_choices(owns: Sequence[str]) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of elastic names by which a material with these constants can be given: four
-    pairs if it has a constant μ, one of κ, λ, ν if it has κ or λ alone; empty without κ and λ.
-    """
+    """Return the sets of elastic names that determine the material; empty without κ and λ."""
     volumetric = {"lambda_pa", "kappa_pa"} & set(owns)
     if not volumetric:
         return ()

@@ -29,8 +29,6 @@ ScaledExcess = Callable[[ca.SX], ca.SX]
 # Rates |r| below which (e^(r x) − 1 − r x)/r² is a power series: the quotient loses digits like
 # 10⁻¹⁶/r².
 SERIES_RATE = 0.02
-# Terms of this series: the error is below 10⁻¹⁶ for |r x| < 0.1, which is |ln J| < 5.
-SERIES_TERMS = 8
 # Number of invariants, which come before the constants among the arguments of an energy.
 INVARIANTS = 3
 
@@ -140,9 +138,7 @@ def _ogden_density(
 def _hyperfoam_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of the foam; see `_ogden_density` for the arguments and `hyperfoam`
-    for the constants.
-    """
+    """Return the energy density of the foam from the constants of `hyperfoam`."""
     log_j = ca.log(ratio)
     energy = ca.SX(0)
     for p in term_numbers(constants):
@@ -164,6 +160,7 @@ def _exponential_remainder(rate: ca.SX, x: ca.SX) -> ca.SX:
     quotient = (ca.exp(safe_rate * x) - 1 - safe_rate * x) / safe_rate**2
     small = ca.if_else(is_small, rate, 0) * x
     series = ca.SX(1)
-    for k in range(SERIES_TERMS, 0, -1):
+    # The error is below 10⁻¹⁶ for |r x| < 0.1, which is |ln J| < 5.
+    for k in range(8, 0, -1):
         series = 1 + small / (k + 2) * series
     return ca.if_else(is_small, x**2 / 2 * series, quotient)

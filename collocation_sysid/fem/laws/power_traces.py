@@ -58,8 +58,6 @@ TAIL_TERMS = 5
 # Doublings of the exponent: s = α/32 at first, so |α| must be below 32, see
 # `constants.LARGEST_EXPONENT`.
 DOUBLINGS = 4
-# Terms of the Taylor series of sin(y)/y, exact to rounding for |y| < π.
-SINC_TERMS = 16
 # Smallest |s| in quotients by s, which are finite at s = 0; smaller ones lose digits like 10⁻¹⁶/s.
 SMALLEST_EXPONENT = 1e-6
 
@@ -113,9 +111,7 @@ class PowerTraces:
         return cache(lambda index: excess(index) / 4)
 
     def _sum(self, parity: Parity, alpha: ca.SX) -> Partials:
-        """Return a function from a `PartialIndex` to that partial derivative of the sum C ("even")
-        or D ("odd") by Ī₁ − 3, Ī₂ − 3 and α; results are cached.
-        """
+        """Partial derivatives of C ("even") or D ("odd") by Ī₁ − 3, Ī₂ − 3 and α, cached."""
         value_weights = _exponent_partials(_value_weights(parity, alpha), alpha)
         weights = _exponent_partials(_weights(parity, alpha), alpha)
 
@@ -130,9 +126,7 @@ class PowerTraces:
         return cache(partial)
 
     def _functions(self, parity: Parity, first_order: int = 0, second_order: int = 0) -> ca.SX:
-        """Return the functions (NODES + TAIL_TERMS,) that a sum consists of, at the nodes and for
-        the series beyond them, or partial derivatives.
-        """
+        """Return what a sum consists of, (NODES + TAIL_TERMS,), or partial derivatives."""
         sign = 1 if parity == "even" else -1
         order = first_order + second_order
         if order == 0:
@@ -220,9 +214,7 @@ def _doubled(excess: Partials, opposite: Partials, square: Partials) -> Partials
 
 
 def _product(first: Partials, second: Partials) -> Partials:
-    """Return the partial derivatives of a product by the rule of Leibniz, as a cached function of a
-    `PartialIndex`, from those of both factors.
-    """
+    """Return the partial derivatives of a product by the rule of Leibniz, cached."""
 
     def partial(index: PartialIndex) -> ca.SX:
         """Return the partial derivative of the product with an index."""
@@ -243,9 +235,7 @@ def _index(orders: Sequence[int]) -> PartialIndex:
 
 
 def _exponent_partials(expression: ca.SX, alpha: ca.SX) -> Partials:
-    """Return the partial derivatives of an expression that depends on the exponent α alone, as a
-    cached function of a `PartialIndex`; derivatives by the invariants are zero.
-    """
+    """Return the partial derivatives of an expression of α alone, cached."""
 
     def partial(index: PartialIndex) -> ca.SX:
         """Return the partial derivative with an index; zero by the invariants."""
@@ -262,6 +252,7 @@ def _exponent_partials(expression: ca.SX, alpha: ca.SX) -> Partials:
 def _sinc(y: ca.SX) -> ca.SX:
     """Return sin(y)/y for |y| < π by its Taylor series; the quotient is undefined at y = 0."""
     value = ca.SX(1)
-    for k in range(SINC_TERMS, 0, -1):
+    # Exact to rounding for |y| < π.
+    for k in range(16, 0, -1):
         value = 1 - y**2 / (2 * k * (2 * k + 1)) * value
     return value

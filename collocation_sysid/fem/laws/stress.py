@@ -43,9 +43,7 @@ def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _stress_derivative(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the entries (6,) of dS along velocities v, the second field of a point: dS = F⁻¹ (dP −
-    dF S).
-    """
+    """Return dS (6,) along v, the second field: dS = F⁻¹ (dP − dF S)."""
     F = point.gradients["x"]
     piola = first_piola(point, law)
     rate = point.gradients["v"]
@@ -64,9 +62,7 @@ def _stress_pullback(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _memory_force(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return f_H of a point (9,), conjugate to F: −∂/∂F ½ V H : FᵀF, with H as data of the
-    point.
-    """
+    """Return f_H (9,), conjugate to F: −∂/∂F ½ V H : FᵀF, with H as data of the point."""
     return -ca.gradient(memory_energy(point), point.gradients["x"])
 
 
@@ -228,9 +224,7 @@ class StressEvaluator:
         return self._slopes("force_slope", x, theta=theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of a derivative, given by the name of its kernel, at
-        `jacobian_entries`.
-        """
+        """Return the entries (T, K) of a derivative at `jacobian_entries`."""
         out = np.zeros((len(x), len(self.jacobian_entries.points)))
         return self._evaluate_all_parts(name, [x], theta=theta, out=out)
 
@@ -281,9 +275,7 @@ class StressEvaluator:
         add: bool,
         point_data: Array | None = None,
     ) -> None:
-        """Evaluate a kernel for one part; its evaluator is built at the first use. Up to
-        `SINGLE_THREAD_STATES` states run on one thread.
-        """
+        """Evaluate a kernel for one part; few states run on one thread."""
         body = self.body
         key = (name, number)
         with COMPILING:
@@ -292,7 +284,8 @@ class StressEvaluator:
         first = body.starts[number]
         values = np.array(theta[first : first + body.parts[number].law_constant_count], dtype=float)
         part_point_data = body.point_data(number, theta, internal_variables=point_data)
-        threads = body.threads if len(out) > SINGLE_THREAD_STATES else 1
+        # One thread is faster than several for few states.
+        threads = body.threads if len(out) > 16 else 1
         self._evaluators[key](
             [np.ascontiguousarray(field) for field in fields],
             values,
@@ -305,9 +298,7 @@ class StressEvaluator:
         )
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel for a part, given by its index, in which every quadrature
-        point is an element of its own.
-        """
+        """Return a batch in which every quadrature point is an element of its own."""
         body = self.body
         part = body.parts[number]
         places = body.memory.part_columns(number)
@@ -353,7 +344,3 @@ class StressEvaluator:
             width=length,
             data_columns=internal_columns,
         )
-
-
-# Number of states up to which one thread is faster than several.
-SINGLE_THREAD_STATES = 16

@@ -22,8 +22,6 @@ from .mesh_checks import edge_lengths, mean_ratios, signed_volumes, unique_edges
 
 # Smallest mean ratio of a new element; where the old ones are worse, they must not deteriorate.
 LEAST_QUALITY = 0.15
-# Smallest volume of a new element over the cube of the desired edge length: rounding.
-LEAST_VOLUME = 1e-6
 # Largest root mean square distance of a new surface node from the planes of the old surface at the
 # removed node, in edge lengths of the coarse mesh.
 SURFACE_TOLERANCE = 0.15
@@ -35,8 +33,6 @@ LONGEST_NEW_EDGE = 2.2
 NEIGHBOURS = 3
 # Largest number of rounds; each removes about a tenth of the nodes.
 MOST_ROUNDS = 100
-# A round that removes a smaller share of the nodes is the last one.
-LEAST_PROGRESS = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +80,9 @@ def coarsen_mesh(
         if excess <= 0:
             break
         removed = state.collapse_round(at_most=excess)
-        if removed <= LEAST_PROGRESS * state.node_count:
+        if removed <= 2e-3 * state.node_count:
             break
     return state.result(mesh)
-
-
-@dataclass(frozen=True, eq=False)
-class _Collapses:
-    """Possible collapses."""
-
-    removed: Index  # (k,) int: nodes that are removed
-    kept: Index  # (k,) int: neighbours onto which they are moved
-
-    def subset(self, chosen: Index | NDArray[np.bool_]) -> _Collapses:
-        """Return the collapses with the given indices or mask."""
-        return _Collapses(self.removed[chosen], self.kept[chosen])
 
 
 class _CollapseState:
@@ -132,22 +116,18 @@ class _CollapseState:
         self._set_quadrics()
 
     def collapse_round(self, at_most: int) -> int:
-        """Do up to `at_most` collapses whose removed nodes share no element, the best for the
-        elements first, and return their number.
-        """
-        collapses = self._candidates()
-        if not len(collapses.removed):
+        """Do the best collapses that share no element; return their number."""
+        pairs = self._candidates()
+        if not len(pairs):
             return 0
-        cost = self._costs(collapses)
+        cost = self._costs(*pairs.T)
         is_valid = np.isfinite(cost)
-        collapses = collapses.subset(is_valid)
-        cost = cost[is_valid]
-        order = np.argsort(cost, kind="stable")
-        _, first = np.unique(collapses.removed[order], return_index=True)
-        collapses = collapses.subset(order[np.sort(first)])
-        chosen = self._independent(collapses.removed)
-        self._apply(collapses.subset(chosen[:at_most]))
-        return len(chosen[:at_most])
+        pairs = pairs[is_valid][np.argsort(cost[is_valid], kind="stable")]
+        _, first = np.unique(pairs[:, 0], return_index=True)
+        pairs = pairs[np.sort(first)]
+        chosen = self._independent(pairs[:, 0])[:at_most]
+        self._apply(*pairs[chosen].T)
+        return len(chosen)
 
     def result(self, mesh: TetMesh) -> CoarseMesh:
         """Return the present mesh; `mesh` is the given one."""
@@ -162,17 +142,13 @@ class _CollapseState:
         )
 
     def _faces(self) -> Index:
-        """Return the triangles (F, 3) between groups and on the boundary, each once, with sorted
-        corners.
-        """
+        """Return the triangles (F, 3) between groups and on the boundary, corners sorted."""
         groups = self.groups[self.sources]
         faces = [boundary_of(self.cells[groups == group])[0] for group in np.unique(groups)]
         return np.unique(np.sort(np.concatenate(faces), axis=1), axis=0)
 
     def _set_quadrics(self) -> None:
-        """Set the quadrics (n, 4, 4) of the planes of the boundary triangles at each node, weighted
-        with their areas, and the sums of these areas (n,).
-        """
+        """Set area-weighted quadrics (n, 4, 4) of the boundary planes and the areas (n,)."""
         faces = self._faces()
         a, b, c = np.moveaxis(self.points[faces], 1, 0)
         normals = np.cross(b - a, c - a) / 2
@@ -186,10 +162,8 @@ class _CollapseState:
             np.add.at(self.quadrics, corner, each)
             np.add.at(self.areas, corner, areas)
 
-    def _candidates(self) -> _Collapses:
-        """Return the collapses that labels, groups, surface and length allow, for each node those
-        onto its nearest neighbours, at most `NEIGHBOURS`.
-        """
+    def _candidates(self) -> Index:
+        """Return pairs (k, 2): removed nodes, and their nearest neighbours that are kept."""
         n = len(self.points)
         edges = unique_edges(self.cells)
         faces = self._faces()
@@ -211,9 +185,9 @@ class _CollapseState:
         )
         pairs = pairs[is_near_surface]
         order = np.lexsort((lengths[is_near_surface], pairs[:, 0]))
-        removed, kept = pairs[order].T
-        rank = np.arange(len(removed)) - np.searchsorted(removed, removed)
-        return _Collapses(removed, kept).subset(rank < NEIGHBOURS)
+        pairs = pairs[order]
+        rank = np.arange(len(pairs)) - np.searchsorted(pairs[:, 0], pairs[:, 0])
+        return pairs[rank < NEIGHBOURS]
 
     def _stays_in_groups(self, removed: Index, kept: Index) -> NDArray[np.bool_]:
         """Return whether each kept node (k,) has elements of all groups of the removed one."""
@@ -224,28 +198,24 @@ class _CollapseState:
         return np.asarray(~outside.any(axis=1))
 
     def _surface_distances(self, removed: Index, kept: Index) -> Array:
-        """Return the root mean square distances (k,) [m] of the kept nodes from the planes of the
-        boundary at the removed nodes; zero for nodes inside.
-        """
+        """RMS distances (k,) [m] of kept nodes from the planes at the removed ones."""
         at = np.column_stack([self.points[kept], np.ones(len(kept))])
         squares = np.einsum("ki,kij,kj->k", at, self.quadrics[removed], at)
         areas = self.areas[removed]
         mean = np.divide(squares, areas, out=np.zeros_like(squares), where=areas > 0)
         return np.sqrt(np.maximum(mean, 0.0))
 
-    def _costs(self, collapses: _Collapses) -> Array:
-        """Return the cost (k,) of each collapse: the smallest quality of the new elements, with the
-        opposite sign; infinite where it is not admissible.
-        """
+    def _costs(self, removed: Index, kept: Index) -> Array:
+        """Return minus the smallest quality (k,) of the new elements; infinite if inadmissible."""
         incidence = self._incidence()
-        starts = incidence.indptr[collapses.removed]
-        counts = incidence.indptr[collapses.removed + 1] - starts
+        starts = incidence.indptr[removed]
+        counts = incidence.indptr[removed + 1] - starts
         of_collapse = np.repeat(np.arange(len(counts)), counts)
         offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         elements = incidence.indices[np.repeat(starts, counts) + offsets]
         corners = self.cells[elements]
-        removed = collapses.removed[of_collapse, None]
-        kept = collapses.kept[of_collapse, None]
+        removed = removed[of_collapse, None]
+        kept = kept[of_collapse, None]
         stays = ~(corners == kept).any(axis=1)
         of_collapse = of_collapse[stays]
         before = corners[stays]
@@ -258,11 +228,9 @@ class _CollapseState:
         return np.where((quality >= limit) & np.isfinite(quality), -quality, np.inf)
 
     def _qualities(self, cells: Index) -> Array:
-        """Return the mean ratios (k,) of elements (k, 4) as of `mean_ratios`; −1 if an element is
-        inverted, flat up to rounding, or has too long an edge.
-        """
+        """Return `mean_ratios` (k,); −1 for inverted, flat or too long elements."""
         volumes = signed_volumes(self.points, cells)
-        is_valid = volumes > LEAST_VOLUME * self.coarse_edge_m**3
+        is_valid = volumes > 1e-6 * self.coarse_edge_m**3
         lengths = edge_lengths(self.points, cells[is_valid])
         ratios = 12 * (3 * volumes[is_valid]) ** (2 / 3)
         ratios /= (lengths**2).sum(axis=1)
@@ -278,9 +246,7 @@ class _CollapseState:
         return sp.csr_array((np.ones(self.cells.size), places), shape=shape)
 
     def _independent(self, removed: Index) -> Index:
-        """Return indices, ascending, of nodes (k,) of which no two share an element; of two that
-        do, the earlier one is preferred.
-        """
+        """Return indices of nodes of which no two share an element, earlier ones first."""
         rank = np.full(len(self.points), len(removed))
         rank[removed] = np.arange(len(removed))
         chosen: list[Index] = []
@@ -295,19 +261,19 @@ class _CollapseState:
             rank[blocked] = len(removed)
         return np.sort(np.concatenate(chosen))
 
-    def _apply(self, collapses: _Collapses) -> None:
+    def _apply(self, removed: Index, kept: Index) -> None:
         """Do collapses whose removed nodes share no element, in place."""
         target = np.arange(len(self.points))
-        target[collapses.removed] = collapses.kept
-        np.add.at(self.quadrics, collapses.kept, self.quadrics[collapses.removed])
-        np.add.at(self.areas, collapses.kept, self.areas[collapses.removed])
+        target[removed] = kept
+        np.add.at(self.quadrics, kept, self.quadrics[removed])
+        np.add.at(self.areas, kept, self.areas[removed])
         cells = target[self.cells]
         repeated = np.diff(np.sort(cells, axis=1), axis=1) == 0
         remains = ~repeated.any(axis=1)
         self.cells = cells[remains]
         self.sources = self.sources[remains]
         self.moved_to = target[self.moved_to]
-        self.node_count -= len(collapses.removed)
+        self.node_count -= len(removed)
 
 
 def _is_smooth(edges: Index, faces: Index, n: int) -> NDArray[np.bool_]:

@@ -343,9 +343,7 @@ def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:
-    """Return a contiguous array that cannot be modified; an argument that is contiguous is itself
-    made read-only and returned.
-    """
+    """Return the array, contiguous and read-only; a copy only if it is not contiguous."""
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
     return array

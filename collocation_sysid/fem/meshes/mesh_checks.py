@@ -232,9 +232,7 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
-    """Raise an `InputError` if a used node has coordinates that are not finite; `used` are the
-    indices of the nodes that an element has.
-    """
+    """Raise an `InputError` if a used node has coordinates that are not finite."""
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(
@@ -258,9 +256,7 @@ def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
 
 
 def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
-    """Raise an `InputError` if an element has almost no volume, of either sign: at most
-    `DEGENERATE_RATIO` of its mean edge length cubed.
-    """
+    """Raise an `InputError` if an element has almost no volume, of either sign."""
     volumes = np.abs(signed_volumes(points, tetrahedra))
     cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
     bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)

@@ -215,9 +215,7 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
 
 @contextlib.contextmanager
 def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
-    """Context that turns a failure on an invalid file into one `InputError` with the path, and
-    prints nothing.
-    """
+    """Turn a failure on an invalid file into one `InputError`, and print nothing."""
     captured = io.StringIO()
     try:
         with (
@@ -295,17 +293,13 @@ def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
 
 
 def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
-    """Return the name of a physical group without a name: "physical_3", or "physical_3_surface" if
-    groups of other dimensions have the same tag (`ambiguous`).
-    """
+    """Return "physical_3", or "physical_3_surface" if other dimensions have this tag too."""
     kind = ("points", "lines", "surface", "volume")[dimension]
     return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
 
 
 def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
-    """Return the mask (n,) of the nodes of cells that are selected by one mask for each block of
-    the file.
-    """
+    """Return the mask (n,) of the nodes of cells selected by one mask for each block."""
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
         chosen[np.asarray(block.data)[mask].ravel()] = True
@@ -329,9 +323,7 @@ def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np
 
 
 def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
-    """Return for each name the corners (k, 3) of the triangles on which an array given block by
-    block is 1. Arrays with other values than 0 and 1, or without a 1, are omitted.
-    """
+    """Return the triangles (k, 3) on which arrays of only 0 and 1, by block, are 1."""
     blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
     sets = {}
     for name, per_block in arrays.items():
@@ -352,9 +344,7 @@ def _cell_counts(data: MeshContent) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
-    """Return numbers of cells by type as text, such as "12 tetra, 3 line"; "no cells at all" if
-    empty.
-    """
+    """Return counts as text, such as "12 tetra, 3 line"; "no cells at all" if empty."""
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 

@@ -120,9 +120,7 @@ def read_content(path: str | Path) -> MeshContent:
 
 
 def _is_small_and_safe(path: Path) -> bool:
-    """Return whether a file is a small .vtu without parts that could exceed its size when
-    decoded.
-    """
+    """Return whether a file is a small .vtu that decoding cannot enlarge."""
     if path.suffix.lower() != ".vtu" or path.stat().st_size > SMALL_BYTES:
         return False
     content = path.read_bytes()

@@ -147,9 +147,6 @@ def refine_body(body: Body) -> Body:
 
 
 def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
-    """Return the statement about the rest shape for the refined body: None if `body` has none,
-    "stress_free", or the scan conditions with the held nodes of the refined `mesh`.
-    """
     if body.scan_conditions is None:
         return None if body.rest_shape is None else "stress_free"
     if isinstance(body.scan_conditions.nodes, (Box, Ball)):

@@ -21,9 +21,6 @@ from .mesh import ElementNodes, TetMesh
 # Tolerance in diagonals of the body: nodes on a box's face must not be lost by rounding.
 ROUND_OFF = 1e-9
 OF_CELLS = "cells, by their centres"
-# Tolerance of a plane in diagonals of the body: nodes of a file in single precision on one plane
-# are this close to it.
-FACE_TOLERANCE = 1e-6
 FaceName = Literal["top", "bottom", "side_x", "side_y"]
 
 
@@ -31,9 +28,7 @@ class _PositionSelection:
     """Base class of selections by position."""
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`, mid nodes
-        included.
-        """
+        """Return the sorted indices of the selected nodes, mid nodes included."""
         hint = self._nearest_hint(nodes.points_m)
         return _indices_or_error(
             self._contains(nodes.points_m), nodes.mesh, what=str(self), of="nodes" + hint
@@ -190,14 +185,13 @@ class Face(_PositionSelection):
         )
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the points in the plane through the outermost point, within a
-        tolerance relative to the diagonal of the points (n, 3).
-        """
+        """Return the mask (n,) of the points in the plane through the outermost one."""
         axis, sign = {"top": (2, -1), "bottom": (2, 1), "side_x": (0, 1), "side_y": (1, 1)}[
             self.name
         ]
         inwards_m = sign * points_m[:, axis]
-        tolerance_m = FACE_TOLERANCE * float(np.linalg.norm(np.ptp(points_m, axis=0)))
+        # Nodes of a file in single precision on one plane are this close to it.
+        tolerance_m = 1e-6 * float(np.linalg.norm(np.ptp(points_m, axis=0)))
         return np.asarray(inwards_m <= inwards_m.min() + tolerance_m)
 
     def __str__(self) -> str:
@@ -424,17 +418,12 @@ def _indices_or_error(
 
 
 def _describe_bounds(bounds_m: np.ndarray) -> str:
-    """Return the bounds of a body as text, from a row of three lowest and a row of three highest
-    coordinates (2, 3) [m].
-    """
     axes = zip("xyz", *bounds_m, strict=True)
     return ", ".join(f"{axis} from {low:.4g} to {high:.4g} m" for axis, low, high in axes)
 
 
 def _tolerance_m(points_m: np.ndarray) -> float:
-    """Return the tolerance of positions for rounding [m]: a fraction of the diagonal of the points
-    (n, 3).
-    """
+    """Return the tolerance for rounding [m]: a fraction of the diagonal of points (n, 3)."""
     return ROUND_OFF * float(np.linalg.norm(np.ptp(points_m, axis=0)))
 
 

@@ -114,9 +114,7 @@ def count_cylinder_elements(
 
 
 def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
-    """Return the numbers of elements along lengths, as floats: rounded to the nearest whole number,
-    at least 1.
-    """
+    """Return the numbers of elements along lengths, as floats, at least 1."""
     if not edge_length_m > 0:
         raise InputError(
             f"found {edge_length_m!r}; expected a positive length in metres",
@@ -234,9 +232,7 @@ def cylinder_mesh(
 
 
 def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (1 + sectors · rings (rings + 1)/2, 2) and triangles (sectors · rings², 3) of
-    the unit disc: its centre first, then ring by ring.
-    """
+    """Return nodes (m, 2) and triangles (k, 3) of the unit disc: centre, then ring by ring."""
     counts = [sectors * k for k in range(1, rings + 1)]
     angles = [2 * np.pi * np.arange(count) / count for count in counts]
     circles = [
@@ -245,9 +241,7 @@ def _disc(rings: int, sectors: int) -> tuple[np.ndarray, np.ndarray]:
     ]
 
     def node(ring: int, sector: int, step: int) -> int:
-        """Return the index of a node: number `step` of a sector of a ring, counting from 0 and on
-        into the next sector; of the centre for ring 0.
-        """
+        """Index of a node: number `step` of a sector of a ring, or of the next sector."""
         if not ring:
             return 0
         before = 1 + sectors * ring * (ring - 1) // 2

@@ -138,9 +138,7 @@ def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndar
 
 
 def _require_closed(triangles: np.ndarray) -> None:
-    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3), or if there
-    is no triangle.
-    """
+    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3)."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
     open_edges = int((count == 1).sum())
