@@ -8,6 +8,8 @@ residuals are small. If they are not, as with measurement noise, Gauss–Newton 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.linalg import solve_triangular
 
@@ -16,6 +18,7 @@ from ..errors import InputError
 from ..program.collocation import Collocation
 from ..program.least_squares import SquareRootInformation
 from ..program.stopwatch import Stopwatch
+from ..program.sweep import Sweep
 from .horizon import Iterate
 from .solution import constraint_multipliers
 
@@ -137,24 +140,50 @@ def exact_curvature(
     projected = [each.x + each.step for each in iterate.trajectories]
     z = collocation.pack(iterate.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
-    directions = np.column_stack(
-        [_tangent_direction(collocation, iterate, k=k) for k in range(len(iterate.p))]
-    )
+    directions = tangent_directions(collocation, [each.by_p for each in iterate.trajectories])
     hessian = collocation.hessian(z, 1.0, multipliers=multipliers)
     reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
     return (reduced + reduced.T) / 2 - iterate.fit.compute_information()
 
 
-def _tangent_direction(collocation: Collocation, iterate: Iterate, k: int) -> Array:
-    """Return the change (variables,) of all variables per unit of the parameter with index k, along
-    the equations of motion linearised at `iterate`; other parameters do not change. Both are those
-    of `collocation`, in its coordinates p and its scaling of z.
+def tangent_directions(collocation: Collocation, by_p: Sequence[Array]) -> Array:
+    """Return the changes (variables, np) of all variables, without lifted ones, per unit of each
+    parameter along the linearised equations of motion, from the `sensitivities` of the positions.
     """
-    unit = np.eye(len(iterate.p))[k]
-    position_changes = [
-        each.by_p @ unit[transcription.list_parameter_indices()[transcription.dynamic_parameters]]
-        for each, transcription in zip(
-            iterate.trajectories, collocation.transcriptions, strict=True
-        )
+    moving = [s.list_parameter_indices()[s.dynamic_parameters] for s in collocation.transcriptions]
+    return np.column_stack(
+        [
+            Collocation.pack(
+                collocation, unit, [z @ unit[own] for z, own in zip(by_p, moving, strict=True)]
+            )
+            for unit in np.eye(collocation.nq + collocation.nphi)
+        ]
+    )
+
+
+def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
+    """Return the sensitivities dx/dp of each experiment at z, (N, 3n, m) [m per unit of p].
+
+    The m parameters p are q and those φ of the experiment that change its motion, in the order of
+    `Transcription.dynamic_parameters`. Prescribed dofs have zeros, and so has x_0 unless it follows
+    as an equilibrium.
+
+    Parameters
+    ----------
+    z : (variables,) array
+        Variables that satisfy the equations of motion.
+
+    Returns
+    -------
+    list of (N, 3n, m) arrays
+        Sensitivities at the N grid times of each experiment.
+
+    Raises
+    ------
+    SimulationError
+        If the equations of a step are singular.
+    """
+    return [
+        np.stack(list(Sweep(part.transcription).sensitivities(part.x, part.equations)))
+        for part in collocation.iterates(z)
     ]
-    return collocation.pack(unit, position_changes)

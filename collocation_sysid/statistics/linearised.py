@@ -35,34 +35,6 @@ from ..program.reactions.reaction_forces import GraspForces
 from ..program.sweep import Sweep
 
 
-def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
-    """Return the sensitivities dx/dp of each experiment at z, (N, 3n, m) [m per unit of p].
-
-    The m parameters p are q and those φ of the experiment that change its motion, in the order of
-    `Transcription.dynamic_parameters`. Prescribed dofs have zeros, and so has x_0 unless it follows
-    as an equilibrium.
-
-    Parameters
-    ----------
-    z : (variables,) array
-        Variables that satisfy the equations of motion.
-
-    Returns
-    -------
-    list of (N, 3n, m) arrays
-        Sensitivities at the N grid times of each experiment.
-
-    Raises
-    ------
-    SimulationError
-        If the equations of a step are singular.
-    """
-    return [
-        np.stack(list(Sweep(part.transcription).sensitivities(part.x, part.equations)))
-        for part in collocation.iterates(z)
-    ]
-
-
 @one_blas_thread()
 def observable_responses(collocation: Collocation, z: Array) -> list[ObservableResponse]:
     """Return the changes of the observables of each experiment with its parameters, computed in

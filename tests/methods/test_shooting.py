@@ -29,12 +29,12 @@ from collocation_sysid.methods.comparison.shooting import (
     adjoint_gradient,
     simulate_variables,
 )
+from collocation_sysid.methods.loss_curvature import sensitivities
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment
-from collocation_sysid.statistics.linearised import sensitivities
 
 GRADIENTS = ("forward", "adjoint")
 

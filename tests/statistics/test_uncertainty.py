@@ -20,6 +20,7 @@ from scipy.stats import chi2
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.laws.moduli import engineering_constants
+from collocation_sysid.methods.loss_curvature import sensitivities
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
@@ -27,7 +28,7 @@ from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.statistics.linearised import observable_responses, sensitivities
+from collocation_sysid.statistics.linearised import observable_responses
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
 
 AT_TRUTH = GUESS.with_guess(TRUTH)
