@@ -38,8 +38,9 @@ GROUP_PREFIXES = {
     "visible_points": "visible_",
     "outlines": "outline_",
 }
-# Prefix of the unit of a custom sensor, before its name.
+# Prefixes of the unit of a custom sensor and of the names of its numbers, before its name.
 UNIT_PREFIX = "unit_"
+COLUMNS_PREFIX = "columns_"
 # Arrays of the body, the same for all experiments of a run but specimens, which have their own.
 BODY_ARRAYS = (
     "undeformed_m",
@@ -157,6 +158,8 @@ class MotionRecord:
     # mapping of name to str: units of the custom sensors that state one, and of image coordinates,
     # see `image_key`.
     reading_units: Mapping[str, str] = field(default_factory=dict)
+    # mapping of name to m str: names of the numbers of each custom sensor.
+    reading_columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     # (T,), or None: strain of a specimen without a mesh; None for other experiments.
     strain: Array | None = None
     # (T, 3), or None: displacement along a line of a test bench whose force is measured; None for
@@ -225,6 +228,7 @@ class MotionRecord:
                 image_key(camera.name): image_unit(camera.camera.matrix is not None)
                 for camera in experiment.depths
             },
+            reading_columns={each.name: [*each.columns] for each in experiment.readings},
             strain=specimen_strains(experiment)[0] if experiment.specimen else None,
             travel_m=bench_travel(experiment),
             **recorded,
@@ -278,6 +282,8 @@ class MotionRecord:
         for group, front in GROUP_PREFIXES.items():
             stored |= {f"{front}{name}": values for name, values in getattr(self, group).items()}
         stored |= {f"{UNIT_PREFIX}{n}": np.array(unit) for n, unit in self.reading_units.items()}
+        for name, columns in self.reading_columns.items():
+            stored[f"{COLUMNS_PREFIX}{name}"] = np.array(columns)
         there = {key: value for key, value in stored.items() if value is not None}
         shared = BODY_ARRAYS if self.strain is None else ()
         return {key if key in shared else prefix + key: value for key, value in there.items()}
@@ -318,6 +324,12 @@ class MotionRecord:
             name: str(arrays[at])
             for name in (*stored["readings"], *map(image_key, stored["visible_points"]))
             if (at := f"{prefix}{UNIT_PREFIX}{name}") in arrays
+        }
+        stored["reading_columns"] = {
+            name: [str(column) for column in arrays[at]]
+            for name, values in stored["readings"].items()
+            if (at := f"{prefix}{COLUMNS_PREFIX}{name}") in arrays
+            and 3 * len(arrays[at]) + 1 == values.shape[1]
         }
         stored["static"] = bool(arrays.get(f"{prefix}static", False))
         _require_shapes(stored)

@@ -13,6 +13,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
+from kit.filmed import NAMES, swung, tracks_of
 from kit.problems import (
     GUESS,
     TRUTH,
@@ -264,6 +265,30 @@ def test_measurements_about_a_prediction_of_zero_are_drawn_if_they_are_no_noise(
     assert len(figure.axes) == 2
     alone = sensor_picture(np.column_stack([t_s, *[0 * t_s] * 3]), ["fx"], ["N"])
     assert len(alone.axes) == 1  # nothing else could be drawn
+
+
+def test_of_many_numbers_those_with_the_largest_errors_are_drawn():
+    t_s = np.linspace(0.0, 1.0, 10)
+    measured = np.outer(t_s, np.ones(20))
+    fitted = measured + 0.01 * np.arange(20)
+    figure = sensor_picture(
+        np.column_stack([t_s, measured, fitted, fitted]), [f"n{k}" for k in range(20)]
+    )
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [f"n{k}" for k in range(5, 20)]
+    assert figure.legends[0].get_title().get_text().startswith("15 of 20 numbers")
+
+
+def test_numbers_of_a_sensor_have_the_names_of_its_columns():
+    tracks = tracks_of()
+    experiment = swung([tracks])
+    values = np.column_stack([tracks.t_s, *[tracks.measured_values] * 3])
+    record = MotionRecord.from_experiment(experiment, recorded={"readings": {"front": values}})
+    kept = MotionRecord.from_arrays("swing", record.to_arrays())
+    pictures = dict(experiment_pictures(kept))
+    figure = pictures["reading_swing_front"]
+    titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
+    assert titles == [f"{name}_{axis}" for name in NAMES for axis in "uv"]
+    assert {axes.get_ylabel() for axes in figure.axes[:3]} == {"[px]"}
 
 
 def test_errors_far_apart_get_a_logarithmic_axis():

@@ -150,6 +150,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
     for name, values in replay.readings.items():
         places = values.shape[1] // 3
         names = [f"{name} {k + 1}" for k in range(places)] if places > 1 else [name]
+        names = replay.reading_columns.get(name, names)
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
         yield (f"reading_{replay.name}_{name}", sensor_picture(values, names, units=units))

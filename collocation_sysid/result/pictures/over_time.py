@@ -261,6 +261,8 @@ HEIGHT_MM = 42.0
 # over the largest of those of the same unit: an identity up to rounding, and noise.
 VANISHING_PREDICTION = 1e-6
 VANISHING_MEASUREMENT = 0.02
+# Largest number of panels, with which the figure fits on a page.
+MOST_PANELS = 15
 
 
 def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = ()) -> Figure:
@@ -268,7 +270,8 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
     torque.
 
     Numbers without any measurement are left out, and those that vanish, as the tangential force of
-    an obstacle without friction does; at least one must be measured.
+    an obstacle without friction does; at least one must be measured. Of more than `MOST_PANELS`,
+    those with the largest errors are shown.
 
     Parameters
     ----------
@@ -283,6 +286,14 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
         samples, [1, *np.cumsum([len(names)] * 2) + 1], axis=1
     )
     shown = _shown_numbers(measured, np.vstack([fitted, rolled_out]), units)
+    title = ""
+    if len(shown) > MOST_PANELS:
+        title = f"{MOST_PANELS} of {len(shown)} numbers, those with the largest errors"
+        model = fitted if np.isfinite(fitted).any() else rolled_out
+        errors = (model - measured)[:, shown]
+        known = np.maximum(1, np.isfinite(errors).sum(axis=0))
+        worst = np.argsort(-np.nansum(errors**2, axis=0) / known, kind="stable")[:MOST_PANELS]
+        shown = [shown[k] for k in sorted(worst.tolist())]
     columns = min(3, len(shown))
     size = PAGE_MM / 25.4, HEIGHT_MM * -(-len(shown) // columns) / 25.4
     figure = NotebookFigure(figsize=size, layout="constrained")
@@ -305,7 +316,8 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
             each.plot(t_s[:, 0], values[:, k], label=label, **style)
     for each in grid.flat[len(shown) :]:
         each.set_visible(False)
-    add_figure_legend(figure, 3)
+    title_style = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
+    add_figure_legend(figure, 3, **title_style)
     return figure
 
 
