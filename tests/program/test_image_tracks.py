@@ -18,6 +18,7 @@ from kit.filmed import (
     PLACES_M,
     T_S,
     TRUTH,
+    bar,
     filming,
     motion_m,
     projected,
@@ -280,19 +281,51 @@ def test_unknown_places_cross_creases_to_faces_that_the_camera_sees() -> None:
     at[front, 2] = 0.021  # beyond the upper edge of the front
     at[top, 1] = -0.001  # beyond the front edge of the top
     at[end, 0] = 0.121  # towards the end, which looks away from the camera
-    moved = found._with_faces_of(at)
+    shapes = np.tile(bar().nodes_m, (1, 1, 1))
+    moved = found._with_faces_of(at, shapes)
     places = moved.association.centre_places_m
     axes = moved.association.axes
     normals = np.cross(axes[..., 0], axes[..., 1])
-    np.testing.assert_allclose(places[front], [at[front, 0], 0.0, 0.02], atol=1e-12)
+    # They appear where they did: on the line from the camera through the point beyond the edge.
+    eye = np.array(EYES_M["front"])
+    for point, plane, height in ((front, 2, 0.02), (top, 1, 0.0)):
+        way = at[point] - eye
+        there = eye + way * (height - eye[plane]) / way[plane]
+        np.testing.assert_allclose(places[point], there, atol=1e-12)
     np.testing.assert_allclose(abs(normals[front]), [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(places[top], [at[top, 0], 0.0, 0.02], atol=1e-12)
     np.testing.assert_allclose(abs(normals[top]), [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(places[end], at[end], atol=1e-12)
     np.testing.assert_allclose(abs(normals[end]), [0, 1, 0], atol=1e-12)
     # Places that are stated stay on their side.
     stated = residual_of(tracks_of()).correspondences
-    assert not np.any(stated._with_faces_of(at).crossings)
+    assert not np.any(stated._with_faces_of(at, shapes).crossings)
+    # Places that cameras share cross at the edge: cameras must not disagree about them.
+    both = residual_of(tracks_of(known=False), tracks_of("side", known=False)).correspondences
+    shared = both._with_faces_of(at, shapes).association.centre_places_m
+    np.testing.assert_allclose(shared[front], [at[front, 0], 0.0, 0.02], atol=1e-12)
+
+
+def test_places_are_found_where_a_stated_pose_lets_all_rays_miss_the_body() -> None:
+    off = np.eye(4)
+    off[:3, :3] = Rotation.from_euler("x", 3, degrees=True).as_matrix()
+    tracks = tracks_of(known=False, camera=filming("front", pose=filming("front").pose @ off))
+    pixels = np.array(tracks.pixels)
+    pixels[:, NAMES.index("tip_end")] = np.nan  # which the camera does not see
+    residual = residual_of(tracks.with_samples(T_S, pixels.reshape(len(T_S), -1)))
+    found = residual.correspondences
+    nodes_m = bar().nodes_m
+    eye = found.translations[0]
+    rays = tracks.camera.points_at_unit_depth(pixels[0, [0, 2]]) @ found.rotations[0].T
+    missed = points_on_surface(np.tile(eye, (2, 1)), rays, nodes_m, bar().mesh.surface)[2]
+    assert (missed > 0).all()
+    # Only the pose is turned, by about its error, and no two points are at the same corner.
+    assert abs(found.start_pose[0]) == pytest.approx(3.0, abs=1.0)
+    assert abs(found.start_pose[1:]).max() < 2.0
+    phi = found.with_start_values(np.zeros(residual.nuisance.size))
+    places = np.delete(found.places_m(phi), NAMES.index("tip_end"), axis=0)
+    np.testing.assert_allclose(places, np.delete(list(PLACES_M.values()), 1, axis=0), atol=0.03)
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    assert (apart[np.triu_indices(len(places), 1)] > 1e-3).all()
 
 
 @pytest.mark.long
@@ -355,6 +388,11 @@ def test_rays_find_the_nearest_of_several_triangles() -> None:
     assert (faces[0], missed[0]) == (1, 0.0)
     np.testing.assert_allclose(shares[0] @ corners[surface[1]], [0, 0, 1], atol=1e-12)
     assert points_on_surface(down, np.array([[1.0, 1, -1]]), corners, surface)[2][0] > 0.1
+    # A miss is next to an edge, also far from its ends.
+    ahead = np.array([[0.0, -0.6, -1.0]])
+    faces, shares, missed = points_on_surface(down, ahead, corners, surface)
+    np.testing.assert_allclose(shares[0] @ corners[surface[faces[0]]], [0, -1, 1], atol=1e-12)
+    assert np.arcsin(missed[0]) == pytest.approx(np.arctan(0.6) - np.arctan(0.5), rel=1e-9)
 
 
 def test_tracks_can_be_pickled_and_shortened() -> None:

@@ -94,7 +94,8 @@ def points_on_surface(
     -------
     (P,) array of int, (P, 3) array, (P,) array
         Triangle, barycentric coordinates in it, and sine of the angle by which the ray misses the
-        surface: zero for a hit; of a miss, triangle and coordinates of the nearest corner.
+        surface: zero for a hit; of a miss, triangle and coordinates of the point on the outline
+        that is nearest in view.
     """
     triangles = nodes_m[surface]
     is_hit, distance, shares = ray_hits(origins, directions, triangles)
@@ -102,17 +103,40 @@ def points_on_surface(
     coordinates = np.clip(shares[np.arange(len(faces)), faces], 0.0, 1.0)
     missed = np.zeros(len(faces))
     for k in np.flatnonzero(~is_hit.any(axis=1)):
-        direction = directions[k] / np.linalg.norm(directions[k])
-        away = triangles.reshape(-1, 3) - origins[k]
-        sines = np.linalg.norm(cross(away, direction), axis=1) / np.linalg.norm(away, axis=1)
-        sines[away @ direction <= 0] = 1.0
-        nearest = int(sines.argmin())
-        faces[k], corner = divmod(nearest, 3)
-        coordinates[k] = np.eye(3)[corner]
-        missed[k] = sines[nearest]
+        faces[k], coordinates[k], missed[k] = _nearest_in_view(origins[k], directions[k], triangles)
     coordinates[~np.isfinite(coordinates).all(axis=1)] = 1 / 3
     coordinates /= coordinates.sum(axis=1, keepdims=True)
     return faces, coordinates, missed
+
+
+def _nearest_in_view(origin: Array, direction: Array, triangles: Array) -> tuple[int, Array, float]:
+    """Return the triangle, barycentric coordinates (3,) in it, and sine of the angle to a ray, of
+    the point of a surface that is nearest in view; of the triangles that look at the origin, because
+    the others are behind them.
+    """
+    ahead = direction / np.linalg.norm(direction)
+    # Two axes across the ray, in which edges are straight at depth one.
+    across = np.linalg.svd(ahead[None])[2][1:]
+    away = triangles - origin
+    depth = away @ ahead
+    is_seen = (depth > 0).all(axis=1)
+    looks = facing(triangles, triangles.mean(axis=1), origin) > 0
+    chosen = np.flatnonzero(is_seen & looks if (is_seen & looks).any() else is_seen)
+    if not len(chosen):
+        return 0, np.full(3, 1 / 3), 1.0
+    at = np.einsum("ki,fci->fck", across, away[chosen]) / depth[chosen, :, None]
+    begins, ends = at, np.roll(at, -1, axis=1)
+    way = ends - begins
+    length2 = np.maximum(np.einsum("fck,fck->fc", way, way), 1e-300)
+    share = np.clip(-np.einsum("fck,fck->fc", begins, way) / length2, 0.0, 1.0)
+    nearest = np.linalg.norm(begins + share[..., None] * way, axis=2)
+    face, edge = divmod(int(nearest.argmin()), 3)
+    # Shares of an edge at depth one are those of the inverse depths.
+    inverse = np.array([1 - share[face, edge], share[face, edge]])
+    inverse /= depth[chosen[face], [edge, (edge + 1) % 3]]
+    coordinates = np.zeros(3)
+    coordinates[[edge, (edge + 1) % 3]] = inverse / inverse.sum()
+    return int(chosen[face]), coordinates, float(np.sin(np.arctan(nearest[face, edge])))
 
 
 def is_occluded(

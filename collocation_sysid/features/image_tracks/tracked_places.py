@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +54,13 @@ TURNS_HIDDEN = -0.1
 SMOOTH = 0.7
 # Creases that an unknown place may cross: its first ray may meet the wrong side of an edge, because
 # the first shape is that of the guess.
-MOST_CREASES = 4
+MOST_CREASES = 10
 # Distance of a stated place from the body over its diagonal from which on it is a mistake.
 FAR_OFF = 0.25
 # Iterations that align a camera with the first image.
 ALIGNMENT_EVALUATIONS = 60
+# Step of the errors of a pose in standard deviations, for differences.
+POSE_STEP = 1e-6
 # Share of the visible samples up to which changes are ignored.
 SETTLED = 0.01
 # Distance in mean edges in front of a point at which another part of the surface hides it.
@@ -71,8 +74,11 @@ ShapesAt = Callable[[Array], Array]
 
 def find_places(
     experiment: Experiment, shapes_at: ShapesAt
-) -> tuple[dict[str, Array], dict[str, float], dict[str, Array]]:
+) -> tuple[dict[str, Array], dict[str, float], dict[str, Array], dict[str, Array]]:
     """Return the poses of the cameras and the places of the points of an experiment.
+
+    Where rays of the first images miss the body, or points with a stated place appear elsewhere, the
+    pose is off: places are found with the errors of the pose that explain these images best.
 
     Parameters
     ----------
@@ -87,6 +93,8 @@ def find_places(
         Of cameras whose pose was found: the RMS of the second best pose over that of the best one.
     places_m : mapping of str to (3,) array
         Place of each point on the undeformed body; NaN if no ray meets the body.
+    errors : mapping of str to (6,) array
+        Errors of the pose of each camera, with which its points are placed [rad, m].
 
     Raises
     ------
@@ -106,9 +114,16 @@ def find_places(
             poses[tracks.name] = found[0][0]
             mirrored[tracks.name] = found[1][1] / found[0][1] if len(found) > 1 else np.inf
     places = dict(stated)
+    errors = {}
     for tracks in cameras:
-        _add_places(places, tracks, poses[tracks.name], experiment.body, shapes_at)
-    return poses, mirrored, places
+        errors[tracks.name] = np.zeros(6)
+        if tracks.is_seen.any() and tracks.pixels is not None:
+            images = _FirstImages(experiment, tracks, poses[tracks.name], shapes_at, places)
+            errors[tracks.name] = images.pose_errors()
+            places |= images.places_m(errors[tracks.name])
+        for name in tracks.names:
+            places.setdefault(name, np.full(3, np.nan))
+    return poses, mirrored, places, errors
 
 
 def _require_on_body(places: Mapping[str, Array], rest: LocatedBody) -> None:
@@ -164,43 +179,130 @@ def _moved(place_m: Array, rest: LocatedBody, nodes_m: Array) -> Array:
     return np.asarray(weights @ nodes_m[nodes])
 
 
-def _add_places(
-    places: dict[str, Array], tracks: ImageTracks, pose: Array, body: Body, shapes_at: ShapesAt
-) -> None:
-    """Add the places of the points that have none and are seen by this camera, in place."""
-    seen = tracks.is_seen
-    if tracks.pixels is None:
-        for name in tracks.names:
-            places.setdefault(name, np.full(3, np.nan))
-        return
-    pixels = np.asarray(tracks.pixels)
-    camera = replace(tracks.camera, pose=pose)
-    tolerance = max(LEAST_MISS, MISSES * np.deg2rad(tracks.pose_sigma.turn_deg))
-    firsts = seen.argmax(axis=0)
-    for sample in np.unique(firsts):
-        chosen = [
-            k
-            for k in np.flatnonzero((firsts == sample) & seen[sample]).tolist()
-            if tracks.names[k] not in places or not np.isfinite(places[tracks.names[k]]).all()
-        ]
-        if not chosen:
-            continue
-        t_s = float(tracks.sample_times_s[sample])
-        rotations, translations = camera.pose_at(t_s)
-        rays = camera.points_at_unit_depth(pixels[sample, chosen])
-        origins = np.tile(translations[0], (len(chosen), 1))
-        nodes_m = shapes_at(np.array([t_s]))[0]
-        faces, shares, missed = points_on_surface(
-            origins, rays @ rotations[0].T, nodes_m, body.mesh.surface
+class _FirstImages:
+    """The first image of each point of a camera: its ray, and the shape of the body in it."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        tracks: ImageTracks,
+        pose: Array,
+        shapes_at: ShapesAt,
+        places_m: Mapping[str, Array],
+    ) -> None:
+        self.tracks, self.body = tracks, experiment.body
+        self.points = np.flatnonzero(tracks.is_seen.any(axis=0))
+        firsts = tracks.is_seen.argmax(axis=0)[self.points]
+        samples, self.shape_of = np.unique(firsts, return_inverse=True)
+        t_s = tracks.sample_times_s[samples]
+        self.shapes_m = shapes_at(t_s)
+        camera = replace(tracks.camera, pose=pose)
+        poses = camera.pose_at(t_s)
+        self.rotations, self.translations = (each[self.shape_of] for each in poses)
+        self.pixels = np.asarray(tracks.pixels)[firsts, self.points]
+        unknowns = tracks.camera_unknowns(experiment)
+        self.sigmas = np.array([unknowns.get(name, 0.0) for name in POSE_UNKNOWNS])
+        rest = LocatedBody(self.body.nodes_m, self.body)
+        # Where the points are whose places are known, NaN for the others.
+        self.known_m = np.full((len(self.points), 3), np.nan)
+        for k, point in enumerate(self.points.tolist()):
+            place = places_m.get(tracks.names[point])
+            if place is not None and np.isfinite(place).all():
+                self.known_m[k] = _moved(place, rest, self.shapes_m[self.shape_of[k]])
+        self.is_free = np.isnan(self.known_m[:, 0])
+        self.rays = np.zeros((len(self.points), 3))
+        if self.is_free.any():
+            self.rays[self.is_free] = camera.points_at_unit_depth(self.pixels[self.is_free])
+        self.is_left_out = np.zeros(len(self.points), dtype=bool)
+        # Rays that miss the body by more than the pose of the camera may be off.
+        _, at_m, missed = self._on_surface(np.zeros(6))
+        away_m = np.linalg.norm(at_m - self.translations, axis=1)
+        sigma = tracks.pose_sigma
+        allowed = max(LEAST_MISS, MISSES * np.deg2rad(sigma.turn_deg))
+        allowed = allowed + MISSES * sigma.shift_m / np.maximum(away_m, 1e-9)
+        self.is_left_out = self.is_free & (missed > allowed)
+
+    def _on_surface(self, errors: Array) -> tuple[Array, Array, Array]:
+        """Return where the rays of the points without a place meet the body, on the undeformed body
+        and in their images (P, 3) [m], and by which sines (P,) they miss it.
+        """
+        at_m, missed = self.known_m.copy(), np.zeros(len(self.points))
+        places_m = np.full_like(at_m, np.nan)
+        surface = self.body.mesh.surface
+        turn = Rotation.from_rotvec(errors[:3]).as_matrix()
+        rotations = self.rotations @ turn.T
+        origins = self.translations - rotations @ errors[3:]
+        directions = np.einsum("pij,pj->pi", rotations, self.rays)
+        for k, nodes_m in enumerate(self.shapes_m):
+            used = np.flatnonzero(self.is_free & ~self.is_left_out & (self.shape_of == k))
+            if len(used):
+                faces, shares, missed[used] = points_on_surface(
+                    origins[used], directions[used], nodes_m, surface
+                )
+                for points, nodes in ((at_m, nodes_m), (places_m, self.body.nodes_m)):
+                    points[used] = np.einsum("pc,pci->pi", shares, nodes[surface[faces]])
+        return places_m, at_m, missed
+
+    def places_m(self, errors: Array) -> dict[str, Array]:
+        """Return the places that were not known, with errors (6,) of the pose, by name."""
+        places_m = self._on_surface(errors)[0]
+        names = [str(self.tracks.names[k]) for k in self.points.tolist()]
+        return {names[k]: places_m[k] for k in np.flatnonzero(self.is_free).tolist()}
+
+    def pose_errors(self) -> Array:
+        """Return the errors (6,) of the pose, weighted by their priors, with which known points are
+        where they appear, and the rays of the others meet the body.
+
+        Of a pose that is off by many pixels, every residual would be beyond the threshold of Huber's
+        loss.
+        """
+        estimated = np.flatnonzero(self.sigmas)
+        errors = np.zeros(6)
+        used = ~self.is_left_out
+        is_exact = self.is_free.all() and not self._on_surface(errors)[2].any()
+        if not len(estimated) or is_exact or not used.any():
+            return errors
+
+        def errors_of(pose: Array) -> Array:
+            errors[estimated] = pose * self.sigmas[estimated]
+            return errors
+
+        def off(at_m: Array, pose: Array) -> Array:
+            turn, shift = np.split(errors_of(pose), 2)
+            own = np.einsum(
+                "pji,pj->pi", self.rotations[used], at_m[used] - self.translations[used]
+            )
+            own = own @ Rotation.from_rotvec(turn).as_matrix().T + shift
+            own[:, 2] = np.maximum(own[:, 2], 1e-3)
+            shown = self.tracks.camera.distorted_pixels(own)
+            return (shown - self.pixels[used]) / self.tracks.sigma_px
+
+        def differences(pose: Array) -> Array:
+            _, at_m, missed = self._on_surface(errors_of(pose))
+            is_met = (self.is_free & (missed == 0))[used]
+            return np.concatenate([np.where(is_met[:, None], 0, off(at_m, pose)).ravel(), pose])
+
+        def slopes(pose: Array) -> Array:
+            _, at_m, missed = self._on_surface(errors_of(pose))
+            stated = off(at_m, pose)
+            steps = POSE_STEP * np.eye(len(pose))
+            by_pose = [(off(at_m, pose + step) - stated) / POSE_STEP for step in steps]
+            changes = np.stack(by_pose, axis=-1)
+            # The nearest point of an outline moves along it.
+            away = stated / np.maximum(np.linalg.norm(stated, axis=1, keepdims=True), 1e-30)
+            free = self.is_free[used]
+            across = np.einsum("pa,pb,pbk->pak", away[free], away[free], changes[free])
+            changes[free] = across * (missed[used][free] > 0)[:, None, None]
+            return np.concatenate([changes.reshape(-1, len(pose)), np.eye(len(pose))])
+
+        fit = least_squares(
+            differences,
+            np.zeros(len(estimated)),
+            cast(Any, slopes),
+            loss="soft_l1",
+            max_nfev=ALIGNMENT_EVALUATIONS,
         )
-        at_m = np.einsum("pc,pci->pi", shares, body.nodes_m[body.mesh.surface[faces]])
-        own_m = np.einsum("pc,pci->pi", shares, nodes_m[body.mesh.surface[faces]])
-        distance = np.linalg.norm(own_m - origins, axis=1)
-        allowed = tolerance + MISSES * tracks.pose_sigma.shift_m / np.maximum(distance, 1e-9)
-        for k, place, miss, most in zip(chosen, at_m, missed, allowed, strict=True):
-            places[tracks.names[k]] = place if miss <= most else np.full(3, np.nan)
-    for name in tracks.names:
-        places.setdefault(name, np.full(3, np.nan))
+        return errors_of(fit.x).copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +333,8 @@ class TrackedPlaces(Correspondences):
     start_pose: Array = field(default_factory=lambda: np.zeros(0))
     obstacles: Sequence[Obstacle] = ()  # obstacles, which may hide points
     crossings: Index | int = 0  # (N,): how many creases each place has crossed
+    # (N,): whether other cameras have the same place
+    is_shared: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @classmethod
     def from_shapes(
@@ -242,7 +346,7 @@ class TrackedPlaces(Correspondences):
         pose_parameters: Index,
     ) -> TrackedPlaces:
         """Find places and pose with the shapes of the body, see `find_places`."""
-        poses, mirrored, places_m = find_places(experiment, shapes_at)
+        poses, mirrored, places_m, errors = find_places(experiment, shapes_at)
         body = experiment.body
         places = np.array([places_m[name] for name in tracks.names])
         is_placed = np.asarray(np.isfinite(places).all(axis=1))
@@ -253,6 +357,9 @@ class TrackedPlaces(Correspondences):
         shapes = shapes_at(tracks.sample_times_s)
         enterable = _enterable_faces(experiment, tracks.names, poses, shapes_at)
         faces = _nearest_faces(body, places, enterable)
+        unknowns = tracks.camera_unknowns(experiment)
+        sigmas_of = dict(zip(POSE_UNKNOWNS, errors[tracks.name], strict=True))
+        start_pose = np.array([sigmas_of[n] / unknowns[n] for n in POSE_UNKNOWNS if n in unknowns])
         correspondences = cls(
             tracks,
             surface_association(body, places, sigmas, faces),
@@ -265,12 +372,12 @@ class TrackedPlaces(Correspondences):
             is_visible=np.ones(tracks.is_seen.shape, dtype=bool),
             coordinate_parameters=coordinate_parameters,
             pose_parameters=pose_parameters,
-            start_pose=np.zeros(len(pose_parameters)),
+            start_pose=start_pose,
             mirror_ratio=mirrored.get(tracks.name, np.inf),
             obstacles=experiment.obstacles,
+            is_shared=_are_shared(experiment, tracks),
         )
-        unknowns = tracks.camera_unknowns(experiment)
-        return correspondences.with_visibility(shapes)._aligned(shapes, unknowns)
+        return correspondences.with_visibility(shapes)
 
     @property
     def measured(self) -> ImageTracks:
@@ -364,55 +471,18 @@ class TrackedPlaces(Correspondences):
     def _mean_edge_m(self) -> float:
         return float(self.association.body.mesh.quality().edge_mean_m)
 
-    # Alignment --------------------------------------------------------------------------------
-
-    def _aligned(self, shapes_m: Array, unknowns: Mapping[str, float]) -> TrackedPlaces:
-        """Return the correspondences with the errors of the pose that fit the first image best,
-        weighted by their priors; of a pose that is off by many pixels, every residual would be
-        beyond the threshold of Huber's loss.
-        """
-        tracks, size = self.tracks, len(self.pose_parameters)
-        used = self.is_visible & tracks.is_seen & self.is_placed
-        if not size or tracks.pixels is None or not used.any():
-            return self
-        sample = int(used.any(axis=1).argmax())
-        points = np.flatnonzero(used[sample])
-        nodes, weights = self._corner_weights
-        at_m = np.einsum("pc,pci->pi", weights[points], shapes_m[sample][nodes[points]])
-        own_m = (at_m - self.translations[sample]) @ self.rotations[sample]
-        pixels = np.asarray(tracks.pixels)[sample, points]
-        names = [name for name in POSE_UNKNOWNS if name in unknowns]
-        scales = np.array([unknowns[name] for name in names])
-        places = [POSE_UNKNOWNS.index(name) for name in names]
-
-        def differences(pose: Array) -> Array:
-            errors = np.zeros(6)
-            errors[places] = pose * scales
-            moved = own_m @ Rotation.from_rotvec(errors[:3]).as_matrix().T + errors[3:]
-            moved[:, 2] = np.maximum(moved[:, 2], 1e-3)
-            off = tracks.camera.distorted_pixels(moved) - pixels
-            return np.concatenate([off.ravel() / tracks.sigma_px, pose])
-
-        fit = least_squares(
-            differences, np.zeros(size), loss="soft_l1", max_nfev=ALIGNMENT_EVALUATIONS
-        )
-        return replace(self, start_pose=fit.x)
-
-    @cached_property
-    def _corner_weights(self) -> tuple[Index, Array]:
-        """Corners (N, 3) of the faces of the places, and their weights (N, 3)."""
-        return self.association.body.mesh.surface[self.faces], self._shares
+    # Following --------------------------------------------------------------------------------
 
     def followed(self, phi: Array, shapes_m: Array) -> TrackedPlaces:
         """Return the correspondences at other estimates φ (k,) with the first s shapes (s, n, 3)
         [m]; self if nothing has changed.
         """
-        other = self._with_faces_of(self.places_m(phi))
+        other = self._with_faces_of(self.places_m(phi), shapes_m)
         return other.with_visibility(shapes_m, is_settled=other is self)
 
-    def _with_faces_of(self, points_m: Array) -> TrackedPlaces:
-        """Return the correspondences with places at points (N, 3) [m] in the planes of their faces;
-        self if each is on its face, or cannot leave it.
+    def _with_faces_of(self, points_m: Array, shapes_m: Array) -> TrackedPlaces:
+        """Return the correspondences with places at points (N, 3) [m] in the planes of their faces,
+        and the first s shapes (s, n, 3) [m]; self if each is on its face, or cannot leave it.
         """
         association = self.association
         corners = self._corners
@@ -431,11 +501,15 @@ class TrackedPlaces(Correspondences):
             is_smooth = normals @ normals[own] > SMOOTH
             face = int(np.where(is_smooth, away, np.inf).argmin())
             if away[face] > near_m:
-                beside = self.enterable[m] & ~is_smooth & (crossings[m] < MOST_CREASES)
-                beside &= np.linalg.norm(nearest - nearest[face], axis=1) < near_m
-                if beside.any():
+                may_enter = self.enterable[m] & ~is_smooth & (crossings[m] < MOST_CREASES)
+                beside = may_enter & (np.linalg.norm(nearest - nearest[face], axis=1) < near_m)
+                entered, place = self._seen_at(m, point, shapes_m)
+                if entered >= 0 and may_enter[entered]:
+                    faces[m], centres[m] = entered, place
+                elif beside.any():
                     faces[m] = int(beside.argmax())
                     centres[m] = nearest[faces[m]]
+                if faces[m] != own:
                     crossings[m] += 1
                     continue
             if away[own] > away[face] + near_m:
@@ -448,6 +522,28 @@ class TrackedPlaces(Correspondences):
             return self
         moved = _on_faces(association, centres, faces, np.flatnonzero(faces != self.faces))
         return replace(self, association=moved, faces=faces, crossings=crossings)
+
+    def _seen_at(self, m: int, point_m: Array, shapes_m: Array) -> tuple[int, Array]:
+        """Return the face and place of the undeformed body (3,) that the camera sees where a point
+        (3,) [m] in the plane of the face of place m appears in its first image, so that a place does
+        not appear elsewhere when it crosses a crease; −1 if it sees no part of the body there, or
+        other cameras have the same place.
+        """
+        first = int(self.tracks.is_seen[:, m].argmax())
+        if self.is_shared[m] or first >= len(shapes_m):
+            return -1, point_m
+        surface = self.association.body.mesh.surface
+        corners = self._corners[self.faces[m]]
+        # Barycentric coordinates of points outside of the triangle, too.
+        b, c = np.linalg.lstsq((corners[1:] - corners[0]).T, point_m - corners[0])[0]
+        at_m = np.array([1 - b - c, b, c]) @ shapes_m[first][surface[self.faces[m]]]
+        eye_m = self.translations[first]
+        faces, shares, missed = points_on_surface(
+            eye_m[None], (at_m - eye_m)[None], shapes_m[first], surface
+        )
+        if missed[0]:
+            return -1, point_m
+        return int(faces[0]), shares[0] @ self._corners[faces[0]]
 
 
 def _enterable_faces(
@@ -473,6 +569,17 @@ def _enterable_faces(
             if name in firsts:
                 faces[k] &= look[samples.index(firsts[name])]
     return faces
+
+
+def _are_shared(experiment: Experiment, tracks: ImageTracks) -> NDArray[np.bool_]:
+    """Return which points (N,) other cameras have, too."""
+    others = {
+        name
+        for other in experiment.readings
+        if isinstance(other, ImageTracks) and other.name != tracks.name
+        for name in other.names
+    }
+    return np.array([name in others for name in tracks.names])
 
 
 def _nearest_faces(body: Body, places_m: Array, enterable: NDArray[np.bool_]) -> Index:
