@@ -61,6 +61,9 @@ class ForcePoints:
         chosen : array of int, optional
             Indices of the instances, in whose order the result is; None for all.
         """
+        if self._own_nodes is not None:
+            nodes = self._own_nodes if chosen is None else self._own_nodes[chosen]
+            return x.reshape(len(x), -1, 3)[:, nodes].transpose(2, 0, 1)
         stacked = self._operator_for("operator", chosen) @ x.T
         return stacked.reshape(len(stacked) // self.dofs, self.dofs, len(x)).transpose(1, 2, 0)
 
@@ -74,6 +77,11 @@ class ForcePoints:
         chosen : array of int, optional
             Indices of the instances to which `forces` belong; None for all.
         """
+        if self._own_nodes is not None:
+            nodes = self._own_nodes if chosen is None else self._own_nodes[chosen]
+            nodal = np.zeros((forces.shape[1], self.node_count, 3))
+            nodal[:, nodes] = forces.transpose(1, 2, 0)
+            return nodal.reshape(len(nodal), -1)
         force_rows = forces.transpose(2, 0, 1).reshape(
             len(forces) * forces.shape[2], forces.shape[1]
         )
@@ -108,6 +116,15 @@ class ForcePoints:
         assembly, nonempty = self._operator_for("skew" if skew else "couplings", chosen)
         values = np.moveaxis(values, 0, 2).reshape(values.shape[1], assembly.shape[1])
         to[:, places[nonempty]] += (assembly @ values.T).T / 2
+
+    @cached_property
+    def _own_nodes(self) -> Index | None:
+        """Node (i,) of each instance if it is its only vector and of no other instance; else
+        None. Indexing takes a tenth of the time of a sparse product.
+        """
+        nodes = self.nodes[:, 0]
+        is_single = self.node_weights.shape[1:] == (1, 1) and bool((self.node_weights == 1).all())
+        return nodes if is_single and len(np.unique(nodes)) == len(nodes) else None
 
     def _operator_for(self, what: str, chosen: Index | None) -> Any:
         """Return the columns or rows of a matrix that belong to chosen instances."""

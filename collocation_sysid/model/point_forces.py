@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -142,22 +142,27 @@ class Pointwise(ForceTerm):
         """
         chosen, y = self.active_points(states)
         constants = self.constants(states)
-        velocities = (
-            (self.points.vectors(states.nu, chosen),) if self.is_nonlinear_in_velocity else ()
-        )
-        steady = np.broadcast_to(constants[..., None], (len(constants), *y.shape[1:]))
-        before = np.zeros((self.internal_variable_count, *y.shape[1:]))
+        constants_offset = len(y) * (2 if self.is_nonlinear_in_velocity else 1)
+        variables_offset = constants_offset + len(constants)
+        u = np.empty((variables_offset + self.internal_variable_count, *y.shape[1:]))
+        u[: len(y)] = y
+        if self.is_nonlinear_in_velocity:
+            u[len(y) : constants_offset] = self.points.vectors(states.nu, chosen)
+        u[constants_offset:variables_offset] = constants[..., None]
+        u[variables_offset:] = 0.0
         if self.previous_state is not None:
-            before = self.previous_state.before[..., slice(None) if chosen is None else chosen]
-        u = np.concatenate([y, *velocities, steady, before])
+            some = slice(None) if chosen is None else chosen
+            u[variables_offset:] = self.previous_state.before[..., some]
         data = self.data(chosen)
+        if data.shape[1:] != y.shape[1:]:
+            data = np.broadcast_to(data, (len(data), *y.shape[1:]))
         return _LawInputs(
             chosen,
             u,
-            data=np.broadcast_to(data, (len(data), *y.shape[1:])),
+            data=data,
             velocity_offset=len(y),
-            constants_offset=len(y) * (2 if self.is_nonlinear_in_velocity else 1),
-            variables_offset=len(u) - len(before),
+            constants_offset=constants_offset,
+            variables_offset=variables_offset,
         )
 
     def force(self, states: States) -> Array:
@@ -455,6 +460,10 @@ class CustomForce(Pointwise):
         """Return the data (d, T, I) of the law at all instances, in the order in which a
         `ForceContext` reads them; `chosen` is not used, because all instances act.
         """
+        return self._data
+
+    @cached_property
+    def _data(self) -> Array:
         data = np.empty((CONTEXT_SIZE, len(self.t_s), self.points.count))
         data[0] = self.t_s[:, None]
         data[1:-2] = self.placed.data[:, None]

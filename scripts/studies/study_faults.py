@@ -22,6 +22,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -35,6 +36,7 @@ from study_coverage import QUANTITIES, SCHEME, intervals_with_truth, reference, 
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
+from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
@@ -85,6 +87,8 @@ class FaultOutcome:
         As `relative`, of a fit without nuisance parameters; NaN in twins with an error.
     correlated : bool
         Whether the standard errors are those of correlated errors.
+    redrawn : int
+        Number of bodies that were drawn before and could not be simulated.
     """
 
     converged: bool
@@ -94,6 +98,7 @@ class FaultOutcome:
     relative: Array
     without: Array
     correlated: bool
+    redrawn: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +141,14 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
     truth.
     """
     rng = np.random.default_rng(seed)
-    true_recording, described = FAULTS[fault](exact_recording(), rng)
+    recordings: TrueAndStated | None = None
+    redrawn = -1
+    while recordings is None:
+        redrawn += 1
+        # Some soft bodies with many errors collapse, and nobody would record them.
+        with suppress(SimulationError):
+            recordings = FAULTS[fault](exact_recording(), rng)
+    true_recording, described = recordings
     tracks = true_recording.markers.positions_m
     tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
     uncertainty, combined_contains_truth, half_widths, converged = identified(
@@ -154,6 +166,7 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
         relative_errors(uncertainty),
         errors_without_nuisance,
         uncertainty.errors == "autocorrelated",
+        redrawn,
     )
 
 
@@ -476,7 +489,7 @@ def table_head() -> str:
         for kind in ("coverage", "combined coverage", "combined half width", "standard error")
         for c in COLUMNS
     ]
-    cells = ["fault", *columns, "correlated errors, %", "not converged"]
+    cells = ["fault", *columns, "correlated errors, %", "not converged", "not simulated"]
     return _line(cells) + "\n" + _line(["---"] * len(cells))
 
 
@@ -501,6 +514,7 @@ def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
             *map("{:.2g}".format, errors),
             f"{correlated:.0f}",
             f"{failures}",
+            f"{sum(outcome.redrawn for outcome in outcomes)}",
         ]
     )
 

@@ -31,6 +31,7 @@ from ...recording.experiment import Experiment
 from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
 from .condensed_steps import StepEquations
+from .extrapolation import MOST_VALUES, next_value
 from .initial_equilibrium import initial_state
 from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .newton_solver import (
@@ -41,6 +42,8 @@ from .newton_solver import (
     simulation_error,
 )
 
+# Relative difference up to which two steps have the same length.
+SAME_STEP = 1e-6
 # Called with the share of the work that is done, between 0 and 1.
 Progress = Callable[[float], None]
 
@@ -59,6 +62,10 @@ class _State:
     # (3n,) or None: mean of the local forces over the step that led here [N]; None if there are
     # none.
     local_n: Array | None = None
+    # (k, 3n): differences of the latest positions from their guesses by position, velocity and
+    # acceleration at the start of their steps [m], and the length of these steps [s].
+    corrections_m: Array | None = None
+    step_s: float = 0.0
 
 
 @one_blas_thread()
@@ -393,10 +400,15 @@ class _Stepper:
             prescribed_dofs=solver.is_prescribed,
             prescribed=self._prescribed_motion(solver, end_s, step_s=h, holding_s=load_s),
         )
-        guess = equations.extrapolation()
+        extrapolated = equations.extrapolation()
+        known = state.corrections_m if abs(h - state.step_s) <= SAME_STEP * h else None
+        guess = extrapolated if known is None else extrapolated + next_value(known)
         if not solver.has_no_inverted_element(guess):
             guess = equations.with_prescribed_positions(state.x)
         x = solver.solve_step(guess, equations)
+        correction_m = (x - extrapolated)[None]
+        if known is not None:
+            correction_m = np.concatenate([known[1 - MOST_VALUES :], correction_m])
         v, a = equations.kinematics(x)
         local_n = None
         if equations.local.has_forces:
@@ -409,7 +421,16 @@ class _Stepper:
         previous_histories = advance_states(
             forces, state.previous_histories, x=x, v=v, interval_s=h
         )
-        return _State(end_s, x, v=v, a=a, previous_histories=previous_histories, local_n=local_n)
+        return _State(
+            end_s,
+            x,
+            v=v,
+            a=a,
+            previous_histories=previous_histories,
+            local_n=local_n,
+            corrections_m=correction_m,
+            step_s=h,
+        )
 
     def _prescribed_motion(
         self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float

@@ -19,6 +19,7 @@ from ...recording.experiment import Experiment
 from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
 from .condensed_steps import StepEquations
+from .extrapolation import MOST_VALUES, next_value
 from .initial_equilibrium import initial_state
 from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .newton_solver import (
@@ -197,12 +198,12 @@ def forces_and_histories(
 
 
 def extrapolate(x: Array, first_step: Array) -> Array:
-    """Return an extrapolation (3n,) of the next row from rows x (k, 3n): quadratic from three or
-    more rows, linear from two; from one row, x_0 + `first_step` (3n,) [m].
+    """Return an extrapolation (3n,) of the next row from rows x (k, 3n); from one row, x_0 +
+    `first_step` (3n,) [m].
     """
-    if len(x) > 2:
-        return 3 * (x[-1] - x[-2]) + x[-3]
-    return x[-1] + (x[-1] - x[-2] if len(x) > 1 else first_step)
+    if len(x) == 1:
+        return x[0] + first_step
+    return x[-1] + next_value(np.diff(x[-1 - MOST_VALUES :], axis=0))
 
 
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
