@@ -44,7 +44,7 @@ SMALL_IMPACT_STRAIN = 1e-4
 # Steps longer than so many times the one that is expected to leave as much are simulated at once.
 LONGEST_SWEPT = 2.0
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With
-# impacts, whose simulations repeat a loss to about 1e-9, the rejection of such a full step ends the
+# impacts, whose simulations repeat a loss to about 1e-8, the rejection of such a full step ends the
 # search as converged, otherwise only if shorter steps are rejected, too: the stress of a nearly
 # incompressible body at small strain has few digits.
 INSIGNIFICANT = 1e-6
@@ -460,6 +460,10 @@ class ReducedSearch:
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return self._status_without_progress(point, curvature)
             self.trust = SHRINK * length
+            if rejections and self.has_impacts:
+                # Points touch and part within short steps: χ² is smooth only within shorter ones,
+                # which need no simulation.
+                self.trust = min(self.trust, self.feasible_length)
             rejections += 1
             if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
                 point = self._make_feasible(horizon, point)

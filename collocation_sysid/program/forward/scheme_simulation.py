@@ -99,8 +99,8 @@ def continue_simulation(
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
     approximate_solution : (N, 3n) array, optional
-        Trajectory at other parameters, as the first guess of equilibria; not used for the steps of
-        a motion.
+        Trajectory at other parameters, as the first guess of equilibria; its steps are those of a
+        motion where it predicted the row before better than the motion itself.
 
     Returns
     -------
@@ -134,12 +134,20 @@ def continue_simulation(
     # Total force at every evaluation so far.
     forces, previous_histories = forces_and_histories(dynamics, x, row_count=done)
     intervals = dynamics.compute_intervals_to_next_s()
+    guesses: list[Array] = []
+    nearest = 1  # guess that missed least at the row before
     for t in range(done, dynamics.row_count):
         row = RowEquations(dynamics, x, forces=forces, t=t, previous=previous_histories)
         solver = solvers.for_prescribed(is_prescribed[t])
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
         if not dynamics.is_static:
-            guess = extrapolate(x[:t], dynamics.step_s * v0)
+            guesses = [extrapolate(x[:t], dynamics.step_s * v0)]
+            if approximate_solution is not None:
+                # Impacts make a motion rough, but much less its distance from a similar one.
+                last = slice(max(0, t - 3), t)
+                distance_m = extrapolate(x[last] - approximate_solution[last], 0.0 * v0)
+                guesses += [approximate_solution[t] + distance_m]
+            guess = guesses[min(nearest, len(guesses) - 1)]
         elif approximate_solution is None:
             guess = _extrapolate_static(x[:t], solver.is_prescribed, goal=goal)
         else:
@@ -156,6 +164,8 @@ def continue_simulation(
                 what=f"time step {t}",
                 static=dynamics.is_static,
             )
+        if len(guesses) > 1:
+            nearest = int(np.argmin([np.abs(x[t] - each).max() for each in guesses]))
         forces[t] = row.force(x[t])
         forces[t, dynamics.is_temporarily_prescribed[t]] = 0
         if previous_histories:
