@@ -90,7 +90,7 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
     basis = tangent_directions(collocation, sensitivities(collocation, z))[:, is_free]
     if added := lifted_count(program):
         rows = program.jacobian(variables)[-added:].tocsc()
-        of_lifted = spla.spsolve(rows[:, -added:], -rows[:, :-added] @ basis)
+        of_lifted = np.asarray(spla.spsolve(rows[:, -added:], -rows[:, :-added] @ basis))
         basis = np.concatenate([basis, of_lifted.reshape(added, -1)])
     hessian = program.hessian(variables, 1.0, multipliers=adjoint[0])
     reduced = basis.T @ (hessian @ basis)

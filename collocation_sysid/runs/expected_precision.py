@@ -8,7 +8,7 @@ and a new test is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +35,7 @@ from ..statistics.budget.consider_analysis import (
     changes_of_assumptions,
     prescribes_no_motion,
 )
+from ..statistics.budget.systematic_effects import CORRELATION_KEY
 from ..statistics.budget.uncertainty_budget import VarianceSources
 from ..statistics.combinations import (
     WIDE,
@@ -87,7 +88,10 @@ class ExpectedPrecision:
 
 
 def expected_precision(
-    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    exact: tuple[LinearisedFit, Uncertainty] | None = None,
 ) -> ExpectedPrecision:
     """Return the precision of the estimates if all residuals were zero at the variables z, which
     satisfy the equations of motion.
@@ -97,14 +101,15 @@ def expected_precision(
     z : (variables,) array
     deviations : mapping of str to float or None
         Standard deviations of the assumptions of the budget.
+    exact : (LinearisedFit, Uncertainty), optional
+        Known result of `_exact_fit`.
 
     Raises
     ------
     SimulationError
         If the equations of motion are singular.
     """
-    collocation = replace(collocation, huber=UNWEIGHTED)
-    fit, known = _exact_fit(collocation, z)
+    fit, known = exact or _exact_fit(collocation, z)
     parameters = collocation.parameters
     q = z[: collocation.nq]
     changes = changes_of_assumptions(collocation, z, deviations)
@@ -140,7 +145,7 @@ def _exact_fit(collocation: Collocation, z: Array) -> tuple[LinearisedFit, Uncer
     """Return the fit linearised at z as if all residuals were zero, and its uncertainty by noise of
     the stated σ.
     """
-    fit = linearise_fit(collocation, z)
+    fit = linearise_fit(replace(collocation, huber=UNWEIGHTED), z)
     exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
     fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
     noise = ErrorModel("given", "independent")
@@ -152,7 +157,6 @@ def expected_deviations(collocation: Collocation, z: Array) -> dict[str, float]:
     """Return the relative standard deviation of each estimated scalar parameter by noise of the
     stated σ and the errors of the sensors, if all residuals were zero at z.
     """
-    collocation = replace(collocation, huber=UNWEIGHTED)
     fit, known = _exact_fit(collocation, z)
     kept = [k for k in collocation.parameters.scalar_coordinates if not fit.at_bound[k]]
     deviations = np.sqrt(np.diag(known.complete_covariance))
@@ -213,6 +217,7 @@ def with_measurements(
     z: Array,
     deviations: Mapping[str, float | None],
     noise: float = 1.0,
+    dominant: Collection[str] = (),
 ) -> tuple[Combination, ...]:
     """Return the combinations with the added sensor or test that would determine their constants
     best as the first of their `fixes`; unchanged where none would. Of specimens, the first test
@@ -226,21 +231,38 @@ def with_measurements(
         Standard deviations of the assumptions of the budget.
     noise : float
         Variance of the noise over that of the stated σ.
+    dominant : collection of str
+        Assumptions that dominate the variances. A measurement with which they alone leave all
+        constants undetermined is not evaluated with the others.
     """
     if not combinations:
         return ()
     found: list[list[Fix]] = [[] for _ in combinations]
+    few = {n: s if n in (*dominant, CORRELATION_KEY) else None for n, s in deviations.items()}
+    # Rulers that the data determine may reduce the effects of other assumptions.
+    has_bound = bool(dominant) and not prescribes_no_motion(collocation)
+
+    def effects(what: str, expected: ExpectedPrecision) -> dict[int, Fix]:
+        covariance = expected.covariance + (noise - 1) * expected.statistical
+        return {
+            k: widest_after(expected.names, members, covariance, what)
+            for k, each in enumerate(combinations)
+            if {*(members := each.determined.names)} <= {*expected.names}
+        }
+
     for what, added in added_measurements(collocation, z):
         try:
             wide, at = _extended(collocation, z, added)
-            expected = expected_precision(wide, at, deviations)
+            exact = _exact_fit(wide, at)
+            if has_bound:
+                least = effects(what, expected_precision(wide, at, few, exact))
+                if all(fix.factor >= WIDE for fix in least.values()):
+                    continue
+            fixes = effects(what, expected_precision(wide, at, deviations, exact))
         except (InputError, SimulationError):
             continue  # the law or the body does not allow this test
-        covariance = expected.covariance + (noise - 1) * expected.statistical
-        for fixes, each in zip(found, combinations, strict=True):
-            if set(each.determined.names) <= set(expected.names):
-                members = each.determined.names
-                fixes.append(widest_after(expected.names, members, covariance, what))
+        for k, fix in fixes.items():
+            found[k].append(fix)
         if all(fixes and fixes[-1].factor < NARROW for fixes in found):
             break
     best = (min(fixes, key=lambda fix: fix.factor, default=None) for fixes in found)

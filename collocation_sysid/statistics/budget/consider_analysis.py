@@ -150,6 +150,8 @@ def changes_of_assumptions(
         collocation, z, assumptions=assumptions, surface_correlation=correlation
     )
     of_nuisances = changes_of_nuisances(collocation, z, deviations=deviations)
+    if not of_nuisances.names:
+        return of_bodies
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
     return ResidualChanges(of_bodies.names + of_nuisances.names, blocks)
@@ -182,7 +184,8 @@ def changes_of_nuisances(
     -------
     ResidualChanges
         One column for each value of these parameters in each experiment, zero in the blocks of
-        other experiments, with the name of the kind. Huber's weights are not applied.
+        other experiments, with the name of the kind; no blocks if all are estimated or exact.
+        Huber's weights are not applied.
     """
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
@@ -205,6 +208,8 @@ def changes_of_nuisances(
         [k for k, name in enumerate(wide.list_parameter_names()) if name not in values],
         dtype=np.int64,
     )
+    if not len(new):
+        return ResidualChanges((), [])
     names: dict[int, str] = {}
     for transcription in wide.transcriptions:
         own = zip(
