@@ -7,18 +7,25 @@ by the motion of those points that are so near the grasp that they move as it do
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
 from ...recording.camera import Camera
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
+from ...recording.measurement import Measurement
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...statistics.misspecification.misspecification_hypothesis import (
+    Hypothesis,
+    corrected_hypothesis,
+)
+from ...statistics.misspecification.sensor_misspecifications import measurement_mistake
 from .rays import facing, points_on_surface
 from .tracked_places import poses_of_tracks
 from .tracks import ImageTracks, stated_places
@@ -90,14 +97,8 @@ MESSAGES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class _Described:
-    """Camera, pixels (S, N, 2) and times (S,) [s] with a mistake corrected, which a clause states."""
-
-    camera: Camera
-    pixels: Array
-    t_s: Array
-    mistake: str = ""
+# Measure of the tracks without a mistake, these tracks, and the clause that states the mistake.
+_Tried = tuple[float, ImageTracks, str]
 
 
 def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -110,30 +111,23 @@ def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
-    pixels = np.asarray(tracks.pixels)
-    stated = _Described(tracks.camera, pixels, tracks.sample_times_s)
     trial = _Trial(experiment, tracks)
     if not len(trial.samples):
         return
-    if not tracks.has_known_pose:
-        stated = trial.with_fitted_pose(stated)
-        tracks = trial.tracks = replace(tracks, camera=stated.camera)
+    stated = trial.tracks = trial.with_fitted_pose(tracks)
     of = f"'{tracks.name}' of '{experiment.name}'"
     stated_px, size_px = trial.distance_px(stated), trial.size_px(stated.camera)
     usual_px = max(OF_DEFORMATION * size_px, OF_POSE * trial.pose_px)
     if stated_px > OF_DEFORMATION * size_px or stated_px >= FAR_PX:
-        corrections = [*trial.corrections(stated), *trial.reversed_order(stated)]
+        rows = [*trial.mistakes(), *trial.reversed_order()]
         if stated_px > usual_px and tracks.has_known_pose:
-            corrections += trial.corrected_pixels(stated)
-        tried = [(trial.distance_px(other), other) for other in corrections]
-        best_px = min(distance for distance, _ in tried)
-        near = sorted(
-            (each for each in tried if each[0] <= SIMILAR * best_px + tracks.sigma_px),
-            key=lambda each: each[0],
-        )
+            rows += trial.wrong_pixels()
+        tried = trial.without(rows, trial.distance_px)
+        best_px = tried[0][0]
+        near = [each for each in tried if each[0] <= SIMILAR * best_px + tracks.sigma_px]
         # Mirror images of a body may be as near as the body itself, but move otherwise.
-        likely = [other for _, other in near if not trial.unlike(other) > UNLIKE]
-        mistake = _alternatives(likely or [other for _, other in near])
+        likely = [each for each in near if not trial.unlike(each[1]) > UNLIKE]
+        mistake = _alternatives(likely or near)
         data = {"distance_px": stated_px, "size_px": size_px}
         if best_px * NEARER < stated_px:
             ratio = stated_px / max(best_px, 1.0)
@@ -149,10 +143,9 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
         remedy = ": check the axes of places_m and camera.pose"
         if not tracks.has_known_pose:
             # A pose that is found shows mirrored images of the body from behind.
-            tried = [(trial.distance_px(each), each) for each in trial.corrections(stated)]
-            tried.sort(key=lambda each: each[0])
+            tried = trial.without(trial.mistakes(), trial.distance_px)
             most = HIDDEN * len(trial.known)
-            seen = [each for _, each in tried if trial.hidden_count(each.camera) <= most]
+            seen = [each for each in tried if trial.hidden_count(each[1].camera) <= most]
             remedy = f", but sees them if {_alternatives(seen)}" if seen else remedy
         data = {"hidden": hidden, "count": len(trial.known), "remedy": remedy}
         strength = hidden / (HIDDEN * len(trial.known))
@@ -161,9 +154,8 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
     unlike = trial.unlike(stated)
     if experiment.is_static or not unlike > UNLIKE:
         return
-    tried = [(trial.unlike(other), other) for other in trial.corrections(stated, with_times=True)]
-    most = min(unlike / ALIKE, WELL_ALIKE)
-    alike = sorted((each for each in tried if each[0] < most), key=lambda each: each[0])
+    tried = trial.without([*trial.mistakes(), *trial.wrong_times()], trial.unlike)
+    alike = [each for each in tried if each[0] < min(unlike / ALIKE, WELL_ALIKE)]
     possible = [
         each
         for each in alike[:MOST_NEAR]
@@ -171,20 +163,20 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
     ]
     if possible:
         least = possible[0][0]
-        similar = [other for each, other in possible if each <= SIMILAR * least + ALIKE_ENOUGH]
+        similar = [each for each in possible if each[0] <= SIMILAR * least + ALIKE_ENOUGH]
         # A correction that leaves images outside of the experiment explains less.
-        similar.sort(key=lambda other: -trial.image_count(other))
+        similar.sort(key=lambda each: -trial.image_count(each[1]))
         # Neighbouring delays are no alternatives.
-        moved = [other for other in similar if other.t_s is not stated.t_s]
-        similar = [other for other in similar if other not in moved[1:]]
+        moved = [each for each in similar if (each[1].t_s != stated.t_s).any()]
+        similar = [each for each in similar if each not in moved[1:]]
         ratio = unlike / max(least, ALIKE_ENOUGH)
         named = {"unlike": unlike, "mistake": _alternatives(similar), "nearer": ratio}
         yield Hypothesis("image-tracks/motion", of, data=named, strength=ratio)
 
 
-def _alternatives(likely: Sequence[_Described]) -> str:
+def _alternatives(likely: Sequence[_Tried]) -> str:
     """Return the first mistakes of several that explain the tracks about equally well."""
-    return ", or if ".join(each.mistake for each in likely[:MOST_NAMED])
+    return ", or if ".join(mistake for _, _, mistake in likely[:MOST_NAMED])
 
 
 class _Trial:
@@ -197,7 +189,8 @@ class _Trial:
     """
 
     def __init__(self, experiment: Experiment, tracks: ImageTracks) -> None:
-        self.experiment, self.tracks, self.body = experiment, tracks, experiment.body
+        self.experiment, self.declared, self.body = experiment, tracks, experiment.body
+        self.tracks = tracks
         self.is_seen = tracks.is_seen
         self.within = self._within(tracks.sample_times_s)
         self.samples = _spread(self.within, MOST_IMAGES)
@@ -257,7 +250,7 @@ class _Trial:
     # Places -----------------------------------------------------------------------------------
 
     def _attached(
-        self, described: _Described, sample: int, shape_m: Array
+        self, described: ImageTracks, sample: int, shape_m: Array
     ) -> dict[int, tuple[Index, Array, float]]:
         """Return nodes, weights and the angle by which the ray misses the body, of each point seen
         in an image in which the body has a shape (n, 3) [m]; without the points whose pixel has no
@@ -273,24 +266,24 @@ class _Trial:
         if not free:
             return found
         try:
-            rays = camera.points_at_unit_depth(described.pixels[sample, free])
+            rays = camera.points_at_unit_depth(np.asarray(described.pixels)[sample, free])
         except ValueError:
             return found
-        rotations, translations = camera.pose_at(described.t_s[[sample]])
+        rotations, translations = camera.pose_at(described.sample_times_s[[sample]])
         origins = np.tile(translations[0], (len(free), 1))
         faces, shares, missed = points_on_surface(origins, rays @ rotations[0].T, shape_m, surface)
         attached = zip(surface[faces], shares, missed.tolist(), strict=True)
         return found | dict(zip(free, attached, strict=True))
 
-    def distance_px(self, described: _Described) -> float:
+    def distance_px(self, described: ImageTracks) -> float:
         """Return the median distance of the tracks from the body [pixels], with the sag for which
         it is least.
         """
         return min(self._distance_px(described, self._sagging_m(sag)) for sag in SAGS)
 
-    def _distance_px(self, described: _Described, shapes_m: Array) -> float:
+    def _distance_px(self, described: ImageTracks, shapes_m: Array) -> float:
         camera, seen = described.camera, self.is_seen[self.samples]
-        pixels = described.pixels[self.samples]
+        pixels = np.asarray(described.pixels)[self.samples]
         focal_px = camera.require_matrix()[0, 0]
         places: dict[int, tuple[Index, Array, float]] = {}
         for k, sample in enumerate(self.samples.tolist()):
@@ -330,16 +323,16 @@ class _Trial:
 
     # Motion -----------------------------------------------------------------------------------
 
-    def unlike(self, described: _Described) -> float:
+    def unlike(self, described: ImageTracks) -> float:
         """Return the deviation of the motion of the points near the grasp from that of the grasp,
         over the latter; NaN without such points or motion, or if too few images are within the
         experiment.
         """
-        within = self._within(described.t_s)
+        within = self._within(described.sample_times_s)
         if len(within) < COVERED * len(self.within):
             return np.nan
         samples = _spread(within, MOST_IN_MOTION)
-        t_s = described.t_s[samples]
+        t_s = described.sample_times_s[samples]
         first = int(samples[0])
         places = self._attached(described, first, self._rigid_m(t_s[:1])[0])
         reach = {k: float(w @ self.reach_m[n]) / self.length_m for k, (n, w, _) in places.items()}
@@ -351,7 +344,7 @@ class _Trial:
             [np.einsum("c,sci->si", places[k][1], nodes_m[:, places[k][0]]) for k in near], axis=1
         )
         shown = _projected(described.camera, t_s, points)
-        measured = described.pixels[samples][:, near]
+        measured = np.asarray(described.pixels)[samples][:, near]
         is_used = np.isfinite(shown + measured).all(axis=2, keepdims=True)
         if not is_used.any(axis=0).all():
             return np.nan
@@ -365,26 +358,49 @@ class _Trial:
 
     # Corrections ------------------------------------------------------------------------------
 
-    def corrections(self, stated: _Described, with_times: bool = False) -> Iterator[_Described]:
-        """Yield the description with one mistake corrected, also of the times if stated."""
-        if self.tracks.has_known_pose:
-            yield from self._corrected_images(stated)
-            yield from _corrected_poses(stated)
-        else:
-            yield from map(self.with_fitted_pose, self._corrected_images(stated))
-        if with_times:
-            yield from self._corrected_times(stated)
+    def without(
+        self, rows: Iterable[Deviation], measure: Callable[[ImageTracks], float]
+    ) -> list[_Tried]:
+        """Return a measure of the tracks without each of some mistakes, these tracks and the clause
+        that states the mistake, the least measure first.
+        """
+        place = self.experiment.readings.index(self.declared)
+        found = [each for row in rows if (each := corrected_hypothesis(row, self.experiment))]
+        others = [(each.corrected.readings[place], each.data["mistake"]) for each in found]
+        tried = [(measure(other), other, mistake) for other, mistake in others]
+        return sorted(tried, key=lambda each: np.nan_to_num(each[0], nan=np.inf))
 
-    def with_fitted_pose(self, described: _Described) -> _Described:
-        """Return the description with the pose that shows the known points in one image best."""
-        shown = replace(self.tracks, camera=described.camera, pixels=described.pixels)
-        pose = poses_of_tracks(shown, self.stated, self.rest, self._rigid_m)[0][0]
+    def mistakes(self) -> Iterator[Deviation]:
+        """Yield the common mistakes of images and, if it is stated, of the pose."""
+        yield from self._wrong_images()
+        if self.declared.has_known_pose:
+            yield from self._wrong_poses()
+
+    def _mistake(self, mistake: str, has_pose: bool = True, **changes: Any) -> Deviation:
+        """Return the row of tracks that are described wrongly, as a clause states; without a pose,
+        that is fitted again.
+        """
+
+        def without(_: Measurement) -> ImageTracks:
+            other = replace(self.tracks, **changes)
+            return other if has_pose else self.with_fitted_pose(other)
+
+        return measurement_mistake("image-tracks", self.declared, without, mistake=mistake)
+
+    def with_fitted_pose(self, described: ImageTracks) -> ImageTracks:
+        """Return the tracks with the pose, unless it is known, that shows the known points in one
+        image best.
+        """
+        if described.has_known_pose:
+            return described
+        pose = poses_of_tracks(described, self.stated, self.rest, self._rigid_m)[0][0]
         return replace(described, camera=replace(described.camera, pose=pose))
 
-    def _corrected_images(self, stated: _Described) -> Iterator[_Described]:
+    def _wrong_images(self) -> Iterator[Deviation]:
+        stated = self.tracks
         matrix = stated.camera.require_matrix()
         width, height = stated.camera.size_px or (2 * matrix[0, 2] + 1, 2 * matrix[1, 2] + 1)
-        u, v = np.moveaxis(stated.pixels, -1, 0)
+        u, v = np.moveaxis(np.asarray(stated.pixels), -1, 0)
         flips = (
             (v, u, "u and v are exchanged (row, column): exchange the columns"),
             (u, height - 1 - v, f"v points upwards: use {height - 1:g} - v"),
@@ -398,39 +414,39 @@ class _Trial:
             (width - 1 - v, u, "the video is turned by 90 degrees anticlockwise: turn it back"),
         )
         for new_u, new_v, mistake in flips:
-            yield replace(stated, pixels=np.stack([new_u, new_v], axis=-1), mistake=mistake)
+            yield self._mistake(mistake, has_pose=False, pixels=np.stack([new_u, new_v], axis=-1))
 
-    def corrected_pixels(self, stated: _Described) -> Iterator[_Described]:
-        """Yield the description with pixels scaled, shifted or of another unit corrected, which
-        errors of the pose resemble.
+    def wrong_pixels(self) -> Iterator[Deviation]:
+        """Yield pixels that are scaled, shifted or of another unit, which errors of the pose
+        resemble.
         """
-        camera = stated.camera
+        camera, stated = self.tracks.camera, np.asarray(self.tracks.pixels)
         matrix = camera.require_matrix()
         for scale in SCALES:
             mistake = (
                 f"the images have {scale:.3g} times the resolution of the calibration: multiply the "
                 "first two rows of the matrix by this"
             )
-            yield replace(stated, pixels=stated.pixels / scale, mistake=mistake)
+            yield self._mistake(mistake, pixels=stated / scale)
         if camera.size_px is not None:
             mistake = "the pixels are shares of the image: multiply them by its size"
-            yield replace(stated, pixels=stated.pixels * camera.size_px, mistake=mistake)
-        pixels = stated.pixels * np.diag(matrix)[:2] + matrix[:2, 2]
+            yield self._mistake(mistake, pixels=stated * camera.size_px)
+        pixels = stated * np.diag(matrix)[:2] + matrix[:2, 2]
         mistake = "they are divided by the focal length: state pixels of the original images"
-        yield replace(stated, pixels=pixels, mistake=mistake)
+        yield self._mistake(mistake, pixels=pixels)
         exchanged = matrix.copy()
         exchanged[[0, 1], 2] = matrix[[1, 0], 2]
         mistake = "the coordinates cx and cy of the principal point are exchanged"
-        yield replace(stated, camera=replace(camera, matrix=exchanged), mistake=mistake)
-        by_px = self._shift_px(stated)
+        yield self._mistake(mistake, camera=replace(camera, matrix=exchanged))
+        by_px = self._shift_px()
         if np.isfinite(by_px).all():
             mistake = (
                 f"all pixels are shifted by ({by_px[0]:.0f}, {by_px[1]:.0f}): the video is cropped, "
                 "or the camera is turned"
             )
-            yield replace(stated, pixels=stated.pixels + by_px, mistake=mistake)
+            yield self._mistake(mistake, pixels=stated + by_px)
 
-    def _shift_px(self, stated: _Described) -> Array:
+    def _shift_px(self) -> Array:
         """Return the shift of all pixels (2,) that puts the middle of the tracks of the first image
         on that of their places, or of the body if no place is known; NaN if it is not in front.
         """
@@ -440,62 +456,61 @@ class _Trial:
         points = shape_m
         if known:
             points = np.array([self.known[k][1] @ shape_m[self.known[k][0]] for k in known])
-        t_s = stated.t_s[[sample]]
-        shown = _projected(stated.camera, t_s, points[None])[0]
-        tracked = stated.pixels[sample, known or self.is_seen[sample]]
+        t_s = self.tracks.sample_times_s[[sample]]
+        shown = _projected(self.tracks.camera, t_s, points[None])[0]
+        tracked = np.asarray(self.tracks.pixels)[sample, known or self.is_seen[sample]]
         return np.asarray(_middle(shown) - _middle(tracked))
 
-    def reversed_order(self, stated: _Described) -> Iterator[_Described]:
-        """Yield the description with the images in reverse order, if nearly all points are seen."""
+    def reversed_order(self) -> Iterator[Deviation]:
+        """Yield images in reverse order, if nearly all points are seen."""
         within = self.within
         if self.is_seen[within].mean() >= MOSTLY_SEEN:
-            pixels = stated.pixels.copy()
-            pixels[within] = stated.pixels[within[::-1]]
+            pixels = np.array(self.tracks.pixels)
+            pixels[within] = pixels[within[::-1]]
             mistake = "the images are in reverse order: sort them by time"
-            yield replace(stated, pixels=pixels, mistake=mistake)
+            yield self._mistake(mistake, pixels=pixels)
 
-    def image_count(self, described: _Described) -> int:
+    def image_count(self, described: ImageTracks) -> int:
         """Return how many images are within the experiment."""
-        return len(self._within(described.t_s))
+        return len(self._within(described.sample_times_s))
 
-    def _corrected_times(self, stated: _Described) -> Iterator[_Described]:
-        t_s = stated.t_s
-        yield from self.reversed_order(stated)
+    def wrong_times(self) -> Iterator[Deviation]:
+        """Yield wrong orders, rates and delays of the images."""
+        t_s = self.tracks.sample_times_s
+        yield from self.reversed_order()
         for rate in RATES:
             mistake = f"their rate is {rate:.3g} times the stated one: correct frame_rate_hz or t_s"
             other_s = t_s[0] + (t_s - t_s[0]) / rate
-            yield replace(stated, t_s=other_s, mistake=mistake)
+            yield self._mistake(mistake, t_s=other_s)
         for delay_s in DELAYS_S.tolist():
             mistake = (
                 f"they were taken about {1e3 * abs(delay_s):.0f} ms "
                 f"{'earlier' if delay_s < 0 else 'later'} than stated: correct start_s or t_s"
             )
-            yield replace(stated, t_s=t_s + delay_s, mistake=mistake)
+            yield self._mistake(mistake, t_s=t_s + delay_s)
 
+    def _wrong_poses(self) -> Iterator[Deviation]:
+        pose = self.tracks.camera.pose
 
-def _corrected_poses(stated: _Described) -> Iterator[_Described]:
-    """Yield the description with a mistake of the pose of the camera corrected."""
-    pose = stated.camera.pose
+        def other(rotation: Array, position: Array, mistake: str) -> Deviation:
+            changed = np.eye(4)
+            changed[:3, :3], changed[:3, 3] = rotation, position
+            return self._mistake(mistake, camera=replace(self.tracks.camera, pose=changed))
 
-    def other(rotation: Array, position: Array, mistake: str) -> _Described:
-        changed = np.eye(4)
-        changed[:3, :3], changed[:3, 3] = rotation, position
-        return replace(stated, camera=replace(stated.camera, pose=changed), mistake=mistake)
-
-    turn, position = pose[:3, :3], pose[:3, 3]
-    mistake = "the pose is from the world to the camera: invert it"
-    yield other(turn.T, -turn.T @ position, mistake)
-    yield other(turn.T, position, "its rotation is transposed")
-    mistake = "the position is the translation of the inverse: use -R t"
-    yield other(turn, -turn @ position, mistake)
-    for words, frame in FRAMES.items():
-        mistake = f"the pose is that of a frame with {words}"
-        yield other(turn @ frame, position, mistake)
-    mistake = "the pose is in a world whose y axis points upwards, that of the grasp is not"
-    yield other(FROM_Y_UP @ turn, FROM_Y_UP @ position, mistake)
-    for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres")):
-        mistake = f"the position of the camera is in {unit}: state it in metres"
-        yield other(turn, factor * position, mistake)
+        turn, position = pose[:3, :3], pose[:3, 3]
+        mistake = "the pose is from the world to the camera: invert it"
+        yield other(turn.T, -turn.T @ position, mistake)
+        yield other(turn.T, position, "its rotation is transposed")
+        mistake = "the position is the translation of the inverse: use -R t"
+        yield other(turn, -turn @ position, mistake)
+        for words, frame in FRAMES.items():
+            mistake = f"the pose is that of a frame with {words}"
+            yield other(turn @ frame, position, mistake)
+        mistake = "the pose is in a world whose y axis points upwards, that of the grasp is not"
+        yield other(FROM_Y_UP @ turn, FROM_Y_UP @ position, mistake)
+        for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres")):
+            mistake = f"the position of the camera is in {unit}: state it in metres"
+            yield other(turn, factor * position, mistake)
 
 
 def _spread(samples: Index, most: int) -> Index:
