@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse.linalg as spla
 
 from ..common.array_types import Array
+from ..errors import SimulationError
 from ..program.collocation import BOUND_TOLERANCE, Collocation, convert_variables
 from ..program.lifted.lifted_collocation import lifted_count, with_lifted_variables
 from .loss_curvature import sensitivities, tangent_directions
@@ -75,24 +76,31 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
     z : (variables,) array
         Variables.
     multipliers : (constraints,) array
-        Multipliers of the constraints, for the first-order conditions. The Hessian has those of the
-        adjoint equations, which include lifted variables.
+        Multipliers of the constraints. With lifted variables the Hessian has those of the adjoint
+        equations, which include them.
     """
     program = with_lifted_variables(collocation)
-    adjoint = adjoint_multipliers(program, collocation, z=z)
-    if adjoint is None:
+    try:
+        by_p = sensitivities(collocation, z)
+    except SimulationError:
         return None
+    of_constraints = multipliers
+    if added := lifted_count(program):
+        adjoint = adjoint_multipliers(program, collocation, z=z)
+        if adjoint is None:
+            return None
+        of_constraints = adjoint[0]
     variables = convert_variables(z, collocation, target=program)
     lower, upper = program.bounds()
     distance = np.minimum(variables - lower, upper - variables)
     parameters = np.r_[: program.nq, program.phi_columns]
     is_free = distance[parameters] > BOUND_TOLERANCE
-    basis = tangent_directions(collocation, sensitivities(collocation, z))[:, is_free]
-    if added := lifted_count(program):
+    basis = tangent_directions(collocation, by_p)[:, is_free]
+    if added:
         rows = program.jacobian(variables)[-added:].tocsc()
         of_lifted = np.asarray(spla.spsolve(rows[:, -added:], -rows[:, :-added] @ basis))
         basis = np.concatenate([basis, of_lifted.reshape(added, -1)])
-    hessian = program.hessian(variables, 1.0, multipliers=adjoint[0])
+    hessian = program.hessian(variables, 1.0, multipliers=of_constraints)
     reduced = basis.T @ (hessian @ basis)
     curvatures = np.asarray(np.linalg.eigvalsh((reduced + reduced.T) / 2), dtype=float)
 
