@@ -7,10 +7,10 @@ of others are listed in `measurement_models`; program, simulation and statistics
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,11 @@ from .association import Association
 from .correspondences import CorrespondenceResidual, Correspondences
 from .measurement_residual import MeasurementResidual, ResidualExpression
 from .reactions.reaction_resultant import ReactionGrid
+
+Residual = TypeVar("Residual", bound=CorrespondenceResidual)
+
+# Threshold of Huber's loss of images in standard deviations, if the problem states none.
+HUBER = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,3 +94,19 @@ class CorrespondenceModel(MeasurementModel):
         self, association: Association, correspondences: Correspondences | None
     ) -> Sequence[CorrespondenceResidual]:
         """Return the residuals at given correspondences, see `MeasurementModel.residuals`."""
+
+    def image_residual(self, kind: Callable[..., Residual], **fields: Any) -> tuple[Residual]:
+        """Return the residual of a class for images, with what all images of a camera share."""
+        grid = self.grid
+        residual = kind(
+            nuisance=grid.nuisance,
+            huber=HUBER if grid.huber is None else grid.huber,
+            t_s=self.measurement.sample_times_s,
+            sensor=self.measurement,
+            observable_s=grid.t_s,
+            is_static=grid.experiment.is_static,
+            experiment=grid.experiment,
+            **fields,
+        )
+        vars(residual)["_expressions"] = self._expressions
+        return (residual,)

@@ -31,9 +31,6 @@ from .camera_images import POSE_UNKNOWNS, CameraImagesResidual
 from .tracked_places import TrackedPlaces
 from .tracks import WALK_TERMS, ImageTracks, place_labels
 
-# Threshold of Huber's loss in standard deviations, if the problem states none.
-HUBER = 3.0
-
 
 @dataclass(frozen=True, eq=False)
 class ImageTrackResidual(CameraImagesResidual):
@@ -256,23 +253,15 @@ class ImageTracksModel(CorrespondenceModel):
             measured[..., :2] = tracks.pixels
         seen = tracks.is_seen & places.is_visible & places.is_placed
         seen &= is_within(at_s, grid.t_s)[:, None]
-        residual = ImageTrackResidual(
+        return self.image_residual(
+            ImageTrackResidual,
             observable=PointPositions(
                 np.arange(len(grid.t_s)), places.association, self._coordinate_parameters
             ),
-            nuisance=grid.nuisance,
-            huber=HUBER if grid.huber is None else grid.huber,
             names=tuple(f"{name} in {tracks.name}" for name in tracks.names),
-            t_s=at_s,
             sigmas=np.full(count, tracks.sigma_px),
             measured=measured,
             is_compared=np.isfinite(measured) & seen[..., None],
             own_parameters=self._own_parameters,
             correspondences=places,
-            sensor=tracks,
-            observable_s=grid.t_s,
-            is_static=grid.experiment.is_static,
-            experiment=grid.experiment,
         )
-        vars(residual)["_expressions"] = self._expressions
-        return (residual,)

@@ -43,8 +43,6 @@ from ..image_tracks.rays import is_behind
 from ..image_tracks.tracked_places import obstacle_distance
 from .outlines import EDGE, Outlines
 
-# Threshold of Huber's loss in standard deviations, if the problem states none.
-HUBER = 3.0
 # Distance to either side of the outline within which the edge of a mask is searched [pixels]: it
 # contains nothing but the body, so that the first edge is that of the body.
 SEARCH_PX = 60.0
@@ -379,21 +377,13 @@ class OutlinesModel(CorrespondenceModel):
             *([EDGE] * (EDGE in outlines.unknowns)),
         ]
         own = grid.nuisance.indices_of_labels(map(outlines.unknown_label, names))
-        residual = OutlinesResidual(
+        return self.image_residual(
+            OutlinesResidual,
             observable=self._observable,
-            nuisance=grid.nuisance,
-            huber=HUBER if grid.huber is None else grid.huber,
             names=(f"outline of {outlines.name}",) * points,
-            t_s=outlines.sample_times_s,
             sigmas=np.full(points, outlines.sigma_px),
             measured=np.tile([0.0, np.nan, np.nan], (samples, points, 1)),
             is_compared=compared(correspondences, grid.t_s),
             own_parameters=np.tile(own, (points, 1)),
             correspondences=correspondences,
-            sensor=outlines,
-            observable_s=grid.t_s,
-            is_static=grid.experiment.is_static,
-            experiment=grid.experiment,
         )
-        vars(residual)["_expressions"] = self._expressions
-        return (residual,)
