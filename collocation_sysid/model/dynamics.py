@@ -471,9 +471,7 @@ class Dynamics:
 
 
 def _combine(table: Array, rows: Array) -> Array:
-    """Return Σ_i table[t, i] rows[t − i] for every t (N, …), from coefficients (N, lags) and `rows`
-    (N, …); terms before the start are omitted.
-    """
+    """Return Σ_i table[t, i] rows[t − i] for every t (N, …); terms before the start are omitted."""
     result = np.zeros_like(rows)
     shape = (-1,) + (1,) * (rows.ndim - 1)
     for lag in range(min(table.shape[1], len(rows))):
@@ -484,20 +482,14 @@ def _combine(table: Array, rows: Array) -> Array:
 
 
 def _row_masses(tables: StencilTables, at_evaluations: DofMasses) -> DofMasses:
-    """Return the mass in each row, from the mass at the evaluations: tied masses are averaged with
-    the weights of the forces, the others are constant.
-    """
+    """Return the mass in each row: tied masses are averaged like forces, others are constant."""
     return replace(at_evaluations, tied_kg=_evaluation_mean(tables, at_evaluations.tied_kg))
 
 
 def _evaluation_mean(tables: StencilTables, at_evaluations: Array) -> Array:
     # Weighted like the forces, so that gravity alone accelerates all masses equally, also a load
     # that is joining.
-    """Return the mean over the evaluations of each row (N, …), weighted like the forces, of
-    quantities (N, …) at the evaluations.
-
-    A row without forces has the value at its evaluation.
-    """
+    """Return the mean of quantities over the evaluations of each row, weighted like the forces."""
     if (at_evaluations == at_evaluations[:1]).all():
         return at_evaluations
     total = tables.w.sum(axis=1).reshape((-1,) + (1,) * (at_evaluations.ndim - 1))

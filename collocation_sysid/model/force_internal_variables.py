@@ -27,7 +27,6 @@ from ..fem.body import SecondDerivatives
 from .force_term import States
 from .forces import Forces
 from .point_forces import LawDerivatives, Pointwise, PreviousState
-from .recursion import HistoryGradient
 
 # Number of evaluations whose derivatives are kept at a time; limits memory.
 CHUNK = 16
@@ -125,9 +124,7 @@ class ForceHistory:
         return self._without_static_velocity(self.term_at(rows).derivatives(self._states(rows)))
 
     def _without_static_velocity(self, parts: LawDerivatives) -> LawDerivatives:
-        """Return the derivatives; those by ẏ are zero if the force gets no velocities, in a static
-        experiment without friction.
-        """
+        """Derivatives; those by ẏ are zero in a static experiment without friction."""
         term = self.forces.pointwise_term(self.number)[0]
         rests = self.forces.is_static and not term.uses_increments
         return parts._replace(v=np.zeros_like(parts.v)) if rests else parts
@@ -186,8 +183,11 @@ class ForceHistory:
         """Return an iterator of the weights μ backward in time, see `ForceAdjoint`."""
         return ForceAdjoint(self)
 
-    def vector_jacobian_product(self, force_weights: Array, by_p: Array) -> HistoryGradient:
-        """Return the derivatives of Σ λ_k · F_k(h_{k−1}) through the internal variables h.
+    def vector_jacobian_product(
+        self, force_weights: Array, by_p: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return the derivatives of Σ λ_k · F_k(h_{k−1}) through h, by ξ and ν (N, 3n) and by the
+        parameters p (m,).
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ class ForceHistory:
             by_xi[k], by_nu[k] = pulling.state_gradient()
             by_parameters += pulling.input_gradient() @ by_p[k][self.find_input_columns()]
             pulling.step_back(force_weights[k])
-        return HistoryGradient(by_xi, by_nu, by_parameters=by_parameters)
+        return by_xi, by_nu, by_parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,9 +290,7 @@ class _DerivativeIterator:
         self._parts = LawDerivatives(*np.zeros((4, 0)))
 
     def derivatives(self) -> tuple[LawDerivatives, LawDerivatives]:
-        """Return ∂F (d, …, I) and ∂h (n, …, I) of the I points at the next evaluation; the iterator
-        does not advance.
-        """
+        """Return ∂F (d, …, I) and ∂h (n, …, I) at the next evaluation, without advancing."""
         chunk, k = divmod(self.next, CHUNK)
         d = self.points.dofs
         if chunk != self._chunk:

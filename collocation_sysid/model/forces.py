@@ -298,10 +298,7 @@ class Forces:
         return at
 
     def _has_external_derivatives(self) -> bool:
-        """Return whether there are external terms, inputs besides θ, or couplings besides the mesh
-        graph, so that derivatives have more entries or columns than those of the body's internal
-        forces.
-        """
+        """Whether derivatives have more entries or columns than internal forces."""
         more = (
             self._input_offsets[-1] > self._input_offsets[0]
             or self.pattern is not self.body.pattern
@@ -437,9 +434,7 @@ class Forces:
         ]
 
     def _with_input_columns(self, by_theta: Array) -> Array:
-        """Return derivatives by θ (…, k) with zero columns appended for the inputs of the terms (…,
-        U): a copy, or `by_theta` itself if the terms have no inputs.
-        """
+        """Append zero columns for the inputs of the terms to derivatives by θ (…, k)."""
         further = self._input_offsets[-1] - self._input_offsets[0]
         if not further:
             return by_theta

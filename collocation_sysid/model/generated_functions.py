@@ -145,10 +145,7 @@ class GeneratedFunction:
     def _evaluate_at_instances(
         self, name: str, function: ca.Function, u: Array, *others: Array
     ) -> list[Array]:
-        """Return the outputs of a CasADi function at all instances, each (rows, columns, …).
-
-        Evaluators are created on the first call and stored.
-        """
+        """Return the outputs at all instances, each (rows, columns, …)."""
         shape = others[0].shape[1:]
         count = math.prod(shape)
         if u.ndim == 1:

@@ -126,9 +126,7 @@ class GraspConstraint:
 
     @cached_property
     def _direct_derivatives(self) -> Array:
-        """Derivatives of positions (N, g, m) by zeros of displacements and of the strain, and by
-        delays of obstacles, which enter to first order; zero for all other φ.
-        """
+        """∂positions (N, g, m) by zeros, strain and delays, which enter to first order."""
         derivatives = np.zeros((len(self.t_s), len(self.dofs), len(self.nuisance.motion_indices)))
         for number, grasp in enumerate(self.experiment.body_grasps):
             rows = np.flatnonzero(grasp.is_active(self.t_s))
@@ -160,9 +158,7 @@ class GraspConstraint:
         return derivatives
 
     def _iterate_obstacle_parameters(self) -> Iterator[tuple[Index, Obstacle, Deviation, int, int]]:
-        """Return the for each nuisance parameter of an obstacle, yield the positions of the
-        obstacle's dofs in `dofs`, the obstacle, the row, the axis and the index in φ.
-        """
+        """Yield dofs, obstacle, row, axis and index in φ of each parameter."""
         for number, obstacle in enumerate(
             self.experiment.obstacles, len(self.experiment.body_grasps)
         ):
@@ -177,16 +173,12 @@ class GraspConstraint:
 
     @cached_property
     def _nodes(self) -> tuple[Index, Index]:
-        """Nodes that are grasped at some time, and for each grasped dof the index of its node among
-        them.
-        """
+        """Nodes grasped at some time, and the index of its node for each grasped dof."""
         nodes, places = np.unique(self.dofs // 3, return_inverse=True)
         return nodes, places
 
     def _find_columns(self) -> Index:
-        """Return the positions of the parameters of H among the nuisance parameters that affect the
-        motion.
-        """
+        """Return the positions of the parameters of H among those that affect the motion."""
         return np.flatnonzero(np.isin(self.nuisance.motion_indices, self.nuisance.grasp_indices))
 
     @cached_property

@@ -230,9 +230,7 @@ class NuisanceMap(RecordingQuantities):
         return np.array([places[label] for label in labels], dtype=np.int64)
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
-        """Return the indices in φ, ascending, of the entries for which a function is true; empty if
-        there are none.
-        """
+        """Return the indices in φ, ascending, of the entries for which a function is true."""
         return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
 
     @cached_property
@@ -476,9 +474,7 @@ class NuisanceMap(RecordingQuantities):
         return GeneratedFunction(self._displaced_point, len(self.grasp_indices), data_size=3)
 
     def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
-        """Return H X (3,) of a point X (3,) of the undeformed body [m], with the hand–eye transform
-        H, as an expression of the φ of `grasp_indices`.
-        """
+        """Return H X (3,) of a point X [m] as an expression of the φ of `grasp_indices`."""
         values = self.values_by_row(phi, self.grasp_indices)
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
@@ -541,9 +537,7 @@ class NuisanceMap(RecordingQuantities):
         return {row: ca.vertcat(*each) for row, each in parts.items()}
 
     def _tilted_gravity(self, angles: ca.SX) -> ca.SX:
-        """Return gravity (3,) of the stated magnitude, tilted by two angles (2,) [rad] about the
-        axes perpendicular to it; unchanged without gravity.
-        """
+        """Return gravity (3,), tilted by two angles [rad] about its perpendicular axes."""
         size = float(np.linalg.norm(self.gravity_m_s2))
         if size == 0:
             return ca.SX(ca.DM(self.gravity_m_s2))
@@ -555,9 +549,7 @@ class NuisanceMap(RecordingQuantities):
 
 
 def _strain_shifts_m(experiment: Experiment) -> Array:
-    """Return the displacement (G, 3) of the node of each grasp of a specimen per unit of strain
-    [m]; empty, (0, 3), if the experiment has a mesh.
-    """
+    """Return the displacement (G, 3) of each grasp of a specimen per strain; (0, 3) for a mesh."""
     if experiment.specimen is None:
         return np.zeros((0, 3))
     moving = experiment.specimen.displaced_nodes()
@@ -626,10 +618,7 @@ def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, st
 def _component_axes(
     experiment: Experiment, row: Deviation, number: int
 ) -> list[tuple[int, str, str, float]]:
-    """Return index, name, unit and prior deviation of each estimated axis of a component.
-
-    The list is empty if the component is exact or the row does not apply to it.
-    """
+    """Return index, name, unit and σ of each estimated axis of a component."""
     sigma = experiment.nuisance.sigma(row)
     names = row.axes.split() or [""]
     if row == PLACE:
@@ -649,9 +638,7 @@ def _component_axes(
 
 
 def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
-    """Return label and load for every time of a load that is to be estimated, masses first: those
-    that change within the recording. Empty if times count as exact.
-    """
+    """Return label and load for every estimated time of a load, masses first."""
     if not experiment.nuisance.joining_s:
         return []
     verbs: dict[LoadTime, str] = {"from_s": "joining", "until_s": "leaving"}

@@ -173,11 +173,7 @@ class Parameter:
             )
 
     def _check_fixed(self) -> None:
-        """Raise an `InputError` if the fixed value is missing, not finite, or not admissible for
-        the constant: at or above its `below`, or less than its least value. That is `at_least` if
-        the scale of this parameter or that of the constant is linear, else zero; the least value is
-        itself admissible.
-        """
+        """Raise an `InputError` if the fixed value is missing or not admissible."""
         constant = constant_named(self.name)
         least = (
             constant.at_least
@@ -191,9 +187,7 @@ class Parameter:
         self._require_below_limit(value, "fixed")
 
     def _require_below_limit(self, value: float, what: str) -> None:
-        """Raise an `InputError` if a value reaches the upper limit of the constant, such as ν =
-        0.5.
-        """
+        """Raise an `InputError` if a value reaches the limit of the constant, such as ν = 0.5."""
         if not value < (limit := constant_named(self.name).below):
             why = (
                 ": an incompressible body has no finite λ; for rubber state 0.499"
@@ -270,11 +264,6 @@ def with_widest_bounds(item: Parameter) -> Parameter:
 def _lower_limit_text(least: float) -> str:
     """Return the start of an inequality with the smallest admissible value; "" if there is none."""
     return "" if least == -np.inf else f"{least:g} <= "
-
-
-# Initial guess of the contrast of two phases if no value is known. It differs from 1, at which the
-# loss would not depend on the phases.
-FIRST_CONTRAST = 2.0
 
 
 def complete_parameter(
@@ -381,10 +370,7 @@ def complete_parameter(
 
 
 def _with_usual_guess(name: str, user_statement: Unknown, constant: Constant) -> Unknown:
-    """Return a statement with the usual value of a user-defined constant as its guess, within the
-    bounds, if it states neither a guess nor a prior; the statement itself for known constants,
-    whose usual value follows from the name.
-    """
+    """Add the usual value of a user-defined constant if neither guess nor prior is stated."""
     if (
         is_known_constant(name)
         or is_modulus(name)
@@ -464,9 +450,7 @@ class Parameters:
 
     @staticmethod
     def _check_ties(items: Iterable[Parameter]) -> None:
-        """Raise an InputError for a parameter of `items` that is tied to one that is not among
-        these, or is tied itself.
-        """
+        """Raise an InputError for a parameter tied to one that is missing or tied itself."""
         untied = {item.name: item for item in items if item.tied is None}
         for item in items:
             if item.tied is not None and item.tied.to not in untied:
@@ -547,7 +531,8 @@ class Parameters:
             if item.name not in coefficients
         )
         contrasts = (
-            complete_parameter(name, Unknown(FIRST_CONTRAST, prior=prior))
+            # Not 1, at which the loss would not depend on the phases.
+            complete_parameter(name, Unknown(2.0, prior=prior))
             for name, prior in priors.items()
             if name not in stated
         )
@@ -606,9 +591,7 @@ class Parameters:
     def _with_components(
         self, function: Callable[[Parameter], tuple[Parameter, ...]]
     ) -> Parameters:
-        """Return these parameters with each component replaced by those of a tuple; a vector
-        without components is left out.
-        """
+        """Return parameters with components replaced by those of a tuple."""
         items: list[Parameter | FieldCoefficients] = []
         for item in self.items:
             if isinstance(item, Parameter):
@@ -939,9 +922,7 @@ class ThetaMap:
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
-        """Names of the derived moduli, see `_derived_moduli`, and the function from q to their
-        values.
-        """
+        """Names of `_derived_moduli`, and the function from q to their values."""
         names = self.parameters.names
         body = self.body
         derived_names, _ = _derived_moduli(

@@ -389,9 +389,7 @@ class _LawInputs:
         return slice(self.variables_offset, len(self.u))
 
     def split(self, values: Array, axis: int) -> LawDerivatives:
-        """Return views of `values`, split along the axis of u into the parts y, ẏ, c and
-        h_{k−1}.
-        """
+        """Return views of `values`, split along the axis of u into y, ẏ, c and h_{k−1}."""
         return LawDerivatives(
             *np.split(
                 values,

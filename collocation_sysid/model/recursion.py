@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,15 +25,6 @@ from ..common.array_types import Array
 from .generated_functions import GeneratedFunction
 
 Expression = Callable[[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX], ca.SX]
-
-
-class HistoryGradient(NamedTuple):
-    """Gradient, through internal variables, of a scalar along a motion with N evaluations."""
-
-    # (N, 3n): derivatives by positions and velocities at the evaluations.
-    by_xi: Array
-    by_nu: Array
-    by_parameters: Array  # (m,): derivatives by the parameters p
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +115,7 @@ class RecursionTrajectory:
         return trajectory
 
     def _stacked_inputs(self, times: slice) -> Array:
-        """Return the stacked inputs (h_{k−1}, s_k, s_{k−1}, c) at consecutive times, (size, T, I).
-
-        At the start, h_{k−1} is zero and s_{k−1} is s_0.
-        """
+        """(h_{k−1}, s_k, s_{k−1}, c) (size, T, I); at the start h = 0, s_{k−1} = s_0."""
         before = np.arange(times.start, times.stop) - 1
         states = np.where((before < 0)[:, None], 0.0, self.states[:, before])
         last = self.signal[:, np.maximum(before, 0)]
@@ -191,10 +178,6 @@ def relaxation_coefficients(tau: ca.SX) -> tuple[ca.SX, ca.SX]:
     tau : SX
         Time constant in units of the interval, τ/h; for 0 both coefficients are zero.
     """
-    ratio = 1 / ca.fmax(tau, SMALLEST_TIME_CONSTANT)
+    # exp(−1e6) is 0 in doubles.
+    ratio = 1 / ca.fmax(tau, 1e-6)
     return ca.exp(-ratio), -tau * ca.expm1(-ratio)
-
-
-# Time constant, in units of the interval, below which the state has relaxed: exp(−1e6) is 0 in
-# doubles.
-SMALLEST_TIME_CONSTANT = 1e-6

@@ -37,12 +37,10 @@ from ..fem.body import Body, SecondDerivatives
 from ..fem.laws.memory import MemoryInput
 from .forces import Forces
 from .generated_functions import GeneratedFunction
-from .recursion import HistoryGradient, Recursion, relaxation_coefficients
+from .recursion import Recursion, relaxation_coefficients
 
 # Number of evaluations whose stress derivatives are kept at a time; limits memory.
 EVALUATIONS_PER_CHUNK = 16
-# Number of relaxation times after which a load counts as relaxed: exp(−1000) is 0 in doubles.
-RELAXED_TIMES = 1e3
 
 
 def _interval_coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
@@ -88,9 +86,7 @@ OVERSTRESS = Recursion(_overstress, 1, signal_size=1, constant_count=2, data_siz
 
 
 def _coefficients(u: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the coefficients (3,) of an evaluation: c of the stress in its overstress
-    Q_k = m_{k−1} + c S_k, then d and a of the recursion m_k = d m_{k−1} + a S_k.
-    """
+    """Return c, and d, a of the recursion m_k = d m_{k−1} + a S_k: Q_k = m_{k−1} + c S_k."""
     return ca.vertcat(_stiffening(u, data), OVERSTRESS.linear_coefficients(u, data)[:2])
 
 
@@ -133,7 +129,8 @@ class FadingCoefficients:
         branches = len(body.memory.branches)
         shape = (branches, len(until_next_s))
         since_s = np.empty(shape)
-        since_s[:, 0] = np.minimum(loaded_s, RELAXED_TIMES * theta[places[1]])
+        # exp(−1000) is 0 in doubles.
+        since_s[:, 0] = np.minimum(loaded_s, 1e3 * theta[places[1]])
         since_s[:, 1:] = until_next_s[:-1]
         began = np.broadcast_to(np.arange(shape[1]) == 0, shape)
         steady = np.full(shape, float(body.memory.oscillates))
@@ -289,10 +286,7 @@ class MemoryHistory:
         )
 
     def _overstress_inputs(self, mu: Array) -> Array:
-        """Return the inputs (5, B, N) of `OVERSTRESS` whose value is Σ μ_k m_k of each branch.
-
-        The recursion is linear in m and S, so the inputs are Σ μ_k m_{k−1} and Σ μ_k S_k.
-        """
+        """Inputs (5, B, N) whose value is Σ μ_k m_k: the recursion is linear in m and S."""
         borne = self.body.memory.to_branches(self.stress)
         before, now = (
             self.body.memory.sum_over_points(mu * each) for each in (self.previous_variables, borne)
@@ -312,8 +306,11 @@ class MemoryHistory:
                 ),
             )
 
-    def vector_jacobian_product(self, force_weights: Array, by_p: Array) -> HistoryGradient:
-        """Return the derivatives of Σ λ_k · f_H(H_k) through H; those by ν are zero.
+    def vector_jacobian_product(
+        self, force_weights: Array, by_p: Array
+    ) -> tuple[Array, Array, Array]:
+        """Return the derivatives of Σ λ_k · f_H(H_k) through H, by ξ and ν (N, 3n) and by the
+        parameters p (m,); those by ν are zero.
 
         Parameters
         ----------
@@ -343,11 +340,8 @@ class MemoryHistory:
         for rows, slopes in self.stress_derivatives(theta_q):
             by_q += np.einsum("tqp,tp->q", slopes, sigma[rows])
         by_parameters[used] = by_q
-        return HistoryGradient(
-            stresses.stress_vjp(self.xi, sigma, theta=self.theta),
-            np.zeros_like(self.xi),
-            by_parameters=by_parameters,
-        )
+        by_xi = stresses.stress_vjp(self.xi, sigma, theta=self.theta)
+        return by_xi, np.zeros_like(self.xi), by_parameters
 
     def add_curvature(self, curvature: SecondDerivatives, mu: Array) -> None:
         """Add the second derivatives of Σ μ_k (d_k m_{k−1} + a_k S_k) that involve (g, τ).
@@ -443,9 +437,7 @@ class MemoryState:
         return MemoryState(self.body, self.theta, stress=stress, overstress=overstress)
 
     def _after_interval(self, interval_s: float) -> tuple[Array, Array]:
-        """Return e Q − b S (all branches,) [Pa] of the overstress Q and the stress S, and the
-        coefficients c (B,), for an interval [s].
-        """
+        """Return e Q − b S (all branches,) [Pa] and the coefficients c (B,)."""
         memory = self.body.memory
         u = self.theta[[(b.share, b.tau) for b in memory.branches]].T
         data = np.tile([[interval_s], [float(memory.oscillates)]], u.shape[1])
@@ -566,11 +558,7 @@ class MemoryForwardColumns:
         self.next += 1
 
     def _elastic_stress_derivatives(self, k: int) -> Array:
-        """Return the derivatives (c, width) of S at evaluation k by the c columns that change
-        elastic constants; empty if none do.
-
-        Derivatives are computed for a chunk of evaluations and stored, so that k must not decrease.
-        """
+        """∂S (c, width) at evaluation k, which must not decrease."""
         if not len(self._moduli):
             return self._by_moduli
         if k % EVALUATIONS_PER_CHUNK == 0 or not len(self._by_moduli):

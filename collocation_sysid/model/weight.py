@@ -65,11 +65,7 @@ class DofMasses:
         return self.own_kg + self.added_kg + self.tied_kg[t]
 
     def _plus_tied(self, constant_kg: Array) -> Array:
-        """Return the sum (T, 3n) of a constant mass (3n,) and the tied masses.
-
-        If the tied masses are the same at all times, stored as a view with stride 0, so is the
-        result.
-        """
+        """Return constant (3n,) plus tied masses (T, 3n); a view with stride 0 if those are one."""
         if len(self.tied_kg) and self.tied_kg.strides[0] == 0:
             return np.broadcast_to(constant_kg + self.tied_kg[0], self.tied_kg.shape)
         return constant_kg + self.tied_kg
@@ -306,16 +302,12 @@ class Weight(ForceTerm):
 
 
 def _own_kg(body: Body) -> Array:
-    """Return the masses (3n,) of a body whose constants are not known yet [kg]; NaN where a density
-    or a density field is a parameter.
-    """
+    """Return the masses (3n,) [kg]; NaN where a density or a density field is a parameter."""
     return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 
 
 def _zero_loads(rows: Array, count: int = 0) -> dict[str, Array]:
-    """Return new arrays of zeros for L loads whose time is estimated, by the name of the field:
-    masses (L, 3n), forces (L, T, 3n), shares (T, L).
-    """
+    """Return zero masses (L, 3n), forces (L, T, 3n) and shares (T, L) of loads, by name."""
     times, dofs = rows.shape
     return {
         "joining_kg": np.zeros((count, dofs)),
@@ -330,7 +322,5 @@ def _sum_over_nodes(dofs: Array) -> Array:
 
 
 def _as_constant_view(rows: Array) -> Array:
-    """Return equal rows as a read-only view of a copy of one row, with stride 0; another array
-    itself, also if a value is NaN. There must be at least one row.
-    """
+    """Return equal rows as a read-only view with stride 0; another array itself."""
     return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows

@@ -36,7 +36,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -57,31 +56,16 @@ WIDTH = 2e-4
 # Width δ of contact with friction, in the same unit: where points slip, friction with a stiffer
 # pressure law destabilises static equilibria.
 FRICTION_WIDTH = 2e-3
-# Width δ of contact as complementarity, in the same unit; the relaxation b g = r δ² refers to it.
-RELAXED_WIDTH = 2e-3
 # Slip ε of dynamic and of static experiments, in mean edge lengths of all faces per second or per
 # sample: the largest creep of a body at rest under friction.
 SLIP = (0.01, 1e-4)
 # Number of data of a point: area, r δ², δ, κ in units of `stiffness`, and the length of the step
 # over which the pressure is averaged.
 DATA_COUNT = 5
-# Multiple of ε above which a point slips: friction is then at least 95 % of its limit.
-SLIP_THRESHOLD = 3.0
 # Points are evaluated in multiples of this number, so that only a few sizes are compiled.
 POINT_BATCH = 16
-# Smallest difference of two gaps, to avoid division by zero [m].
-TINY_M = 1e-30
 # Largest b of relaxed contact in widths, which limits the pressure at gaps near zero or below.
 LARGEST_SCALED_PRESSURE = 50.0
-
-
-class NormalContact(NamedTuple):
-    """Expressions of the contact of a point without friction."""
-
-    point: ca.SX  # (3,) SX: the point in obstacle axes [m]
-    axes: ca.SX  # (3, 3) SX: axes of the obstacle, one per column, in the axes of the world
-    gap_gradient: ca.SX  # (3,) SX: gradient of the gap at the point, in obstacle axes
-    force_n: ca.SX  # normal force N [N]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +106,7 @@ class ContactLaw:
         if self.obstacle.width_m is not None:
             return np.full(len(self.edges_m), self.obstacle.width_m)
         if self.obstacle.relaxed is not None:
-            return RELAXED_WIDTH * self.edges_m
+            return 2e-3 * self.edges_m
         return (FRICTION_WIDTH if self.obstacle.has_friction else WIDTH) * self.edges_m
 
     @property
@@ -359,19 +343,19 @@ class ContactLaw:
         scaled_pressure : SX, optional
             Given b; that of the gap by default.
         """
-        contact = self._normal_contact(u, data, pressing=scaled_pressure)
+        place, axes, slope, force_n = self._normal_contact(u, data, pressing=scaled_pressure)
         # The forces on the ends of the axes follow from the coordinates of the point in these axes.
-        push = contact.force_n * contact.gap_gradient
-        force = ca.vertcat(contact.axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m)
+        push = force_n * slope
+        force = ca.vertcat(axes @ push, ca.vec(u[:3] @ push.T) / self._frame_size_m)
         if not self.obstacle.has_friction:
             return force
-        _, friction, _ = self._friction(u, contact)
-        return force + ca.vertcat(
-            friction, -ca.vec(friction @ (contact.point / self._frame_size_m).T)
-        )
+        _, friction, _ = self._friction(u, place, axes @ slope, force_n)
+        return force + ca.vertcat(friction, -ca.vec(friction @ (place / self._frame_size_m).T))
 
-    def _normal_contact(self, u: ca.SX, data: ca.SX, pressing: ca.SX | None) -> NormalContact:
-        """Return the point in the axes of its obstacle, and its normal force."""
+    def _normal_contact(
+        self, u: ca.SX, data: ca.SX, pressing: ca.SX | None
+    ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Return point [m], axes (3, 3) and ∂gap/∂point in obstacle axes, and normal force [N]."""
         place, axes = self.to_obstacle_frame(u[: 3 * VECTORS_PER_POINT])
         symbol = ca.SX.sym("place", 3)
         gap = self.gap_at(symbol)
@@ -384,12 +368,10 @@ class ContactLaw:
         else:
             scaled_pressure = self.scaled_pressure(gap, data)
         force_n = data[0] * data[3] * self.stiffness(self._constants(u)) * scaled_pressure
-        return NormalContact(place, axes, gap_gradient=slope, force_n=force_n)
+        return place, axes, slope, force_n
 
     def _end_gaps(self, u: ca.SX, half_s: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return the gaps [m] at both ends of a step: `half_s` [s] before and after the state in u,
-        with constant velocities.
-        """
+        """Return the gaps [m] `half_s` before and after the state in u, at constant velocities."""
         y = u[: 3 * VECTORS_PER_POINT]
         v = u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT]
         before, after = (
@@ -401,17 +383,17 @@ class ContactLaw:
         """Return the constants (c,), which are the last entries of u."""
         return u[u.numel() - len(self.constant_columns) :]
 
-    def _friction(self, u: ca.SX, contact: NormalContact) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Return the limit μ N of the friction of a point [N], its friction force (3,) [N], and its
-        tangential velocity (3,) relative to the obstacle [m/s], in the axes of the world.
+    def _friction(
+        self, u: ca.SX, place: ca.SX, slope: ca.SX, force_n: ca.SX
+    ) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return limit μ N [N], friction force (3,) [N] and tangential velocity (3,) [m/s]; these
+        and the gradient `slope` of the gap are in the axes of the world.
         """
-        slope = contact.axes @ contact.gap_gradient
         relative, *ends = ca.vertsplit(u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3)
-        relative -= ca.horzcat(*ends) @ (contact.point / self._frame_size_m)
+        relative -= ca.horzcat(*ends) @ (place / self._frame_size_m)
         normal = slope / ca.norm_2(slope)
         tangential = relative - normal * ca.dot(normal, relative)
-        coefficient = self.friction_coefficient(self._constants(u))
-        limit_n = coefficient * contact.force_n
+        limit_n = self.friction_coefficient(self._constants(u)) * force_n
         speed = ca.sqrt(ca.sumsqr(tangential) + self.slip**2)
         return limit_n, -limit_n / speed * tangential, tangential
 
@@ -425,9 +407,10 @@ class ContactLaw:
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return the 6 values of friction, with u = (y, ẏ, c)."""
-            contact = self._normal_contact(u, data, pressing=None)
-            limit_n, force, velocity = self._friction(u, contact)
-            slip_speed = SLIP_THRESHOLD * self.slip
+            place, axes, slope, force_n = self._normal_contact(u, data, pressing=None)
+            limit_n, force, velocity = self._friction(u, place, axes @ slope, force_n)
+            # Friction is then at least 95 % of its limit.
+            slip_speed = 3.0 * self.slip
             slips = ca.sumsqr(velocity) > slip_speed**2
             return ca.vertcat(limit_n, limit_n * slips, force, -ca.dot(force, velocity))
 
@@ -472,5 +455,5 @@ def mean_square(first: ca.SX, second: ca.SX) -> ca.SX:
     low = ca.fmin(first, second)
     both = (high**2 + high * low + low**2) / 3
     # Where low is negative, high − low is at least high.
-    one = high**3 / (3 * ca.if_else(low > 0, 1.0, ca.fmax(high - low, TINY_M)))
+    one = high**3 / (3 * ca.if_else(low > 0, 1.0, ca.fmax(high - low, 1e-30)))
     return ca.if_else(low > 0, both, ca.if_else(high > 0, one, 0.0))

@@ -13,8 +13,6 @@ from ..dynamics import Dynamics
 from ..force_term import States
 from .contact_force import Contact, contact_terms
 
-# Times with a normal force below this share of the largest are ignored.
-GRAZE = 0.01
 # Number of samples whose gaps are evaluated together, to limit memory.
 AT_ONCE = 64
 
@@ -84,7 +82,7 @@ class FrictionSummary:
     """Friction with an obstacle in a motion."""
 
     # Largest ratio of the total friction force to its limit, over the times whose limit is above
-    # the share `GRAZE` of the largest; 0 without contact.
+    # 1 % of the largest; 0 without contact.
     used: float
     slipping: float  # share of slipping points, weighted by their friction limits, over the motion
     dissipated_j: float  # dissipated energy [J]
@@ -112,7 +110,7 @@ def friction_summaries(
         sums = np.concatenate([contact.friction_sums(row) for row in rows], axis=1)
         limit_n, slipping_n, *rub_n, power_w = sums
         # At times of little contact the ratio of both forces is meaningless.
-        is_firm = limit_n > GRAZE * limit_n.max(initial=0.0)
+        is_firm = limit_n > 0.01 * limit_n.max(initial=0.0)
         used = np.linalg.norm(rub_n, axis=0)[is_firm] / limit_n[is_firm]
         summaries[contact.law_of_contact.obstacle.name] = FrictionSummary(
             used=float(used.max(initial=0.0)),

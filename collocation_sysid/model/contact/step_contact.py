@@ -18,8 +18,6 @@ from ...fem.pattern import SymmetricPattern
 from ..local_force import ActivePoints, CandidatePoints, LocalForce
 from .contact_law import POINT_BATCH, ContactLaw
 
-# Distance within which points are candidates, in edges of the surface.
-MARGIN = 0.25
 # Share of this distance by which a coordinate may change before candidates are searched again.
 CHANGE = 1 / 3
 
@@ -33,9 +31,7 @@ class ContactCandidates:
 
     @cached_property
     def _last_data(self) -> dict[tuple[float, bytes, bytes], Array]:
-        """Data of the law at the last evaluation, by the length of the step, the constants and the
-        frame of the obstacle.
-        """
+        """Data at the last evaluation, by length of the step, constants and frame."""
         return {}
 
     @staticmethod
@@ -95,10 +91,7 @@ class ContactCandidates:
         return np.concatenate([self.points.all_nodes, self.law.obstacle.nodes])
 
     def _data_with(self, frame: Array, constants: Array, step_s: float) -> Array:
-        """Return the data (d, i) of the law.
-
-        The last data are stored, because the frame of the obstacle does not move within a step.
-        """
+        """Return the data (d, i), stored: the frame does not move within a step."""
         key = step_s, constants.tobytes(), frame.tobytes()
         data = self._last_data.get(key)
         if data is None:
@@ -146,7 +139,8 @@ class StepContact(LocalForce):
         self._from = np.full((1, 1), np.nan)
         self._last_candidates: ContactCandidates | None = None
         self._last_evaluation: tuple[Array, Array, ActivePoints] | None = None
-        self._margin_m = MARGIN * law.surface.edge_m
+        # In edges of the surface.
+        self._margin_m = 0.25 * law.surface.edge_m
 
     def force(self, xi: Array, nu: Array) -> Array:
         """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
@@ -188,11 +182,7 @@ class StepContact(LocalForce):
         return candidates.inputs(xi[0], nu[0], constants=self._constants, step_s=self._step_s)
 
     def _candidates(self, xi: Array, nu: Array) -> ContactCandidates | None:
-        """Return the candidates at ξ and ν, (3n,) each; None if no point may touch.
-
-        The search for candidates is repeated if the state has changed by more than the margin
-        allows.
-        """
+        """Candidates at ξ and ν; searched again if the state left the margin. None without any."""
         ends = xi[None]
         if self._step_s:
             # A pressure that is averaged over a step depends on the states at both ends.
@@ -204,9 +194,7 @@ class StepContact(LocalForce):
         return self._last_candidates
 
     def _candidates_near(self, states: Array) -> ContactCandidates | None:
-        """Return the points within the margin in any of the states (s, 3n) [m]; None if there are
-        none.
-        """
+        """Points within the margin in any of the states (s, 3n) [m]; None without any."""
         law = self._law
         gaps_m = law.gaps(law.surface.points.vectors(states)).min(axis=0)
         is_near = gaps_m < law.widths_m + self._margin_m
