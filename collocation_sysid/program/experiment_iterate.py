@@ -143,15 +143,13 @@ class ExperimentIterate:
         for k, (reading, (by_observables, by_phi)) in enumerate(pairs):
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
-                products = reading.observable.vjp(
+                own_x, own_reaction, own_phi = reading.observable.vjp(
                     self.motion_for(reading.observable), phi, by_values=by_observables
                 )
-                by_x = by_x + products.by_x
-                by_p[nq:] = by_p[nq:] + products.by_phi
-                if products.by_reaction is not None:
-                    by_reaction = products.by_reaction + (
-                        0.0 if by_reaction is None else by_reaction
-                    )
+                by_x = by_x + own_x
+                by_p[nq:] = by_p[nq:] + own_phi
+                if own_reaction is not None:
+                    by_reaction = own_reaction + (0.0 if by_reaction is None else by_reaction)
         if by_reaction is not None:
             through_x, through_p = self._reaction_vjp(by_reaction)
             by_x += through_x

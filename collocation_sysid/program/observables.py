@@ -66,15 +66,6 @@ class ObservableDerivatives(NamedTuple):
         )
 
 
-class VectorJacobianProduct(NamedTuple):
-    """Derivatives of a scalar by positions, reaction forces and nuisance parameters."""
-
-    by_x: Array  # (N, 3n): derivatives by the positions [1/m]
-    # (N, g) or None: derivatives by the reaction forces [1/N]; None if it does not depend on them.
-    by_reaction: Array | None
-    by_phi: Array  # (k,): derivatives by φ
-
-
 class SparseEntries(NamedTuple):
     """Entries of a sparse matrix, three arrays of equal length; values with the same row and column
     are summed.
@@ -252,8 +243,11 @@ class PointPositions:
             by_own=self._coordinate_derivatives(x, shape_functions),
         )
 
-    def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
-        """Vector–Jacobian product: derivatives of a scalar by x and φ from those by the values.
+    def vjp(
+        self, motion: ObservedMotion, phi: Array, by_values: Array
+    ) -> tuple[Array, Array | None, Array]:
+        """Vector–Jacobian product: derivatives of a scalar by x (N, 3n), by reaction forces, which is
+        None, and by φ (k,), from those by the values.
 
         Parameters
         ----------
@@ -276,7 +270,7 @@ class PointPositions:
                 self._coordinate_derivatives(motion.x, self.shape_functions(phi)),
             )
             by_phi[self.coordinate_parameters[here]] = own
-        return VectorJacobianProduct(by_x, None, by_phi=by_phi)
+        return by_x, None, by_phi
 
     def frame_changes(
         self, grasp: Grasp, motion: ObservedMotion, phi: Array, shifts: Array, rotations: Array

@@ -6,15 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import NamedTuple
-
-
-class ComputingTimes(NamedTuple):
-    """Computing times by kind of work."""
-
-    build: float  # time of symbolic work and tables [s]
-    evaluations: float  # time of element kernels [s]
-    linear_algebra: float  # time of factorisations and substitutions [s]
 
 
 class Stopwatch:
@@ -63,9 +54,9 @@ class Stopwatch:
             self.evaluations += evaluations
             self.linear_algebra += linear_algebra
 
-    def read_and_reset(self) -> ComputingTimes:
-        """Return the accumulated times and reset all three to zero."""
-        spent = ComputingTimes(self.build, self.evaluations, linear_algebra=self.linear_algebra)
+    def read_and_reset(self) -> tuple[float, float, float]:
+        """Return the times of building, evaluations and linear algebra [s]; reset them to zero."""
+        spent = self.build, self.evaluations, self.linear_algebra
         self.build = self.evaluations = self.linear_algebra = 0.0
         return spent
 

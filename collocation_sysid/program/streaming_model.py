@@ -67,21 +67,6 @@ class StreamStencil(NamedTuple):
         return range(begins, ends + self.neighbours)
 
 
-class StencilMatrices(NamedTuple):
-    """Stencil coefficients as matrices that map values at all rows to values of each row.
-
-    Each has the shape (rows, rows); p, q and s apply to positions and give the states ξ [m] and ν
-    [m/s] of the evaluations and the accelerations [m/s²], w applies to the forces at the
-    evaluations. The time step is included in q and s.
-    """
-
-    # (rows, rows): coefficients of row t and time t − i at [t, t − i], see `model.schemes`.
-    p: Array
-    q: Array
-    w: Array
-    s: Array
-
-
 class StreamInstrument(NamedTuple):
     """Instrument whose samples come with frames: a custom sensor, or the sensor of a grasp."""
 
@@ -451,17 +436,15 @@ class StreamingModel:
         return grasp, dofs % 3
 
     @cached_property
-    def stencils(self) -> StencilMatrices:
-        """Stencil coefficients of all rows of the template."""
+    def stencils(self) -> tuple[Array, Array, Array, Array]:
+        """Stencil coefficients p, q, w and s of the template as matrices (rows, rows), with those of
+        row t and time t − i at [t, t − i], see `model.schemes`; q and s include the time step.
+        """
         dynamics = self.transcription.dynamics.truncated_to(self.template_rows)
         tables = dynamics.tables
         step_s = dynamics.step_s
-        return StencilMatrices(
-            p=_banded_matrix(tables.p),
-            q=_banded_matrix(tables.q) / step_s,
-            w=_banded_matrix(tables.w),
-            s=_banded_matrix(tables.s) / step_s**2,
-        )
+        p, q, w, s = map(_banded_matrix, (tables.p, tables.q, tables.w, tables.s))
+        return p, q / step_s, w, s / step_s**2
 
 
 def _banded_matrix(table: Array) -> Array:

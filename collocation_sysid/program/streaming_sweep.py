@@ -422,18 +422,16 @@ class StreamingSweep:
             past[:, 0] = 0.0
         rows = slice(here.start, here.stop)
         known = slice(here.stop)
-        stencils = self.model.stencils
+        p, q, w, s = self.model.stencils
         x = self.x[known]
         force = self.force[known]
         free = self.solver.free
-        acceleration = stencils.s[rows, known] @ x
+        acceleration = s[rows, known] @ x
         at = self.forces.linearise(
-            stencils.p[rows, known] @ x,
-            stencils.q[rows, known] @ x,
-            out=self.model.linearisation_memory[: len(here)],
+            p[rows, known] @ x, q[rows, known] @ x, out=self.model.linearisation_memory[: len(here)]
         )
         force[rows] = at.force
-        total = stencils.w[rows, known] @ force
+        total = w[rows, known] @ force
         residual = (total - self.mass_kg * acceleration)[:, free]
         return at, self.columns.right_hand_sides(
             rows, at, acceleration=acceleration, residual=residual, free=free
@@ -541,11 +539,11 @@ class StreamingSweep:
         first = max(here.start, int(sensors[0][0].known_rows[0]) + DELAY_STEPS)
         if first >= here.stop:
             return resultants
-        stencils = self.model.stencils
+        _, _, w, s = self.model.stencils
         x = self.x[: here.stop, self.sensed]
         rows = np.arange(first, here.stop)
         reactions, channels = self.reactions.resultants(
-            sensors, self.setting, x=x, weights=(stencils.w, stencils.s), rows=rows
+            sensors, self.setting, x=x, weights=(w, s), rows=rows
         )
         motion = ObservedMotion(x, reactions)
         for k, channel in enumerate(channels):

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -383,18 +382,10 @@ def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float)
     )
 
 
-class SampleQuantiles(NamedTuple):
-    """Median and 95 % interval of samples."""
-
-    lower: float  # quantile of 2.5 %
-    median: float
-    upper: float  # quantile of 97.5 %
-
-
-def _quantiles(values: Array) -> SampleQuantiles:
-    """Return median and 95 % interval of samples (any shape, not empty)."""
+def _quantiles(values: Array) -> tuple[float, float, float]:
+    """Return the 2.5 %, 50 % and 97.5 % quantiles of samples (any shape, not empty)."""
     lower, median, upper = np.quantile(values, [ENDS[0], 0.5, ENDS[1]])
-    return SampleQuantiles(float(lower), float(median), upper=float(upper))
+    return float(lower), float(median), float(upper)
 
 
 def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:

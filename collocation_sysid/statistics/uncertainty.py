@@ -71,7 +71,6 @@ from .residuals.noise_level import (
 )
 from .residuals.recording_scatter import (
     RecordingComparison,
-    RecordingEstimate,
     blocks_by_recording,
     compare_recordings,
     single_fits,
@@ -262,9 +261,7 @@ def uncertainty_from_fit(
     covariance, determined, of_noise, basis = _error_bars(fit, factored, requested=error_model)
     of_all, bounded = _reported_covariance(covariance, fit, parameters=parameters, q=q)
     scatter = _compare_recordings(fit, parameters, q=q, errors=error_model)
-    widened = _widen_by_scatter(of_all[:shared, :shared], of_noise, scatter=scatter)
-    of_q = widened.covariance
-    quantiles = widened.quantiles
+    of_q, quantiles, widening = _widen_by_scatter(of_all[:shared, :shared], of_noise, scatter)
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
     )
@@ -307,7 +304,7 @@ def uncertainty_from_fit(
             *disagreement_notes(parameters, scatter),
         ),
         scatter=scatter,
-        widening=widened.factors,
+        widening=widening,
     )
 
 
@@ -379,23 +376,14 @@ def _reported_covariance(
     return reported, bounded
 
 
-@dataclass(frozen=True, eq=False)
-class _WidenedBars:
-    """Error bars of the shared parameters that contain the disagreement of recordings."""
-
-    covariance: Array  # (nq, nq): covariance of q
-    quantiles: Array  # (nq,): half widths of the 95 % intervals in standard deviations
-    # (nq,): half widths of the intervals over those without the disagreement; 1 where recordings
-    # agree.
-    factors: Array
-
-
 def _widen_by_scatter(
     covariance_q: Array, quantiles: Array, scatter: RecordingComparison | None
-) -> _WidenedBars:
-    """Widen the error bars of parameters on which recordings disagree."""
+) -> tuple[Array, Array, Array]:
+    """Return the covariance (nq, nq), the half widths (nq,) of the 95 % intervals in standard
+    deviations, and by what they are wider (nq,), where recordings disagree.
+    """
     if scatter is None:
-        return _WidenedBars(covariance_q, quantiles, factors=np.ones(len(quantiles)))
+        return covariance_q, quantiles, np.ones(len(quantiles))
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
     factors = np.where(scatter.find_disagreements(), factors, 1.0)
@@ -403,11 +391,7 @@ def _widen_by_scatter(
         quantiles, student_ppf(0.975, np.maximum(scatter.count_degrees_of_freedom(), 1))
     )
     wide = np.where(scatter.find_disagreements(), of_few, quantiles)
-    return _WidenedBars(
-        covariance_q * np.outer(factors, factors),
-        quantiles=wide,
-        factors=factors * wide / quantiles,
-    )
+    return covariance_q * np.outer(factors, factors), wide, factors * wide / quantiles
 
 
 def _compare_recordings(
@@ -420,7 +404,7 @@ def _compare_recordings(
     """
     if len(blocks_by_recording(fit)) < 2:
         return None
-    known = {}
+    known: dict[str, tuple[Array, Array, Array]] = {}
     sizes = relative_derivatives(parameters, q)
     for alone, step in single_fits(fit):
         if alone.count_measurements() <= len(alone.names):
@@ -428,9 +412,7 @@ def _compare_recordings(
         uncertainty = uncertainty_from_fit(alone, parameters, q=q, error_model=errors)
         independent = least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
         variances = np.diag(uncertainty.covariance) / sizes**2
-        known[alone.blocks[0].name] = RecordingEstimate(
-            step[: fit.shared_count], variances, independent_variances=independent
-        )
+        known[alone.blocks[0].name] = step[: fit.shared_count], variances, independent
     return compare_recordings(fit, known) if len(known) > 1 else None
 
 

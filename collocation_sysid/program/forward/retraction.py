@@ -17,8 +17,6 @@ pressures with which the stiffness is indefinite.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -36,18 +34,6 @@ LARGEST_STRAIN = 20.0
 # Largest entry of the gradient of an increment: steps of a nearly singular matrix may be of any
 # length, and are halved later.
 LONGEST_STEP = 1e6
-
-
-@dataclass(frozen=True, eq=False)
-class _Axis:
-    """Least-squares problem of one coordinate of the positions."""
-
-    # (f,), (p,): nodes whose coordinate is free or prescribed.
-    free: Index
-    prescribed: Index
-    factor: SuperLU  # factor of the normal equations of the free nodes
-    # (f, p) sparse: normal equations of the free nodes by the prescribed ones.
-    coupling: sp.csc_array
 
 
 class Retraction:
@@ -69,7 +55,7 @@ class Retraction:
         anchor = np.full(len(body.nodes_m), ANCHOR * float(self._weights.sum()) / size_m**2)
         self._anchor = anchor
         normal = sp.csc_array(laplacian + sp.diags_array(anchor))
-        known: dict[bytes, _Axis] = {}
+        known: dict[bytes, tuple[Index, Index, SuperLU, sp.csc_array]] = {}
         for column in prescribed.T:
             key = column.tobytes()
             if key not in known:
@@ -83,9 +69,8 @@ class Retraction:
         moved = (x + increment).reshape(-1, 3)
         right = self._gradient.T @ (self._weights[:, None] * self._target(x, increment))
         right += self._anchor[:, None] * moved
-        for k, axis in enumerate(self._axes):
-            known = axis.coupling @ moved[axis.prescribed, k]
-            moved[axis.free, k] = axis.factor.solve(right[axis.free, k] - known)
+        for k, (free, fixed, factor, coupling) in enumerate(self._axes):
+            moved[free, k] = factor.solve(right[free, k] - coupling @ moved[fixed, k])
         return moved.ravel()
 
     def relative_gradient(self, x: Array, increment: Array) -> Array:
@@ -123,19 +108,16 @@ def _exponential(strain: Array) -> Array:
     return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
 
 
-def _axis(normal: sp.csc_array, prescribed: NDArray[np.bool_]) -> _Axis:
-    """Return the least-squares problem of one coordinate, from the normal equations (n, n) of all
-    nodes and the mask (n,) of prescribed nodes.
+def _axis(
+    normal: sp.csc_array, prescribed: NDArray[np.bool_]
+) -> tuple[Index, Index, SuperLU, sp.csc_array]:
+    """Return free and prescribed nodes of a coordinate, the factor of the normal equations of the
+    free ones, and their coupling to the prescribed ones.
     """
     free = np.flatnonzero(~prescribed)
     fixed = np.flatnonzero(prescribed)
     rows = normal[free]
-    return _Axis(
-        free,
-        fixed,
-        factor=splu(sp.csc_matrix(rows[:, free])),
-        coupling=sp.csc_array(rows[:, fixed]),
-    )
+    return free, fixed, splu(sp.csc_matrix(rows[:, free])), sp.csc_array(rows[:, fixed])
 
 
 def add_increment(x: Array, increment: Array) -> Array:

@@ -32,12 +32,7 @@ from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.nuisance import SENSOR_LAG, SENSOR_TIME, TOOL_CENTRE, TOOL_MASS, cayley_rotation
 from ...recording.poses import Frame
-from ..observables import (
-    ObservableDerivatives,
-    ObservedMotion,
-    ReactionForces,
-    VectorJacobianProduct,
-)
+from ..observables import ObservableDerivatives, ObservedMotion, ReactionForces
 from .reaction_forces import centred_rows
 
 # Sizes of the data of the tool: the sensor's axes Q, the grasp's rotation and its second time
@@ -432,9 +427,11 @@ class ReactionResultant:
             np.arange(size), slope
         )
 
-    def vjp(self, motion: ObservedMotion, phi: Array, by_values: Array) -> VectorJacobianProduct:
-        """Vector–Jacobian product: derivatives of a scalar by positions, reaction forces and φ from
-        those by Y.
+    def vjp(
+        self, motion: ObservedMotion, phi: Array, by_values: Array
+    ) -> tuple[Array, Array, Array]:
+        """Vector–Jacobian product: derivatives of a scalar by positions (N, 3n), reaction forces
+        (N, g) and φ (k,) from those by Y.
 
         Parameters
         ----------
@@ -463,7 +460,7 @@ class ReactionResultant:
             "ka,kag->kg", by_w, of_force
         )
         by_x[np.ix_(k, self.sensed_dofs[self.node_dofs])] = np.einsum("ka,kag->kg", by_w, of_place)
-        return VectorJacobianProduct(by_x, by_reaction, by_phi=by_phi)
+        return by_x, by_reaction, by_phi
 
     def frame_changes(
         self, grasp: Grasp, motion: ObservedMotion, phi: Array, shifts: Array, rotations: Array

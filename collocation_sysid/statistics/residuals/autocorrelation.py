@@ -315,8 +315,8 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
         return Dependence(0.0, np.inf, shared_p=1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
     tested = (each for each in pairs if not each[0].has_noise_floor)
-    over_space = [moments for each in tested if (moments := estimate_spatial_correlation(*each))]
-    space_p = min((len(over_space) * moments.p_value for moments in over_space), default=1.0)
+    over_space = [found for each in tested if (found := estimate_spatial_correlation(*each))]
+    space_p = min((len(over_space) * p_value for _, p_value, _ in over_space), default=1.0)
     moments = lagged_products(fit, information, lags=[1] * len(fit.blocks))
     # Rows and columns: variance and lag one, pooled over the experiments.
     pool = np.tile(np.eye(2), len(fit.blocks))
@@ -443,8 +443,8 @@ def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) ->
     channels *= autocovariance[0] * weight.sum() / level if level > 0 else 0.0
     if over_space is not None and len(residual) <= residual.shape[1]:
         # Samples are too few to tell a covariance by themselves.
-        covariance = over_space.covariance
-        freedom = len(residual) * over_space.freedom
+        covariance, _, freedom = over_space
+        freedom *= len(residual)
         if block.has_noise_floor and np.trace(covariance) < len(covariance):
             covariance = np.eye(len(covariance))
             freedom = np.inf

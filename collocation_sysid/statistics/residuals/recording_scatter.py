@@ -159,18 +159,8 @@ def fit_part(
     return alone.after_step(step), step
 
 
-@dataclass(frozen=True, eq=False)
-class RecordingEstimate:
-    """Shared parameters by one recording alone, in the solver's coordinates."""
-
-    step: Array  # (nq,): estimates less those of the joint fit
-    # (nq,): their variances; NaN or infinite where the recording does not determine them.
-    variances: Array
-    independent_variances: Array  # (nq,): variances for independent errors of the stated σ
-
-
 def compare_recordings(
-    fit: LinearisedFit, alone: Mapping[str, RecordingEstimate]
+    fit: LinearisedFit, alone: Mapping[str, tuple[Array, Array, Array]]
 ) -> RecordingComparison:
     """Compare recordings by the result of each alone; a parameter that a recording hardly
     determines, with a standard deviation of q of at least `TELLING`, has NaN there.
@@ -179,12 +169,12 @@ def compare_recordings(
     ----------
     fit : LinearisedFit
         The joint fit.
-    alone : mapping of str to RecordingEstimate
-        Estimates by recording, at least one.
+    alone : mapping
+        By recording, at least one: its estimates of q less those of the joint fit (nq,), their
+        variances, NaN or infinite where it does not determine them, and the variances for
+        independent errors of the stated σ.
     """
-    steps = np.array([each.step for each in alone.values()])
-    variances = np.array([each.variances for each in alone.values()])
-    independent = np.array([each.independent_variances for each in alone.values()])
+    steps, variances, independent = map(np.array, zip(*alone.values(), strict=True))
     deviations = np.sqrt(variances)
     is_determined = deviations < TELLING
     with np.errstate(invalid="ignore"):

@@ -12,8 +12,6 @@ directions that the parameters do not affect (restricted maximum likelihood; Pat
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ...common.array_types import Array
@@ -32,18 +30,10 @@ LEAST_CORRELATION = 0.1
 MOST_SAMPLES = 20
 
 
-@dataclass(frozen=True, eq=False)
-class SpatialCorrelation:
-    """Spatial correlation of the errors of one sample of a block."""
-
-    covariance: Array  # (n, n): covariance of its channels, in units of σ²
-    length_m: float  # correlation length ℓ [m]
-    p_value: float  # p-value of the likelihood ratio, for independent errors
-    freedom: float  # degrees of freedom of the variance
-
-
-def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialCorrelation | None:
-    """Estimate the spatial correlation of a block's errors.
+def estimate_spatial_correlation(
+    block: ResidualBlock, slope: Array
+) -> tuple[Array, float, float] | None:
+    """Estimate the spatial correlation of the errors of a sample of a block.
 
     Parameters
     ----------
@@ -52,8 +42,10 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
 
     Returns
     -------
-    SpatialCorrelation or None
-        None if the block has no places, no samples, or too few points in each.
+    (covariance, p_value, freedom) or None
+        Covariance (n, n) of its channels in units of σ², p-value of the likelihood ratio for
+        independent errors, degrees of freedom of the variance. None if the block has no places, no
+        samples, or too few points in each.
 
     Notes
     -----
@@ -104,7 +96,7 @@ def estimate_spatial_correlation(block: ResidualBlock, slope: Array) -> SpatialC
     freedom = max(
         1.0, len(contrasts) * share_known * np.trace(shape) ** 2 / float(np.sum(shape**2))
     )
-    return SpatialCorrelation(level * shape, float(length), p_value=p, freedom=freedom)
+    return level * shape, p, freedom
 
 
 def _correlation_matrix(distances_m: Array, share: float, length_m: float) -> Array:
