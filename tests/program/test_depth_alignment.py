@@ -7,11 +7,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth import camera_alignment
-from collocation_sysid.program.depth.camera_alignment import (
-    SLIDING,
-    _alignment_steps,
-    _MatchedSurface,
-)
+from collocation_sysid.program.depth.camera_alignment import SLIDING, _alignment_steps
 from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 
@@ -26,8 +22,7 @@ def test_steps_are_those_of_linear_least_squares():
     weights = rng.uniform(size=(starts, points))
     prior = np.array([11.0, 11.0, 1e6, 50.0, 50.0, 50.0])
     errors = 0.01 * rng.normal(size=(starts, 6))
-    matched = _MatchedSurface(arms_m, distances_m, is_facing=np.ones((starts, points), dtype=bool))
-    steps = _alignment_steps(matched, normals, weights=weights, prior=prior, errors=errors)
+    steps = _alignment_steps(arms_m, distances_m, normals, weights, prior, errors)
     for k in range(starts):
         rows = []
         right = []

@@ -67,15 +67,6 @@ SMALLEST_VARIANCE = 1e-8
 POSES_PER_SAMPLE = 4
 
 
-@dataclass(frozen=True, eq=False)
-class ResidualRows:
-    """Residuals S x − b of one kind, in units of their deviations."""
-
-    name: str  # name of the point, or "rest"
-    matrix: sp.csr_array  # (m, N · 3n) sparse: S, by the flattened positions [1/m]
-    target: Array  # (m,): b
-
-
 class LinearisedLimits(NamedTuple):
     """Limits of a hand near some unknowns, to first order; linear limits are exact."""
 
@@ -399,24 +390,23 @@ class PlannedProgram:
     # The residuals --------------------------------------------------------------------------------
 
     @cached_property
-    def residual_rows(self) -> tuple[ResidualRows, ...]:
-        """Residuals of the body: those of each reference, then those of the rest at the end."""
-        rows = [self._reference_rows(each) for each in self.references]
+    def residual_rows(self) -> list[tuple[str, sp.csr_array, Array]]:
+        """Residuals S x − b of each reference, then of the rest at the end, in units of their
+        deviations: name of the point or "rest", S (m, N · 3n) [1/m] and b (m,).
+        """
+        rows = [(each.name, *self._reference_rows(each)) for each in self.references]
         if self.task.end.at_rest:
-            rows.append(self._rest_rows())
-        return tuple(rows)
+            rows.append(("rest", *self._rest_rows()))
+        return rows
 
     @cached_property
     def residuals(self) -> tuple[sp.csr_array, Array]:
         """Matrix S (m, N · 3n) and vector b (m,) of all residuals S x − b of the body."""
         size = len(self.grid_since_s) * self.driven.transcription.dof_count
-        matrices = [each.matrix for each in self.residual_rows]
-        if not matrices:
+        if not self.residual_rows:
             return sp.csr_array((0, size)), np.zeros(0)
-        return (
-            sp.csr_array(sp.vstack(matrices)),
-            np.concatenate([each.target for each in self.residual_rows]),
-        )
+        _, matrices, targets = zip(*self.residual_rows, strict=True)
+        return sp.csr_array(sp.vstack(matrices)), np.concatenate(targets)
 
     @cached_property
     def effort(self) -> tuple[Array, Array]:
@@ -451,8 +441,7 @@ class PlannedProgram:
         substeps = self.driven.transcription.substeps
         return np.arange(len(self.experiment.t_s)) * substeps
 
-    def _reference_rows(self, reference: Reference) -> ResidualRows:
-        """Return the residuals of a reference."""
+    def _reference_rows(self, reference: Reference) -> tuple[sp.csr_array, Array]:
         at_point = self.point_weights(reference.name)
         rows = self.sample_rows
         last = len(self.grid_since_s) - 1
@@ -477,11 +466,9 @@ class PlannedProgram:
             # Row r has the product of its time's weights and its axis' weights.
             blocks.append(_row_products(select, sp.csr_array(at_point[axes])))
             targets.append(scale * values[samples, axes])
-        return ResidualRows(
-            reference.name, sp.csr_array(sp.vstack(blocks)), np.concatenate(targets)
-        )
+        return sp.csr_array(sp.vstack(blocks)), np.concatenate(targets)
 
-    def _rest_rows(self) -> ResidualRows:
+    def _rest_rows(self) -> tuple[sp.csr_array, Array]:
         """Return the residuals of the velocity of all nodes after the motion."""
         transcription = self.driven.transcription
         free = transcription.free_dofs
@@ -499,7 +486,7 @@ class PlannedProgram:
             (weight, (np.arange(len(free)), free)), shape=(len(free), transcription.dof_count)
         )
         matrix = sp.csr_array(sp.kron(difference, of_dofs))
-        return ResidualRows("rest", matrix, np.zeros(len(rows) * len(free)))
+        return matrix, np.zeros(len(rows) * len(free))
 
     def objective_parts(self, c: Array, x: Array) -> dict[str, float]:
         """Return the parts of the objective at unknowns c and motion x (N, 3n): of each reference,
@@ -507,9 +494,9 @@ class PlannedProgram:
         """
         parts: dict[str, float] = {}
         flat = x.ravel()
-        for each in self.residual_rows:
-            value = float(np.sum((each.matrix @ flat - each.target) ** 2))
-            parts[each.name] = parts.get(each.name, 0.0) + value
+        for name, matrix, target in self.residual_rows:
+            value = float(np.sum((matrix @ flat - target) ** 2))
+            parts[name] = parts.get(name, 0.0) + value
         matrix, constant = self.effort
         parts["jerk"] = float(np.sum((matrix @ c + constant) ** 2))
         return parts

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,16 +74,6 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
         positions_m = part.x.reshape(len(part.x), -1, 3)
         comparison = _MotionComparison(reading, positions_m, is_simulated=within)
         yield from comparison.hypotheses(name)
-
-
-class _AlignedPoints(NamedTuple):
-    """Alignment of measured points with a surface."""
-
-    turn_rad: Array  # (3,): rotation vector of the points about the pivot of the camera [rad]
-    shift_m: Array  # (3,): shift of the points [m]
-    # Root mean square distance of the surface from the points along its normal [m] before the last
-    # step, at most the gate for each point; infinite before the first step.
-    misfit_m: float
 
 
 class _MotionComparison:
@@ -180,10 +169,11 @@ class _MotionComparison:
         Before its first time the body rests at its first position.
         """
         shapes = self._shapes_in_camera(described)
-        aligned = _AlignedPoints(np.zeros(3), np.zeros(3), misfit_m=np.inf)
+        estimate = np.zeros(6)
+        misfit_m = np.inf
         for _ in range(ALIGNMENTS):
-            aligned = self._align(described.images, shapes, start=aligned)
-        return aligned.misfit_m
+            estimate, misfit_m = self._align(described.images, shapes, estimate)
+        return misfit_m
 
     def _shapes_in_camera(self, described: ImageTimes) -> list[tuple[Array, Array]]:
         """Return for each image the visible points of the surface [m] and their unit normals,
@@ -211,11 +201,12 @@ class _MotionComparison:
         self,
         images: Sequence[int] | NDArray[np.int64],
         shapes: list[tuple[Array, Array]],
-        start: _AlignedPoints,
-    ) -> _AlignedPoints:
-        """Return the rotation and shift of the points after one more Gauss–Newton step."""
-        turn_rad = start.turn_rad
-        shift_m = start.shift_m
+        estimate: Array,
+    ) -> tuple[Array, float]:
+        """Return rotation vector [rad] and shift [m] of the points (6,) about the camera's pivot
+        after one more Gauss–Newton step, and the RMS distance along the normals [m] before it.
+        """
+        turn_rad, shift_m = np.split(estimate, 2)
         pivot_m = self.camera.pivot_m
         rows = []
         right = []
@@ -235,9 +226,7 @@ class _MotionComparison:
         prior = np.concatenate(
             [self.camera.prior_weights(DEPTH_TURN), self.camera.prior_weights(DEPTH_SHIFT)]
         )
-        estimate = np.concatenate([turn_rad, shift_m])
         step = np.linalg.lstsq(
             np.vstack([*rows, np.diag(prior)]), -np.concatenate([*right, prior * estimate])
         )[0]
-        misfit_m = float(np.sqrt(np.mean(np.concatenate(distances_m) ** 2)))
-        return _AlignedPoints(turn_rad + step[:3], shift_m + step[3:], misfit_m=misfit_m)
+        return estimate + step, float(np.sqrt(np.mean(np.concatenate(distances_m) ** 2)))

@@ -299,7 +299,7 @@ def iterate_alignments(
     prior = np.concatenate([camera.prior_weights(row) for row in (DEPTH_TURN, DEPTH_SHIFT)])
     mismatches = np.ones(len(starts))
     for gate in gates:
-        matched = _match_surface(
+        arms_m, distances_m, is_facing = _match_surface(
             camera,
             cloud,
             places=places,
@@ -307,31 +307,21 @@ def iterate_alignments(
             rotations=rotations,
             translations_m=translations_m,
         )
-        squares = np.sum(matched.distances_m**2, axis=2)
-        counts = matched.is_facing.sum(axis=1)
-        limited = np.minimum(squares / gate**2, 1.0) * matched.is_facing
+        squares = np.sum(distances_m**2, axis=2)
+        counts = is_facing.sum(axis=1)
+        limited = np.minimum(squares / gate**2, 1.0) * is_facing
         mismatches = np.where(counts > 0, limited.sum(axis=1) / np.maximum(counts, 1), 1.0)
         weights = np.sqrt(INDEPENDENT / np.maximum(counts, 1))[:, None]
-        weights = weights * matched.is_facing / gate
+        weights = weights * is_facing / gate
         weights /= 1 + squares / (gate / 2) ** 2
         errors = np.hstack([rotations.as_rotvec(), translations_m])
-        steps = _alignment_steps(matched, normals, weights=weights, prior=prior, errors=errors)
+        steps = _alignment_steps(arms_m, distances_m, normals, weights, prior, errors)
         rotations = Rotation.from_rotvec(steps[:, :3]) * rotations
         translations_m = translations_m + steps[:, 3:]
     return [
         AlignedPose(rotations[k], translations_m[k], mismatch=float(mismatch))
         for k, mismatch in enumerate(mismatches)
     ]
-
-
-class _MatchedSurface(NamedTuple):
-    """Points of a surface with the nearest points of a cloud, for B camera errors."""
-
-    arms_m: Array  # (B, P, 3): rotated cloud points relative to the camera's pivot [m]
-    distances_m: Array  # (B, P, 3): from the surface's points to the moved cloud points [m]
-    # (B, P) of bool: whether the surface faces the camera, not at a grazing angle; true without a
-    # camera.
-    is_facing: NDArray[np.bool_]
 
 
 def _match_surface(
@@ -341,9 +331,9 @@ def _match_surface(
     normals: Array,
     rotations: Rotation,
     translations_m: Array,
-) -> _MatchedSurface:
-    """Return the nearest cloud points of surface points `places` (P, 3) [m] with `normals` (P, 3),
-    for camera errors of B rotations and translations (B, 3) [m].
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return for B camera errors the nearest cloud points of P points of the surface: relative to
+    the camera's pivot and to these points (B, P, 3) [m], and whether the surface faces the camera.
     """
     pivot = camera.pivot_m
     turns = rotations.as_matrix()
@@ -356,11 +346,11 @@ def _match_surface(
         ways = (moved - (turns @ pivot)[:, None]) - places
         cosines = np.sum(normals * ways, axis=2)
         is_facing = cosines > GRAZING * np.linalg.norm(ways, axis=2)
-    return _MatchedSurface(arms_m, arms_m + moved - places, is_facing=is_facing)
+    return arms_m, arms_m + moved - places, is_facing
 
 
 def _alignment_steps(
-    matched: _MatchedSurface, normals: Array, weights: Array, prior: Array, errors: Array
+    arms_m: Array, distances_m: Array, normals: Array, weights: Array, prior: Array, errors: Array
 ) -> Array:
     """Return the Gauss–Newton steps (B, 6) of rotation vectors [rad] and translations [m].
 
@@ -368,8 +358,6 @@ def _alignment_steps(
     squares of the errors over the prior. The 6 × 6 normal equations are solved for all B at once,
     scaled by their diagonals.
     """
-    arms_m = matched.arms_m
-    distances_m = matched.distances_m
     along = np.concatenate(
         [np.cross(arms_m, normals), np.broadcast_to(normals, arms_m.shape)], axis=2
     )
