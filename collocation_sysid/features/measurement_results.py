@@ -62,9 +62,7 @@ class PredictionErrors:
 
 
 def _forces_text(*sizes: float | None) -> str:
-    """Return RMS or σ of a force [N] and a torque [N m] in words, without those that are None or
-    zero.
-    """
+    """Return RMS or σ of force [N] and torque [N m], without None and zero."""
     pairs = zip(sizes, ("N", "N m"), strict=True)
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 

@@ -257,27 +257,20 @@ class NlpFunctions:
             product += self.collocation.jacobian(z).T @ by_multipliers
 
     def _upper_triangle(self, z: Array, weight: float, multipliers: Array) -> Array:
-        """Return the values of the upper triangle of the Hessian of weight · f + multipliers · g at
-        z, in the order of `hessian_structure`, as a new array.
-        """
+        """Values of the Hessian of weight · f + multipliers · g, a new array."""
         values = np.empty(len(self.collocation.hessian_structure[1]))
         self._upper_values(z, weight, multipliers, values)
         return values
 
     def _weights(self, weight: Array, multipliers: Array) -> tuple[float, Array]:
-        """Return the weight w of the objective and the multipliers y (constraints,), from arrays
-        that CasADi leaves empty for zeros.
-        """
+        """Return w and y; CasADi leaves arrays empty for zeros."""
         if not len(multipliers):
             multipliers = np.zeros(self.collocation.constraint_count)
         return float(weight[0]) if len(weight) else 0.0, multipliers
 
     @cached_property
     def _inputs(self) -> list[ca.Sparsity]:
-        """Sparsity of the inputs in CasADi's order: variables z (variables, 1), CasADi's parameters
-        p, which are empty (0, 1), weight w of the objective (1, 1), and multipliers y (constraints,
-        1).
-        """
+        """Sparsity of z, CasADi's empty parameters p, w and y, in this order."""
         dense = ca.Sparsity.dense
         variables = self.collocation.variable_count
         rows = self.collocation.constraint_count
@@ -285,9 +278,7 @@ class NlpFunctions:
 
     @cached_property
     def _full(self) -> tuple[ca.Sparsity, NDArray[np.int64]]:
-        """Sparsity of the symmetric Hessian, and for each of its entries the index in the upper
-        triangle's values.
-        """
+        """Sparsity of the symmetric Hessian, and indices of its entries in the triangle."""
         upper = self._sparsity("triu_hess")
         numbered = ca.DM(upper, np.arange(1.0, upper.nnz() + 1))
         symmetric = ca.triu2symm(numbered)

@@ -316,9 +316,7 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _remaining(self) -> tuple[Index, Index]:
-        """Indices in the complete program, ascending, of the variables and of the constraints that
-        remain: two int arrays.
-        """
+        """Indices, ascending, of variables and constraints that remain."""
         variables = np.arange(self.complete.variable_count)
         rows = np.arange(self.complete.constraint_count)
         for each in self.eliminated:
@@ -327,9 +325,7 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _condensed_indices(self) -> tuple[Index, Index]:
-        """Index of each variable and of each constraint of the complete program among those that
-        remain, −1 for those that are eliminated: two arrays of the complete sizes.
-        """
+        """Their index among those that remain, −1 if eliminated."""
         sizes = self.complete.variable_count, self.complete.constraint_count
         indices = np.full(sizes[0], -1), np.full(sizes[1], -1)
         for number, remaining in zip(indices, self._remaining, strict=True):
@@ -417,9 +413,7 @@ class CondensedCollocation(Collocation):
         return complete
 
     def _prescribed(self, z: Array) -> Iterator[tuple[Array, Array]]:
-        """Return an iterator of positions and derivatives of the eliminated dofs of each experiment
-        at z, see `EliminatedDofs.evaluate`.
-        """
+        """Yield positions and derivatives of eliminated dofs at z."""
         p = self.parameters_from(z)
         return (
             each.evaluate(p[each.transcription.nuisance_indices.indices])
@@ -508,9 +502,7 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _hessian(self) -> CondensedPattern:
-        """Pattern of the upper triangle of the Hessian, and how its values follow from those of the
-        complete program.
-        """
+        """Pattern of the upper triangle, and its values from the complete one."""
         structure = self.complete.hessian_structure
         numbers, _ = self._condensed_indices
         has_number = numbers >= 0
@@ -625,7 +617,5 @@ class CondensedCollocation(Collocation):
 
 
 def _products(rows: Index, columns: Index) -> tuple[Index, Index]:
-    """Return rows and columns (r · c,) of the entries of every row of `rows` (r,) in every column
-    of `columns` (c,), row by row.
-    """
+    """Return rows and columns (r · c,) of every row in every column, row by row."""
     return np.repeat(rows, len(columns)), np.tile(columns, len(rows))

@@ -294,11 +294,7 @@ def connect_executor(scheduler: str | None) -> Iterator[DaskExecutor | None]:
 
 
 def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
-    """Return the worker address of each experiment.
-
-    The experiment with the highest cost is assigned first, each to the thread with the least work
-    so far.
-    """
+    """Return the worker of each experiment: the costliest first, to the least loaded."""
     _require_workers(threads)
     threads_of_workers = [(address, k) for address, count in threads.items() for k in range(count)]
     loads = dict.fromkeys(threads_of_workers, 0)
@@ -337,17 +333,13 @@ def _refusal(message: str) -> InputError:
 
 
 def _require_workers(threads: dict[str, int]) -> None:
-    """Raise `SearchEnded` if no worker is left: `threads`, the numbers of threads by address of the
-    worker, is empty.
-    """
+    """Raise `SearchEnded` if no worker is left."""
     if not threads:
         raise _disconnection("No worker is left.")
 
 
 def _disconnection(reason: str) -> SearchEnded:
-    """Return the exception that ends the search because the cluster is lost; its message ends with
-    the sentence `reason`.
-    """
+    """Return the exception that ends the search because the cluster is lost."""
     return SearchEnded(
         Status.CLUSTER_DISCONNECTED, f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}"
     )
@@ -398,8 +390,6 @@ def _with_body(experiment: Experiment, body: Body) -> Experiment:
 def _restore_segment(
     experiment: Experiment, association: Association, rest: dict[str, Any]
 ) -> Transcription:
-    """Return a transcription from its experiment, its association with markers without body, and
-    its other arguments by name; workers run this function.
-    """
+    """Return a transcription from its parts; workers run this function."""
     markers = _with_fields(association.markers, experiment.body)
     return Transcription(experiment, association=replace(association, markers=markers), **rest)

@@ -361,14 +361,10 @@ def _row_count(result: LinearisedTrajectory | SimulationResult | Array) -> int:
 def _failure_and_times(
     result: SimulationResult,
 ) -> tuple[SimulationError | None, tuple[float, float, float]]:
-    """Return the failure (None if complete) and the times of building, evaluations and linear
-    algebra [s] of a simulation; workers run this function.
-    """
+    """Return failure and times [s] of a simulation; workers run this function."""
     return result.failure, result.times_s
 
 
 def _first_rows(result: LinearisedTrajectory | SimulationResult | Array, count: int) -> Array:
-    """Return the positions (count, 3n) [m] of the first `count` rows of a trajectory, or all if
-    there are fewer; workers run this function.
-    """
+    """Return positions (count, 3n) [m] or fewer; workers run this function."""
     return trajectory_positions(result)[:count]

@@ -33,9 +33,7 @@ from .starts.initial_point import InitialPoint, adjoint_multipliers, compute_ini
 
 
 def _require_ipopt_value(value: Any) -> Any:
-    """Return an IPOPT option if it is text or a number; raise `ValueError` otherwise, also for a
-    boolean, since IPOPT's switches are "yes" and "no".
-    """
+    """Return text or a number; booleans are refused: IPOPT has "yes" and "no"."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(
             f"found {str(value).lower()}; expected text or a number as in IPOPT's manual; its "
@@ -189,9 +187,7 @@ class InteriorPoint(MethodOptions):
     def _solve(
         self, collocation: Collocation, watch: Watch | None, start: Array | None
     ) -> Solution:
-        """Return the solution with the contact law of each obstacle, without the complementarity
-        solves.
-        """
+        """Solve with the contact law, without the complementarity solves."""
         recorder = Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)

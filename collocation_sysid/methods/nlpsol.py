@@ -220,9 +220,7 @@ class _NlpsolResult(NamedTuple):
 
     @classmethod
     def failure(cls, count: int, return_status: str) -> _NlpsolResult:
-        """Return the result of a solver that failed or was abandoned, for `count` variables, with a
-        `return_status`.
-        """
+        """Return the result of a solver that failed or was abandoned."""
         return cls(np.full(count, np.nan), np.zeros(0), return_status=return_status, iterations=0)
 
 
@@ -233,10 +231,7 @@ def _run(
     monitor: IterationMonitor,
     multipliers: tuple[Array, Array] | None,
 ) -> _NlpsolResult:
-    """Run a solver, on a thread of its own if this is the main thread.
-
-    A failure of the solver is part of the result, and no error.
-    """
+    """Run a solver, on a thread if this is the main one; failures are part of the result."""
     lower, upper = bounds
     arguments = {"x0": start, "lbx": lower, "ubx": upper, "lbg": 0, "ubg": 0}
     if multipliers is not None:
@@ -306,9 +301,7 @@ def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
         del handlers[signal.SIGTERM]
 
     def request(number: int, _frame: object) -> None:
-        """Request a stop by a signal, and let the next signal of this number
-        interrupt the process.
-        """
+        """Request a stop; the next signal of this number interrupts the process."""
         monitor.stop = True
         INTERRUPTS.number = number
         signal.signal(number, signal.default_int_handler)

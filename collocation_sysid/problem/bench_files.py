@@ -220,9 +220,7 @@ def add_noises(table: BenchTable, layout: ForceSensorSection, wrench: Wrench) ->
 
 
 def _named_quantities(layout: TableSection) -> list[str]:
-    """Return the keys of the quantities whose columns the table names; empty if it names none. The
-    time does not count.
-    """
+    """Return the quantities whose columns the table names, without the time."""
     return [key for key in layout.columns if key != TIME.key]
 
 

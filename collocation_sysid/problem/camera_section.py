@@ -95,9 +95,7 @@ class DepthSection(MeasurementSection, of=Depth):
     def _camera(
         self, folder: RecordingFolder, content: DepthFileContent, where: str
     ) -> DepthCamera:
-        """Return the camera of the table, completed by the content of its file; raise an
-        `InputError` at `where` if it is incomplete.
-        """
+        """Return the camera, completed by its file; an incomplete one is refused."""
         arguments: dict[str, Any] = declared_in(self.camera, where=where)
         for name in ("matrix", "pose", "distortion"):
             if name not in self.camera.model_fields_set:  # a default does not replace the file's

@@ -66,9 +66,7 @@ def with_declared_densities(
 
 
 def _with_guessed_density(region: RegionSection, parameters: Sections) -> RegionSection:
-    """Return a region with its density [kg/m³]: the region itself if it states one, else a copy
-    with the guess of its parameter "NAME.density_kg_m3", or None.
-    """
+    """Return a region with its density, or the guess of its parameter."""
     if region.density_kg_m3 is not None:
         return region
     guess = _guess(parameters, f"{region.name}.{DENSITY.name}")
@@ -76,9 +74,7 @@ def _with_guessed_density(region: RegionSection, parameters: Sections) -> Region
 
 
 def _guess(parameters: Sections, name: str) -> float | None:
-    """Return a number known for a parameter: its guess, else the mean of its prior, else its fixed
-    value; None if it has none of these or is missing. A parameter that is a number is returned.
-    """
+    """Return guess, prior mean or fixed value of a parameter; None without."""
     section = parameters.get(name)
     if not isinstance(section, ParameterSection):
         return section

@@ -156,9 +156,7 @@ def problem_arguments(
 def _load_object(
     file: ProblemFile, folder: Path, code: CodeLoader, simulation: bool, say: Say | None
 ) -> tuple[Body, Size]:
-    """Return the body of the recordings, with the parts whose density is estimated marked, and the
-    size of the problem with one sample.
-    """
+    """Return the body, free densities marked, and the size with one sample."""
     with _lengths_checked(file.object):
         generated = _generated_counts(file.object)
         if generated:
@@ -228,9 +226,7 @@ class SpecimenCells:
 
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
-    """Return the numbers of corner nodes and of elements of a box or cylinder to be generated; None
-    for meshes and surfaces from files.
-    """
+    """Return corner nodes and elements of a generated mesh; None from files."""
     length_m = section.edge_length_m
     if length_m is None:
         return None
@@ -263,9 +259,7 @@ def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation
 
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
-    """Return the paths of the data files that a problem names, in `folder`, whether or not they
-    exist; Python files and poses of cameras are not among them.
-    """
+    """Return the data files that a problem names, existing or not."""
     names = [file.object.mesh, file.object.surface]
     names += [section.file for section in file.list_specimens()]
     for section in file.list_recordings():
@@ -300,11 +294,7 @@ def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterato
 
 
 def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
-    """Return the mesh of [object]: read from a file, meshed from a surface, or generated from a
-    shape.
-
-    Meshes of surfaces are cached in ``.meshes`` in `folder`, the folder of the problem.
-    """
+    """Return the mesh of [object]; meshes of surfaces are cached in ``.meshes``."""
     if section.mesh is not None:
         file = existing_file(folder, section.mesh, key="mesh")
         return TetMesh.read(file, section.length_unit)
@@ -319,9 +309,7 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
-    """Return a mesh of the cylinder, or else of the box, that the section states, with edges of
-    about this length [m].
-    """
+    """Return a mesh of the stated cylinder or box, with edges of about this length."""
     if (shape := section.cylinder) is not None:
         return cylinder_of_edge(
             shape.diameter_m, shape.height_m, edge_length_m=edge_length_m, quarter=shape.quarter
@@ -331,9 +319,7 @@ def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
 
 @contextmanager
 def _lengths_checked(section: ObjectSection) -> Iterator[None]:
-    """Context that replaces an `InputError` by one that names the largest length of the cylinder or
-    box, if that is above the largest plausible size; other errors pass.
-    """
+    """Turn an `InputError` into one that names an implausible length."""
     if (shape := section.cylinder) is not None:
         lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
     else:
@@ -362,21 +348,13 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 
     def material(law: str | CodeSection | None, key: str) -> Any:
-        """Return a custom material if `law` is the table of a Python file, else the name itself, or
-        None.
-        """
+        """Return a custom material for a table of a Python file, else the name."""
         return code.material(law, key) if isinstance(law, CodeSection) else law
 
     def branches(region: str | None) -> list[str]:
-        """Return the names of the memory branches of a region; None stands for branches without a
-        region.
-        """
         return [branch.name for branch in section.prony if branch.region == region]
 
     def field(section: Section | None, where: str) -> Field | None:
-        """Return the spatially varying constant that a table states at the key `where`; None
-        without a table.
-        """
         return None if section is None else Field(**declared_in(section, where=where))
 
     regions = [
@@ -413,9 +391,6 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
 
 
 def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"] | None:
-    """Return the stated stress-free shape: that of a scan under gravity, "stress_free", or None if
-    the file states none.
-    """
     if section.scan is not None:
         return UnderGravity(selection_from_section(section.scan.nodes), section.scan.gravity_m_s2)
     return "stress_free" if section.rest_shape is not None else None
@@ -432,9 +407,7 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
 
 
 def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tied | float:
-    """Return one parameter from its table: its fixed value, a `Tied` one if it has `tied_to` (with
-    the ratio 1 by default), else one that is estimated; a number is returned as it is.
-    """
+    """Return a fixed value, a `Tied` one (ratio 1 by default) or one to estimate."""
     if not isinstance(section, ParameterSection):
         return section
     if section.fixed is not None:

@@ -23,9 +23,7 @@ KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)
 
 
 def _require_scope(word: str) -> str:
-    """Return a scope unchanged if it is "recording" or matches `SCOPE` ("shared", or "shared" and a
-    word); raise `ValueError` otherwise.
-    """
+    """Return "recording", "shared", or "shared" and a word; `ValueError` otherwise."""
     if word != "recording" and not re.fullmatch(SCOPE, word):
         raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
     return word

@@ -399,10 +399,7 @@ def _require_plausible_noise(experiment: Experiment) -> None:
 
 
 def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None:
-    """Raise `InputError` if no stress-free shape exists for the mesh under gravity at the guess.
-
-    Nothing is checked if a parameter has no guess: the search then starts where the shape exists.
-    """
+    """Refuse a mesh without stress-free shape at the guess, if there is one."""
     if any(item.guess is None for item in parameters.components if item.tied is None):
         return
     for body in bodies:
@@ -412,9 +409,7 @@ def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None
 
 
 def _require_equal_fields(bodies: Iterable[Body]) -> None:
-    """Raise `InputError` if two bodies have fields of the same constant with different shapes.
-    Bodies with equal shapes pass.
-    """
+    """Refuse bodies with fields of the same constant but other shapes."""
     shapes_by_name: dict[str, Array] = {}
     for part in (part for body in bodies for part in body.parts if part.field):
         assert part.field is not None

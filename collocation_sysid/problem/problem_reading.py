@@ -87,9 +87,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _nesting_level_count(content: Any) -> int:
-    """Return the number of nested levels of a table or list, itself included (1 if nothing is
-    nested); counting stops at `DEEPEST` + 1.
-    """
+    """Return the nested levels, itself included, up to `DEEPEST` + 1."""
     level = [content]
     level_count = 0
     while level and level_count <= DEEPEST:
@@ -100,9 +98,7 @@ def _nesting_level_count(content: Any) -> int:
 
 
 def _beyond_limits(error: Exception) -> str:
-    """Return the message for a file whose numbers or nesting exceed the limits of the parser that
-    raised `error`.
-    """
+    """Return the message for a file beyond the limits of its parser."""
     if isinstance(error, RecursionError):
         return f"tables or lists are nested too deeply; expected at most {DEEPEST} levels"
     return "an integer has too many digits; expected fewer than 4,300"
@@ -142,9 +138,7 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
 
 
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
-    """Return (not raise) the error for invalid TOML, with the line and its text if the parser
-    states it.
-    """
+    """Return the error for invalid TOML, with the line if it is stated."""
     reason, _, place = complaint.rpartition(" (at ")
     reason = _PLAINER.get(reason, reason)
     matched = re.match(r"line (\d+)", place)
@@ -195,9 +189,7 @@ def _apply_override(content: dict[str, Any], override: str) -> None:
 
 
 def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
-    """Return the parts of a key, with those parts joined by dots that together are a key of the
-    content, such as "core.mu_pa"; the longest such key counts.
-    """
+    """Join parts of a key that are one key of the content, such as "core.mu_pa"."""
     names = []
     table = content
     while parts:

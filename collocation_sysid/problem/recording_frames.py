@@ -328,9 +328,7 @@ class RecordingFrames:
 
 
 def _level_rank(name: str) -> int:
-    """Return the place of a frame in `LEVEL_FRAMES`, by its name without namespace and prefix; the
-    number of these if it has none of these names.
-    """
+    """Return the place in `LEVEL_FRAMES` of a name without namespace and prefix."""
     bare = name.rpartition("/")[2].lower()
     return next(
         (

@@ -173,9 +173,7 @@ class RecordingReader:
     # Files ----------------------------------------------------------------------------------------
 
     def _table_file(self, table: TableSection, key: str) -> Path:
-        """Return the path of the existing file of a displacement or a wrench: its own, else that of
-        the experiment.
-        """
+        """Return a table's own file, else that of the experiment."""
         key = "file" if table.file is None and self.section.file else key
         return self._recording_folder.require_existing(
             self.section.file_of(table), key, what="a file here, or a file of the experiment"
@@ -375,9 +373,7 @@ class RecordingReader:
         )
 
     def _measurements(self, t_s: Array) -> dict[str, list[Any]]:
-        """Return the measurements of all tables of sensors within the times t_s (T,) of the
-        experiment [s], by the name of the field of `Experiment`.
-        """
+        """Return the measurements of all tables, by the field of `Experiment`."""
         section = self.section
         fields: dict[str, list[Any]] = {
             "readings": [

@@ -452,9 +452,7 @@ class Collocation:
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
-        """Return p (nq + nphi,) from q (nq,) and the φ (k,) of each fitted experiment; of shared
-        entries, the value in the first experiment.
-        """
+        """Return p from q and φ of each experiment, the first of shared ones."""
         p = np.concatenate([q, np.zeros(self.nphi)])
         for transcription, phi in reversed([*zip(self.transcriptions, phis, strict=True)]):
             p[transcription.nuisance_indices.indices] = phi
@@ -631,9 +629,7 @@ class Collocation:
 
     @cached_property
     def _hessian(self) -> SparseAssembly:
-        """Structure of the Hessian: columns of q, those of x from the motion, then all
-        other entries.
-        """
+        """Structure of the Hessian: columns of q, of x from the motion, all others."""
         counts = np.arange(self.nq + 1)
         further = []
         indptr = [counts * (counts + 1) // 2]
@@ -766,9 +762,7 @@ class Collocation:
     # Additional variables of subclasses ---------------------------------------------------------
 
     def _additional_equations(self, parts: Sequence[ExperimentIterate], z: Array) -> list[Array]:
-        """Return the equations of additional variables, which follow all other constraints; `parts`
-        are the iterates at z.
-        """
+        """Return the equations of additional variables, last of the constraints."""
         return []
 
     def _additional_jacobian_entries(self) -> list[tuple[Index, Index]]:
@@ -778,9 +772,7 @@ class Collocation:
     def _additional_jacobian(
         self, parts: Sequence[ExperimentIterate], z: Array
     ) -> list[tuple[Array, Array]]:
-        """Return the equations of additional variables, and the values of each group of
-        `_additional_jacobian_entries`; `parts` are the iterates at z.
-        """
+        """Return them with the values of `_additional_jacobian_entries`."""
         return []
 
     def _additional_gradients(self, parts: Sequence[ExperimentIterate]) -> list[Array]:
@@ -794,9 +786,7 @@ class Collocation:
         return 0.0, []
 
     def _additional_hessian_entries(self) -> list[tuple[Index, Index]]:
-        """Return groups of rows and columns in z of additional entries of the Hessian, upper
-        triangle.
-        """
+        """Rows and columns in z of additional entries, upper triangle."""
         return []
 
     def _additional_hessian(
@@ -877,9 +867,7 @@ class Collocation:
 def _with_shared_associations(
     transcriptions: Sequence[Transcription], associations: Sequence[Association]
 ) -> tuple[Transcription, ...]:
-    """Return the transcriptions with the given associations, in which places and clocks of shared
-    nuisance parameters are those of the first experiment that shares them.
-    """
+    """Return transcriptions with places and clocks of the first that shares them."""
     parts = zip(transcriptions, associations, strict=True)
     same = shared_associations(
         (s.nuisance_indices, s.nuisance, association) for s, association in parts

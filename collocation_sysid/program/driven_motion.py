@@ -139,9 +139,7 @@ class DrivenMotion:
 
     @property
     def _amplitude_columns(self) -> slice:
-        """Columns of the amplitudes among the inputs u: after the constants, because the experiment
-        has no deviations.
-        """
+        """Columns of the amplitudes in u, after the constants."""
         first = len(self.transcription.body.constants)
         return slice(first, first + len(self.transcription.experiment.actuators))
 
@@ -224,9 +222,7 @@ class DrivenMotion:
         return x
 
     def _corrected(self, equations: EquationsAtParameters, near: Array) -> Array | None:
-        """Return the motion from Newton's method on all time steps at once, None if it does not
-        converge quickly; the equations have no controls.
-        """
+        """Return the motion from Newton on all steps at once; None if slow."""
         goals = equations.dynamics.prescribed_m
         x = np.where(np.isnan(goals), near, goals)
         previous = np.inf
@@ -256,9 +252,7 @@ class DrivenMotion:
 
     @one_blas_thread()
     def _respond(self, equations: EquationsAtParameters, x: Array) -> tuple[Array, Array, float]:
-        """Return the feasibility step (N, 3n), the derivatives (N, 3n, c), and the largest residual
-        of the equations of motion [N].
-        """
+        """Return feasibility step, derivatives (N, 3n, c), largest residual [N]."""
         sweep = self._sweep
         goals = equations.prescribed.positions_m
         by_control = equations.prescribed.by_phi

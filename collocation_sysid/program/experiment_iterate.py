@@ -157,9 +157,7 @@ class ExperimentIterate:
         return by_x, by_p
 
     def _reaction_vjp(self, weights: Array) -> tuple[Array, Array]:
-        """Vector–Jacobian product of the reaction forces R, including the dependence through
-        history variables. The transcription's `linearisation_buffer` is overwritten.
-        """
+        """VJP of R with histories; overwrites `linearisation_buffer`."""
         by_x, by_p, force_weights = reaction_vjp(
             self.equations,
             self.x,

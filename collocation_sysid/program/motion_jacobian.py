@@ -108,17 +108,13 @@ class MotionJacobian:
         return blocks
 
     def _inertia_rows(self, lag: int) -> Index:
-        """Return the indices of the grid times whose equations of motion contain inertia of the
-        position `lag` times earlier.
-        """
+        """Times whose equations contain inertia of x `lag` earlier."""
         rows = np.arange(max(self.dynamics.first_row, lag), self.dynamics.row_count)
         return rows[self.dynamics.inertia_coefficient(lag)[rows] != 0]
 
     @cached_property
     def _constant_positions(self) -> tuple[Index, Index]:
-        """Positions in the values of `structure` of the inertia entries, and of the unit entries of
-        grasp rows.
-        """
+        """Places in `structure` of inertia and of unit entries."""
         place = np.searchsorted(self.constrained_dofs, self.free_dofs)
         positions = [np.zeros(0, dtype=np.int64)]
         for lag in range(self.dynamics.largest_lag + 1):
@@ -134,9 +130,7 @@ class MotionJacobian:
         return np.concatenate(positions), grasps.ravel()
 
     def _inertia(self, dynamics: Dynamics) -> Array:
-        """Return the scaled inertia entries of ∂c/∂x with the masses of `dynamics`, in the order of
-        their positions.
-        """
+        """Return the scaled inertia entries of ∂c/∂x in their order."""
         mass = dynamics.mass.inertia_kg[:, self.free_dofs] * self.length_m / self.force_n
         values = [np.zeros(0)]
         for lag in range(self.dynamics.largest_lag + 1):
@@ -305,9 +299,7 @@ class ReleasedGrasps:
 def _dropped_forces(
     dynamics: Dynamics, band: BlockBand, pattern: SymmetricPattern, place: Index, scale: float
 ) -> list[_DroppedForce]:
-    """Return the entries of forces that act while a dof is prescribed for a part of the time, in
-    later rows where it is free.
-    """
+    """Return forces while a dof is prescribed, in later rows where it is free."""
     tables = dynamics.tables
     step_s = dynamics.step_s
     dropped = []

@@ -261,9 +261,7 @@ class MotionTranscription:
         return GraspConstraint(self.experiment, self.nuisance, t_s=self.dynamics.t_s)
 
     def _prescribed_positions(self, prescribed: PrescribedDisplacements) -> Array:
-        """Return an array (N, 3n) with the positions [m] of the dofs that `prescribed` contains,
-        NaN elsewhere.
-        """
+        """Return (N, 3n) [m] with prescribed dofs, NaN elsewhere."""
         goals = np.full((self.grid_times, self.dof_count), np.nan)
         goals[:, prescribed.dofs] = prescribed.positions_m
         return goals
@@ -607,9 +605,7 @@ class MotionTranscription:
 
     @cached_property
     def _skew_hessian(self) -> BlockBand:
-        """Structure that adds the contribution of the skew part of ∂²φ/∂x∂v to the values of
-        `hessian`.
-        """
+        """Structure that adds the skew part of ∂²φ/∂x∂v to `hessian`."""
         blocks = self._hessian_blocks(lambda p, q, pp, qq: (pp * q - qq * p, 0 * q))
         return skew_block_band(
             self.dof_count, self._list_hessian_starts(), blocks=blocks, top_rows=self.nq
@@ -624,9 +620,7 @@ class MotionTranscription:
         )
 
     def _list_hessian_starts(self) -> Index:
-        """Return the row of the Hessian, including the nq rows of q, at which each grid time
-        begins, (N,).
-        """
+        """Return the Hessian's row of each time (N,), q first."""
         return self.nq + np.arange(self.grid_times) * self.dof_count
 
     def _hessian_blocks(self, factors: Factors) -> list[BandBlock]:
@@ -657,9 +651,7 @@ class MotionTranscription:
         return blocks
 
     def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
-        """Return the terms of the Hessian's block between rows at a distance in time, a sum over
-        the evaluations k = t + i; terms whose factors are all zero are left out.
-        """
+        """Terms of the block between rows at a distance in time."""
         p = self.dynamics.compute_state_weights()
         q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
@@ -827,7 +819,5 @@ class MotionTranscription:
 
 
 def _state_factors(p: Array, q: Array, p_second: Array, q_second: Array) -> tuple[Array, Array]:
-    """Return the coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions, in the second
-    derivative of a potential φ of one evaluation.
-    """
+    """Return the coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v in the block of two positions."""
     return p * p_second, p * q_second + q * p_second

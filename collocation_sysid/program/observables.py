@@ -156,9 +156,7 @@ class PointPositions:
         return interpolation_matrix(nodes, shape.weights, node_count=self.node_count)
 
     def _interpolate(self, x: Array, nodes: Index, weights: Array) -> Array:
-        """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at those R of the observable's rows that x
-        (rows, 3n) contains, for nodes (m, a).
-        """
+        """Return Σ_a weights[m, a, …] x_a, (R, m, 3, …), at known rows."""
         rows = self.rows[self.rows < len(x)]
         at = x[rows].reshape(len(rows), -1, 3)[:, nodes]
         return np.einsum("ma...,tmai->tmi...", weights, at)
@@ -296,9 +294,7 @@ class PointPositions:
         return marker, corner
 
     def _derivative_entries(self, variables: int, size: int) -> tuple[Index, Index]:
-        """Return rows and columns of the entries of `derivative_matrix`, in their order; all x
-        precede all φ.
-        """
+        """Rows and columns of `derivative_matrix`: x, then φ."""
         nodes, _ = self.shape_functions(np.zeros(size))
         marker, corner = self._dependencies
         axes = np.arange(3)

@@ -95,9 +95,7 @@ def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[Nuis
 
 
 def _require_same_objects(leader: Experiment, experiment: Experiment, row: Deviation) -> None:
-    """Check that the objects on which a shared nuisance parameter depends are the same in two
-    experiments.
-    """
+    """Check that two experiments share what a nuisance parameter refers to."""
     theirs = row.same(leader)
     ours = row.same(experiment)
     for entry in ours:
@@ -113,9 +111,7 @@ def _require_same_objects(leader: Experiment, experiment: Experiment, row: Devia
 def _require_same_prior(
     one: tuple[Experiment, NuisanceEntry], other: tuple[Experiment, NuisanceEntry]
 ) -> None:
-    """Check that a nuisance parameter shared by two experiments has one prior, and a shared marker
-    one stated place, in both or in neither.
-    """
+    """Check that a shared parameter has one prior, a marker one stated place."""
     leader, first = one
     experiment, second = other
     row = second.row

@@ -243,9 +243,7 @@ def simulate(
 
 
 def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
-    """Return the predictions of the measurements without nuisance parameters, of markers at the
-    samples; none, (S, 0), of unlabelled points.
-    """
+    """Return the predictions without nuisance parameters; none of unlabelled points."""
     stated = motion.experiment
     known = [row for row in stated.nuisance.own if row.name in stated.known_deviations]
     experiment = replace(
@@ -329,9 +327,7 @@ def _with_automatic_steps(
 
 
 def _part(progress: Progress, done: float, share: float) -> Progress:
-    """Return a function that reports a share from 0 to 1 of a part of the work, which begins at
-    `done` and takes `share` of it, to `progress`.
-    """
+    """Return a function that reports a part of the work, from `done` on, to `progress`."""
 
     def report(part: float) -> None:
         """Report the share of all work."""

@@ -193,9 +193,7 @@ class StreamingModel:
 
     @cached_property
     def _mass_damping(self) -> tuple[Index, Array]:
-        """Indices in p of the mass-proportional damping coefficients γ_m, and their coordinates in
-        p (logarithms) at the guess.
-        """
+        """Indices in p of γ_m, and their coordinates at the guess."""
         free = self.collocation.parameters.free
         places = np.flatnonzero([without_region(item.name) == GAMMA_M.name for item in free])
         return places, self.collocation.guess_p[places]
@@ -448,9 +446,7 @@ class StreamingModel:
 
 
 def _banded_matrix(table: Array) -> Array:
-    """Return the matrix (rows, rows) with table[t, lag] at [t, t − lag], from a table (rows, lags);
-    entries before row 0 are left out.
-    """
+    """Return the matrix with table[t, lag] at [t, t − lag], from (rows, lags)."""
     matrix = np.zeros((len(table), len(table)))
     for lag in range(table.shape[1]):
         matrix += np.diag(table[lag:, lag], -lag)
@@ -458,9 +454,7 @@ def _banded_matrix(table: Array) -> Array:
 
 
 def _still_experiment(experiment: Experiment, collocation: Collocation) -> Experiment:
-    """Return the experiment as a few samples in which nothing moves: grasps at their first poses,
-    markers at their first samples (zero for markers without any), and sensors at zero.
-    """
+    """Return a few samples in which nothing moves, with first poses and markers."""
     reach = collocation.transcriptions[0].dynamics.largest_lag
     # The rows of the start, and room for a reading.
     count = max(2 * reach + 2 + ROWS_PER_CHUNK, NEIGHBOURS, 3)
@@ -477,9 +471,7 @@ def _still_experiment(experiment: Experiment, collocation: Collocation) -> Exper
 
 
 def _first_poses(experiment: Experiment) -> Poses:
-    """Return the poses of all grasps at the first times of their pose sequences, (rotation,
-    position) each.
-    """
+    """Return the first (rotation, position) of each grasp."""
     poses = (grasp.poses.at(grasp.poses.t_s[:1]) for grasp in experiment.grasps)
     return tuple((rotations[0], shifts[0]) for rotations, shifts in poses)
 

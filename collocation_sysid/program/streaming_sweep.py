@@ -191,9 +191,7 @@ class StreamingSweep:
     # State ------------------------------------------------------------------------------------
 
     def _initial_state(self) -> SweepState:
-        """Return the state before the first row, with all arrays zero; the first row computes the
-        start.
-        """
+        """Return the state before the first row, all zero."""
         rows = self.model.template_rows
         dofs = self.transcription.dof_count
         empty = np.zeros((rows, dofs))
@@ -213,10 +211,7 @@ class StreamingSweep:
         )
 
     def _moved_state(self, state: SweepState, at: Array) -> SweepState:
-        """Return `state` extrapolated to first order from the parameters `at` (P,) of its
-        linearisation point to those of this pass; the same object if they are equal or nothing is
-        computed yet.
-        """
+        """Return `state` at the parameters of this pass, to first order."""
         if state.last_rows is None or (at == self.p).all():
             return state
         moving = self.moving
@@ -381,9 +376,7 @@ class StreamingSweep:
         self.end = self.end + count
 
     def _make_room(self, count: int) -> int:
-        """Discard the oldest rows of the template, in place, so that `count` more fit; return the
-        index of the next row in it.
-        """
+        """Discard the oldest rows so that `count` fit; return the next index."""
         surplus = self.end + count - self.model.template_rows
         if surplus > 0:
             for each in (self.x, self.force, self.prescribed_columns, *self.reactions.arrays):
@@ -403,9 +396,7 @@ class StreamingSweep:
         return 4 * (self.x[t - 1] + self.x[t - 3]) - 6 * self.x[t - 2] - self.x[t - 4]
 
     def _start_positions(self, poses: Poses) -> Array:
-        """Return the positions (3n,) of the initial state with grasps at given poses, which a
-        Newton solve computes.
-        """
+        """Solve the initial state (3n,) with grasps at given poses."""
         goals_m = np.full(self.transcription.dof_count, np.nan)
         goals_m[self.grasped] = self.model.prescribed_positions(self.displaced_nodes, [poses])[0][0]
         experiment = self.model.at_start(poses)
@@ -438,9 +429,7 @@ class StreamingSweep:
         )
 
     def _stencil_row(self, t: int) -> StencilRow:
-        """Return the coefficients of row t of the template, cached in the model while the masses do
-        not depend on parameters, otherwise in this pass.
-        """
+        """Return the coefficients of row t, cached in model or pass."""
         if t not in self._rows:
             self._rows[t] = StencilRow.from_dynamics(self.dynamics, t)
         return self._rows[t]
@@ -501,11 +490,7 @@ class StreamingSweep:
         return solved, None
 
     def _store_rows(self, columns: Sequence[Array]) -> list[StoredRow]:
-        """Return the last rows for later passes.
-
-        The reactions are corrected, and observed quantities of these rows are appended to those
-        stored, in place.
-        """
+        """Correct reactions, store observed quantities, return the last rows."""
         rows = slice(self.end - len(columns), self.end)
         all_columns = np.array(columns)
         all_columns[:, :, 0] = self.x[rows]
@@ -554,18 +539,14 @@ class StreamingSweep:
         return resultants
 
     def _at_points(self, columns: Array) -> Array:
-        """Interpolate columns (…, 3n, k) of nodal values at the markers and other observed points;
-        return (…, 3M + …, k).
-        """
+        """Interpolate columns (…, 3n, k) at markers and observed points."""
         nodes, weights = self._observables
         *rows, dofs, count = columns.shape
         at = columns.reshape(*rows, dofs // 3, 3, count)[..., nodes, :, :]
         return np.einsum("ma,...maik->...mik", weights, at).reshape(*rows, -1, count)
 
     def _solve_carefully(self, t: int, poses: Poses) -> Array:
-        """Return the positions x_t (3n,) of row t by a full Newton solve, with the displacement of
-        the grasp applied in parts if necessary.
-        """
+        """Solve row t (3n,), the displacement of grasps in parts."""
         if t == 0:
             return self._start_positions(poses)
         equations = RowEquations(self.dynamics, self.x, forces=self.force, t=t)
@@ -582,9 +563,7 @@ class StreamingSweep:
             self._fail(failure)
 
     def _fail(self, failure: NewtonFailure) -> NoReturn:
-        """Raise the `SimulationError` of the next row, which cannot be solved for the reason
-        `failure`.
-        """
+        """Raise the `SimulationError` of the next row."""
         model = self.model
         what = f"time step {self.row}"
         time_s = self.row * model.experiment.timestep_s / model.collocation.substeps
@@ -621,11 +600,7 @@ class StreamingSweep:
     def _instrument_residuals(
         self, of: int, pairs: Sequence[tuple[Sample, int]]
     ) -> Iterator[tuple[Array, Array]]:
-        """Yield, for each sample of an instrument, residuals and their derivatives with respect to
-        p.
-
-        Residuals are in standard deviations, and NaN where the sample cannot be compared.
-        """
+        """Yield residuals over σ and ∂p of each sample, or NaN."""
         model = self.model
         reading, stencil, observable = self.model.instruments[of - 1]
         at = [self.row - 1 - sample.rows_back - rows for sample, rows in pairs]

@@ -504,9 +504,7 @@ class Sweep:
         return self.choose_chunk_rows() * self._estimate_step_bytes() + factor_bytes
 
     def _estimate_step_bytes(self) -> int:
-        """Return the memory of one time step [bytes]: element results, and its factor or, where
-        factors are reused, its matrix.
-        """
+        """Memory of a step [bytes]: element results, and factor or matrix."""
         results_bytes = 8 * self.body.linearisation_width
         if self.reuses_factors:
             parts = 1 + self.body.is_unsymmetric
@@ -514,9 +512,7 @@ class Sweep:
         return results_bytes + self._estimate_factor_bytes()
 
     def _estimate_factor_bytes(self) -> int:
-        """Return the memory of one factor [bytes], that of an unsymmetric matrix if the body's
-        is.
-        """
+        """Memory of a factor [bytes], unsymmetric if the body's is."""
         solver = self.factoriser
         values = (
             solver.estimate_unsymmetric_factor_size()
@@ -930,9 +926,7 @@ class ForwardSubstitution:
         self.past.appendleft(out)
 
     def _similar_solution(self, step: FactorisedStep) -> Array | float:
-        """Return the columns (free, c) of the similar solution at a time step, zero for the others;
-        0 if there is none or no guess is needed.
-        """
+        """Columns (free, c) of the similar solution; 0 without."""
         if self._similar is None or not isinstance(step.factor, ReusedFactor):
             return 0.0
         similar = np.zeros(self._of_free)
@@ -955,9 +949,7 @@ class ForwardSubstitution:
     def _store_grasp_forces(
         self, grasp_forces: GraspForces, step: FactorisedStep, force: Array, solution: Array
     ) -> None:
-        """Store the force F_t and its changes on the dofs of instrumented grasps in `grasp_forces`,
-        in place.
-        """
+        """Store F_t and its changes on instrumented grasps."""
         row = step.row
         dofs = self.solver.sensed
         matrix = self.solver.of_sensed
@@ -969,9 +961,7 @@ class ForwardSubstitution:
         )
 
     def _stencil_sum(self, weights: Sequence[float], solution: Array) -> Array:
-        """Return Σ_i weights[i] Y_{t−i} (3n, c) with Y_t = `solution`: the change of ξ or ν of row
-        t for the weights p or q.
-        """
+        """Return Σ_i weights[i] Y_{t−i} (3n, c) with Y_t = `solution`."""
         return weights[0] * solution + weighted_sum_of_past(weights, self.past, shape=self.shape)
 
     def _past_force(self, step: FactorisedStep, row: StencilRow) -> Array | float:

@@ -263,9 +263,7 @@ class Transcription(MotionTranscription):
         return self._with_marker_places(phi, self.association.markers.centre_coordinates)
 
     def _with_marker_places(self, phi: Array, place_coordinates: Array) -> Array:
-        """Return a copy of φ (k,) with other coordinates of the estimated marker places, from
-        `place_coordinates` (M, k') of all markers.
-        """
+        """Return φ (k,) with other coordinates of estimated places."""
         updated = phi.copy()
         estimated = self.association.markers.estimated
         updated[self.markers.observable.coordinate_parameters[estimated]] = place_coordinates[

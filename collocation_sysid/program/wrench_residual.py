@@ -108,9 +108,7 @@ class WrenchResidual(MeasurementResidual):
         return _is_covered(self.observable, self.t_s, known=known)
 
     def _neighbour_count(self, known: int) -> int:
-        """Return the number of grid times from which a sample is interpolated, if `known` are
-        known: at most four, and two for equilibria.
-        """
+        """Times that a sample is interpolated from: four, two if static."""
         return min(2 if self.observable.reaction_grid.is_static else TIMES_PER_SAMPLE, known)
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -180,9 +178,7 @@ class WrenchResidual(MeasurementResidual):
 
 
 def _is_covered(observable: ReactionResultant, t_s: Array, known: int) -> NDArray[np.bool_]:
-    """Return the mask (S,) of the samples at times `t_s` (S,) [s] that lie within the first `known`
-    times of the observable for any admissible shift of the clock; all false if none are known.
-    """
+    """Return which samples lie in the known times for any shift of the clock."""
     if not known:
         return np.zeros(len(t_s), dtype=bool)
     first, last = observable.t_s[[0, known - 1]]

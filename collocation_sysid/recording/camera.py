@@ -211,9 +211,7 @@ class Camera:
         return points
 
     def _undistorted(self, distorted: Array) -> Array:
-        """Return the coordinates (P, 2) of which `distorted` (P, 2) are the distorted ones, perhaps
-        inexactly.
-        """
+        """Return the coordinates (P, 2) whose distorted ones are given, perhaps inexactly."""
         if self.model == "fisheye":
             return self._by_newton(distorted, start=self._tangents(distorted))
         k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients(8)

@@ -54,9 +54,7 @@ DEFAULT_NUISANCE = Nuisance()
 
 
 def _state(name: str) -> Callable[[ArrayLike], Array]:
-    """Return a converter of arrays (k, 3), with any k, to read-only floats for the field
-    ``start_<name>``, which raises an `InputError` for another shape or values that are not finite.
-    """
+    """Return a converter of (k, 3) to read-only floats for ``start_<name>``, checked."""
     return float_converter((None, 3), f"start_{name}")
 
 
@@ -320,9 +318,7 @@ class Experiment:
         return planes
 
     def _without_symmetric_loads(self, grasp: Grasp) -> Grasp:
-        """Return the grasp without those measured components that vanish on the complete specimen:
-        the part's own are those of one half, and those of the other half are opposite.
-        """
+        """Drop components that vanish on the complete specimen by symmetry."""
         wrench = grasp.wrench
         if wrench is None or wrench.symmetry == 1 or isinstance(grasp, Obstacle):
             return grasp
@@ -620,9 +616,7 @@ class Experiment:
         return poses.at(times)
 
     def _undeformed_places(self, points_m: Array, t_s: Array) -> Array:
-        """Return the places (M, 3) on the undeformed body of points (M, 3) [m], the mth measured at
-        the time `t_s[m]`, if the body moved rigidly as in `rigid_positions`.
-        """
+        """Places (M, 3) of points measured at `t_s` (M,) on a rigidly moved body [m]."""
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("mji,mj->mi", rotations, points_m - translations)
 
@@ -643,9 +637,7 @@ class Experiment:
         return np.where(markers.located, sigma_m, body_m)
 
     def _check_kind(self) -> None:
-        """Raise an `InputError` if a static experiment has another `start` or `start_rule` than the
-        default.
-        """
+        """Refuse another `start` or `start_rule` than the default in a static experiment."""
         if not self.is_static:
             return
         for name, usual in (("start", "equilibrium"), ("start_rule", "standard")):
@@ -656,9 +648,7 @@ class Experiment:
                 )
 
     def _check_air(self) -> None:
-        """Raise an `InputError` unless the air is lighter than each region of the body at its
-        stated density.
-        """
+        """Refuse air that is not lighter than each region at its stated density."""
         lightest = min(self.body.parts, key=lambda part: part.density_kg_m3)
         if self.air_density_kg_m3 < lightest.density_kg_m3:
             return
@@ -718,9 +708,7 @@ class Experiment:
         self._check_separate_sensors()
 
     def _check_grasp_times(self) -> None:
-        """Raise an `InputError` if poses do not cover the samples at which their grasp is active,
-        or a wrench has too few samples within the experiment.
-        """
+        """Refuse poses that do not cover their samples, and wrenches with too few."""
         for grasp in self.grasps:
             grasp.poses.at(self.t_s[grasp.is_active(self.t_s)])
             if grasp.wrench is not None:
@@ -759,9 +747,7 @@ class Experiment:
                     )
 
     def _require_measurements(self) -> None:
-        """Raise an `InputError` if, besides markers, nothing is measured either: by no sensor of
-        its own times and no wrench.
-        """
+        """Refuse an experiment in which nothing is measured."""
         if self.separate_sensors or self.find_instrumented_grasps():
             return
         if not self.markers.names:
@@ -782,9 +768,7 @@ class Experiment:
                 )
 
     def _check_nodes(self) -> None:
-        """Raise an `InputError` if a grasp, point mass, force or placement refers to a node that
-        the body does not have, or two grasps hold a dof at the same time.
-        """
+        """Refuse nodes that the body does not have, and dofs held twice at a time."""
         n = len(self.body.nodes_m)
         grasped = prescribed_dofs(self.grasps)
         if grasped.size and grasped[-1] >= 3 * n:
@@ -920,9 +904,7 @@ class Experiment:
         return velocities
 
     def _append_obstacle_frames(self, node_count: int) -> None:
-        """Append positions and velocities of the obstacles' frames to a given start state without
-        them, in place; a state that has them is unchanged.
-        """
+        """Append the obstacles' frames to a given start without them, in place."""
         if node_count == len(self.body.nodes_m):
             return
         state = ("start_positions_m", "start_velocities_m_s")
@@ -930,17 +912,13 @@ class Experiment:
             vars(self)[name] = np.vstack([getattr(self, name), own])
 
     def _frame_motion(self) -> tuple[Array, Array]:
-        """Return positions [m] and velocities [m/s] of the nodes of the obstacles' frames at the
-        first time, as differences over a thousandth of the time between samples.
-        """
+        """Positions and velocities of the obstacles' frames, over a thousandth of a step."""
         at_s = self.t_s[0] + np.array([0.0, 1e-3 * self.timestep_s])
         places = self.rigid_positions(at_s)[:, self.body.frames.ravel()]
         return places[0], np.diff(places, axis=0)[0] / np.diff(at_s)
 
     def _require_unique_equilibrium(self) -> None:
-        """Raise an `InputError` if the grasps at the first sample leave the body a rigid motion;
-        with obstacles nothing is checked, as these may support the body.
-        """
+        """Refuse grasps that leave a rigid motion, unless obstacles may hold it."""
         if self.obstacles:
             return  # these may carry it: the rest state is looked for
         is_prescribed = self.is_prescribed(self.t_s[:1])[0]

@@ -57,8 +57,6 @@ def coarse_experiment(experiment: Experiment, relation: CoarseBody) -> Experimen
 
 
 def _coarse_pressure(pressure: Pressure, relation: CoarseBody) -> Pressure:
-    """Return the pressure on the coarse body; a selection by name becomes the corresponding faces,
-    as the coarse mesh has no arrays and face sets.
-    """
+    """Return the pressure on the coarse body; named selections become faces."""
     corners = pressure.require_measure().faces[:, :3]
     return replace(pressure, faces=relation.coarse_faces(corners), body_measure=None)

@@ -44,9 +44,7 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
 
 
 def _interpolated(state: Array, body: Body, finer: Body) -> Array:
-    """Return nodal vectors `state` (n, 3) of a body, interpolated to the nodes (n', 3) of the finer
-    body by the shape functions.
-    """
+    """Return nodal vectors (n, 3) at the nodes (n', 3) of the finer body."""
     here_m = finer.nodes.points_m
     there_m = body.nodes.points_m
     places = place_markers(here_m, there_m, body=body, attach="embedded")

@@ -274,9 +274,7 @@ def _null_space(matrix: Array) -> Array:
 
 
 def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
-    """Yield the unit vectors (3,) of an orthonormal basis of the span of vectors (k, 3), along
-    coordinate axes where possible; nothing if all are zero.
-    """
+    """Yield an orthonormal basis of the span of vectors, along axes where possible."""
     _, values, directions = np.linalg.svd(vectors.reshape(-1, 3), full_matrices=False)
     space = directions[values > SMALLEST_SINGULAR_VALUE]
     while len(space):
@@ -288,9 +286,7 @@ def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
 
 
 def _direction_text(direction: Array) -> str:
-    """Return "x", "y" or "z" for a unit vector (3,) along that axis, in either sense, or else its
-    components as text.
-    """
+    """Return "x", "y" or "z" for a vector along that axis, else its components."""
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) > 1 - 1e-6:
         return "xyz"[axis]

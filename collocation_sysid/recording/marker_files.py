@@ -124,10 +124,7 @@ def read_markers(
 
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
-    """Return the tracks of the markers that `choose` selects from a file of any known format;
-    `choose` returns their indices from the labels. A text without a known beginning is read as
-    plain CSV.
-    """
+    """Return the tracks that `choose` selects from a file of any known format."""
     content = read_bytes(path)
     if c3d.is_c3d(content):
         return c3d.read(path, content, choose=choose)
@@ -182,18 +179,14 @@ def _require_distinct(names: Sequence[str], message: str) -> None:
 
 
 def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
-    """Raise an `InputError` if a name is not among the names `known` in the file; `what` is the
-    kind of name in the message, and similar names are suggested.
-    """
+    """Refuse a name that is not among the known ones, with similar names."""
     if name not in known:
         hint = hint_at(name, known)
         raise InputError(f"no {what} '{name}'; the file has {', '.join(known)}{hint}")
 
 
 def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
-    """Return the unit of length by the user, `length_unit`, or by the file, else the default of the
-    format.
-    """
+    """Return the unit by the user or the file, else the default of the format."""
     if length_unit and raw.unit and length_unit != raw.unit:
         raise InputError(
             f"length_unit is '{length_unit}', but {raw.unit_key} says '{raw.unit}'; expected the "
@@ -209,9 +202,7 @@ def _length_unit(raw: RawTracks, length_unit: str | None) -> str:
 
 
 def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
-    """Return the times (T,) of the frames [s]: as in the file, else from the frame rate of the file
-    or the user, `rate_hz`.
-    """
+    """Return the times (T,) [s] of the file, else from the frame rate of user or file."""
     t_s = raw.t_s
     rates = {raw.rate_key: raw.rate_hz, "rate_hz": rate_hz}
     declared_rates = {key: rate for key, rate in rates.items() if rate}

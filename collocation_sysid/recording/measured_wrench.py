@@ -40,9 +40,7 @@ WRENCH_COLUMNS = tuple(quantity.column for quantity in (*FORCES, *TORQUES))
 
 
 def _with_torques(values: ArrayLike) -> Array:
-    """Return values (S, 3) of forces with three more columns of NaN for torques; others
-    unchanged.
-    """
+    """Append three columns of NaN for torques to forces (S, 3)."""
     rows = float_array(values, "values of the wrench", ((None, 3), (None, 6)), finite=False)
     forces_alone = rows.ndim == 2 and rows.shape[1] == 3
     return np.hstack([rows, np.full_like(rows, np.nan)]) if forces_alone else rows

@@ -135,9 +135,7 @@ class Measurement:
         return bool(np.isfinite(self.measured_values).any() or any(self.point_counts))
 
     def _ratios_for(self, t_s: ArrayLike) -> Array | None:
-        """Return the ratios of σ for other samples at times `t_s`: the same for as many samples,
-        else None, so that the usual σ holds.
-        """
+        """Return the ratios of σ for as many samples, else None: the usual σ."""
         is_same = self.sigma_ratios is not None and np.size(t_s) == len(self.sigma_ratios)
         return self.sigma_ratios if is_same else None
 

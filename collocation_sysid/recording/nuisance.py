@@ -52,24 +52,17 @@ def cayley_rotation(rotation_vector: ca.SX) -> ca.SX:
 
 
 def _rotate_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
-    """Return a marker's predicted position y (3,) [m], rotated by the rotation vector `values` (3,)
-    [rad] about the pivot of `data`; the time is not used.
-    """
+    """Rotate a predicted position (3,) by a rotation vector about the pivot of `data`."""
     pivot = ca.DM(data.pivot_m)
     return cayley_rotation(values) @ (y - pivot) + pivot
 
 
 def _shift_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
-    """Return a marker's predicted position y (3,) [m] plus `values` (3,) [m]; time and data are not
-    used.
-    """
     return y + values
 
 
 def _distort_position(y: ca.SX, values: ca.SX, t_s: ca.SX, data: RecordingQuantities) -> ca.SX:
-    """Return a marker's predicted position y (3,) [m] with radial distortion of first order, with
-    the coefficient `values` [1/m²], about the pivot of `data`; the time is not used.
-    """
+    """Add radial distortion of first order [1/m²] about the pivot of `data`."""
     away = y - ca.DM(data.pivot_m)
     return y + values * ca.sumsqr(away) * away
 
@@ -105,9 +98,7 @@ def _has_depth_outlines(experiment: Any) -> bool:
 
 
 def _camera_sharing_key(experiment: Any) -> dict[str, object]:
-    """Return what must agree in recordings that share the pose of their depth cameras: the body
-    (the same object), and the pose of each camera in order.
-    """
+    """Return what must agree where cameras are shared: body and stated poses."""
     places = [tuple(d.camera.pose.ravel()) for d in experiment.depths]
     return {"body": id(experiment.body), "pose of its depth cameras": places}
 
@@ -140,16 +131,12 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
 
 
 def _largest_place_step_m(experiment: Any) -> float:
-    """Return the largest change of a marker's place in a step of the solver [m]: `EDGES_A_STEP`
-    mean edges of the mesh.
-    """
+    """Return `EDGES_A_STEP` mean edges of the mesh."""
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
 def _hand_eye_sharing_key(experiment: Any) -> dict[str, object]:
-    """Return what must agree in recordings that share the hand–eye transform: the body (the same
-    object), and the set of nodes in its grasps without obstacles.
-    """
+    """Return what must agree where the hand–eye transform is shared: body, grasped nodes."""
     nodes = {int(node) for grasp in experiment.body_grasps for node in grasp.nodes}
     return {"body": id(experiment.body), "set of nodes in its grasps": nodes}
 

@@ -72,10 +72,7 @@ class Solid(ABC):
 
 
 def _unit_vector_converter(name: str) -> Callable[[ArrayLike], Array]:
-    """Return a function that normalises a vector (3,) to unit length.
-
-    It raises an `InputError` that begins with `name` for a zero vector or another shape.
-    """
+    """Return a function that normalises a vector (3,), not zero."""
 
     def made(value: ArrayLike) -> Array:
         """Return the normalised vector (3,)."""
@@ -181,18 +178,14 @@ class _AxialSolid(Solid):
     ends_m: Array = key(tuple[Vector, Vector], converter=_checked_ends)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return a closed circle at each end and four lines between them; both arguments are
-        ignored.
-        """
+        """Return a closed circle at each end and four lines between them."""
         axis = np.diff(self.ends_m, axis=0)[0]
         first, last = (_circle(end, axis, radius_m=self.radius_m) for end in self.ends_m)
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
         return [first, last, *(np.array([first[k], last[k]]) for k in quarters)]
 
     def _beyond_ends_and_radius(self, point: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return by how much a point (3,) [m] is beyond the nearer end along the axis of the solid,
-        negative between the ends, and its distance from the axis [m].
-        """
+        """Return the distances [m] beyond the nearer end and from the axis."""
         first, last = self.ends_m
         half = float(np.linalg.norm(last - first)) / 2
         axis = ca.DM((last - first) / (2 * half))
@@ -293,25 +286,19 @@ def orthogonal_axes(normal: Array) -> Array:
 
 
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:
-    """Return a closed polyline (33, 3) of the circle with the radius `radius_m` [m] about a centre
-    (3,), across an axis (3,) of any length.
-    """
+    """Return a closed polyline (33, 3) of a circle across an axis (3,) of any length."""
     angle = np.linspace(0, 2 * np.pi, 33)
     round_m = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ orthogonal_axes(axis)
     return centre_m + radius_m * round_m
 
 
 def _length(vector: ca.SX) -> ca.SX:
-    """Return the Euclidean norm √(|v|² + 1e-24 m²) of a vector, with finite second derivatives at
-    zero.
-    """
+    """Return √(|v|² + 1e-24 m²), with finite second derivatives at zero."""
     return ca.sqrt(ca.sumsqr(vector) + SMALLEST_SQUARE_M2)
 
 
 def _corner_distance(beyond: ca.SX) -> ca.SX:
-    """Return the signed distance [m] from a convex corner with orthogonal sides, by the signed
-    distances `beyond` (k,) from each of its sides; negative inside.
-    """
+    """Return the signed distance [m] from a convex corner by those from its sides."""
     return _length(ca.fmax(beyond, 0)) + ca.fmin(ca.mmax(beyond), 0)
 
 

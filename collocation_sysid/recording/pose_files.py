@@ -103,9 +103,7 @@ def _checked_sequence(
 
 
 def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
-    """Return the cells of the columns with the indices `places` as numbers (rows, columns); an
-    `InputError` for a blank cell or one that is no number.
-    """
+    """Return the cells of columns (indices) as numbers; blank cells are refused."""
     return numeric_cells(grid, list(places), blank_allowed=False)
 
 
@@ -131,9 +129,7 @@ def _column_error(grid: TextTable) -> InputError:
 
 
 def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
-    """Return the indices of the columns named x, y, z (in capitals, too), and the factor from their
-    unit to metres.
-    """
+    """Return the indices of x, y, z (or capitals), and the factor to metres."""
     parts = [name_and_unit(column) for column in grid.columns]
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
     units = [parts[k][1] for k in axes]
@@ -188,9 +184,7 @@ def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) 
 
 
 def _read_archive(path: str | Path) -> tuple[Array, Array]:
-    """Return `t_s` (T,) [s] and `matrices` (T, 4, 4) of a NumPy archive, in the file's unit of
-    length.
-    """
+    """Return `t_s` (T,) and `matrices` (T, 4, 4) of a NumPy archive, in its unit."""
     try:
         arrays = load_arrays(path)
     except InputError:

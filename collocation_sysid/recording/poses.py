@@ -258,9 +258,7 @@ class PoseSequence:
         return (self._rotations[:-1].inv() * self._rotations[1:]).as_rotvec()
 
     def _require_times_covered(self, times: Array) -> None:
-        """Raise an `InputError` if a time is over half a sample interval outside the sequence, or
-        NaN; the sequence must have at least two samples.
-        """
+        """Refuse times over half an interval outside, or NaN."""
         first_step, last_step = np.diff(self.t_s)[[0, -1]]
         earliest = self.t_s[0] - max(0.5 * first_step, TIME_TOLERANCE_S)
         latest = self.t_s[-1] + max(0.5 * last_step, TIME_TOLERANCE_S)

@@ -30,9 +30,7 @@ PLANE_TOLERANCE = 1e-9
 
 
 def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
-    """Return a selection unchanged, or a copy of node indices (F, 3) of triangles; an `InputError`
-    for anything else.
-    """
+    """Return a selection, or a copy of triangles (F, 3); anything else is refused."""
     if isinstance(faces, Selection):
         return faces
     faces = np.array(faces)
@@ -106,9 +104,7 @@ class Pressure(Actuator[EnclosedVolume]):
             )
 
     def _measure_on(self, body: Body) -> EnclosedVolume:
-        """Return the volume on the pressure's side of the faces of a body, positive for a cavity;
-        the faces may also be an open patch.
-        """
+        """Return the volume on the pressure's side of faces, which may be an open patch."""
         mesh = body.mesh
         if isinstance(self.faces, Selection):
             rows = self.faces.resolve_faces(mesh)

@@ -71,9 +71,7 @@ def write_gauge_csv(
 
 
 def _write_csv(path: str | Path, header: Sequence[str], values: Array) -> None:
-    """Write a header and rows of numbers (rows, columns) with 12 digits; NaN becomes a blank cell.
-    The file is replaced only when it is complete.
-    """
+    """Write rows with 12 digits, NaN as blank; a file is replaced only when complete."""
     with replaced_file(path) as draft, open(draft, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)

@@ -245,9 +245,7 @@ def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
 
 
 def _mean(points: Array, weight: Array) -> Array:
-    """Return the weighted mean (T, 3) of points (T, B, 3) with weights (T, B); 0 if all weights of
-    a frame are 0. Points of weight zero may be NaN.
-    """
+    """Return the weighted mean (T, 3) of points (T, B, 3); 0 without weights."""
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
     present = np.where(weight[:, :, None] > 0, points, 0.0)
     return np.einsum("tb,tbi->ti", weight, present) / total[:, None]

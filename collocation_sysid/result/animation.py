@@ -341,9 +341,7 @@ class FilmFigure:
         height_mm: float,
         figure_height_mm: float,
     ) -> Line2D:
-        """Draw the panel of marker errors over time, since the first sample, and return the
-        vertical line that marks the current time.
-        """
+        """Draw marker errors over time; return the line of the current time."""
         t_s = self.replay.t_s - self.replay.t_s[0]
         place = (
             left_mm + 12,
@@ -407,9 +405,7 @@ class FilmFigure:
 
 
 def _points_to_show_m(replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]) -> Array:
-    """Return all points (p, 3) [m] that a film has to show: the surface of the body, obstacles near
-    it, measured markers (NaN where missing) and compared points of cameras.
-    """
+    """Return all points (p, 3) [m] that a film has to show, NaN where missing."""
     outlines_m = replay.obstacles_m
     surroundings_m = with_nearby_outlines(
         surface_m, None if outlines_m is None else outlines_m[samples]
@@ -421,9 +417,7 @@ def _points_to_show_m(replay: MotionRecord, surface_m: Array, samples: NDArray[n
 
 
 def _with_even_pixels(height_mm: float) -> float:
-    """Return the least height [mm], not below `height_mm`, that is an even number of pixels in an
-    MP4 film, as H.264 needs.
-    """
+    """Return the least height [mm] with an even number of pixels, as H.264 needs."""
     per_mm = PIXELS_WIDE[".mp4"] / FILM_WIDTH_MM
     return float(2 * np.ceil(height_mm * per_mm / 2) / per_mm)
 

@@ -147,9 +147,7 @@ def _body_section(body: BodyCheck, details: bool) -> Table:
 
 
 def _rest_shape(body: BodyCheck) -> str:
-    """Return how far the stress-free shape differs from a mesh that was made under gravity, or that
-    none was found.
-    """
+    """Return how far the stress-free shape differs from the mesh, or that none was found."""
     if np.isnan(body.rest_shape_change_m):
         return (
             "the mesh was made under gravity; no stress-free shape was found at the guess: give "
@@ -248,9 +246,7 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
 
 
 def _air_description(density_kg_m3: float) -> str:
-    """Return how the model contains the surrounding air of a density [kg/m³], in words; zero stands
-    for a vacuum.
-    """
+    """Return how the model contains air of a density [kg/m³]; zero is a vacuum."""
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
@@ -312,9 +308,7 @@ def _cost_text(cost: MethodCost) -> str:
 
 
 def _solve_brief(findings: CheckResult) -> Table:
-    """Return the table of guesses, the first mode, combinations that are determined, and the
-    expected cost of the chosen method.
-    """
+    """Return guesses, first mode, determined combinations and expected cost."""
     rows = _guess_rows(findings) | _motion_rows(findings)
     if findings.combinations:
         best, *others = findings.combinations
@@ -327,9 +321,7 @@ def _solve_brief(findings: CheckResult) -> Table:
 
 
 def _solve_section(findings: CheckResult) -> Table:
-    """Return the table of guesses, problem size, expected costs of each method, and derivative
-    errors.
-    """
+    """Return guesses, problem size, cost of each method, and derivative errors."""
     rows = _guess_rows(findings)
     for number, each in enumerate(findings.combinations, start=1):
         which = f" {number}" if len(findings.combinations) > 1 else ""

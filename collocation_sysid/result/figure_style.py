@@ -69,9 +69,7 @@ class NotebookFigure(Figure):
             super().savefig(*arguments, **options)
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
-        """Return the figure as PNG bytes, with its width in pixels for a notebook, at 96 pixels per
-        inch.
-        """
+        """Return PNG bytes, with the width in pixels at 96 per inch."""
         png = BytesIO()
         self.savefig(png, dpi=RESOLUTION_DPI)
         return png.getvalue(), {"width": round(96 * self.get_figwidth())}

@@ -81,9 +81,7 @@ def probe_lines(result: Result) -> list[str | Table]:
 
 
 def _largest_probes(result: Result) -> list[Probe]:
-    """Return the probe with the most significant size of each assumption, in the order of the
-    assumptions; others are components of the same assumption.
-    """
+    """Return the most significant probe of each assumption, in their order."""
     largest: dict[str, Probe] = {}
     for probe in result.probes:
         name = assumption_name(probe.name)
@@ -127,9 +125,7 @@ def is_first_to_correct(result: Result) -> bool:
 
 
 def _shown_estimates(result: Result) -> list[str]:
-    """Return the names of the estimates that the table of probes has as columns, at most
-    `MAX_ESTIMATES`.
-    """
+    """Return the estimates that the table of probes shows, at most `MAX_ESTIMATES`."""
     known = [n for n, each in result.collect_estimates().items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][
@@ -215,9 +211,7 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
-    """Return the symbol of the estimate `name` and its change in a refit, as text such as
-    "λ +1.20 %"; KeyError if the refit or the result does not have it.
-    """
+    """Return symbol and change of an estimate in a refit, such as "λ +1.20 %"."""
     return f"{symbol_of(name)} {_change_text(probe.moves[name], result.collect_estimates()[name].value)}"
 
 

@@ -351,9 +351,7 @@ class MotionRecord:
 
 
 def _obstacle_outlines(experiment: Experiment) -> Array | None:
-    """Return the outlines of all obstacles at their stated poses at each sample, (T, o, 3) [m] in
-    the world; None without obstacles.
-    """
+    """Return the outlines of all obstacles at each sample (T, o, 3) [m], or None."""
     body = experiment.body.nodes.points_m
     outlines = []
     for obstacle in experiment.obstacles:
@@ -368,9 +366,7 @@ def _obstacle_outlines(experiment: Experiment) -> Array | None:
 
 
 def _join_polylines(lines_m: Sequence[Array]) -> Array | None:
-    """Return polylines (P, 3), with any number of points P each, joined into one array (p, 3) with
-    a row of NaN after each; None without lines.
-    """
+    """Return polylines in one array (p, 3), a row of NaN after each; None without."""
     if not lines_m:
         return None
     return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])

@@ -197,9 +197,7 @@ def write_pictures(
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
-    """Return the cell data that are the same in every frame, by name: "region" (index of the part),
-    if there are several, and spatially varying constants of a body.
-    """
+    """Return the cell data that all frames share, by name."""
     data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
@@ -294,9 +292,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
 
 
 def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str, Array]:
-    """Return the points of each camera of an experiment on the fitted surface, or else on the
-    simulated one.
-    """
+    """Return each camera's points on the fitted, else the simulated surface."""
     if not experiment.camera_names:
         return {}
     from .camera_overlays import visible_points  # which needs matplotlib
@@ -305,9 +301,7 @@ def _visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str
 
 
 def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
-    """Return the edges of masks and the fitted contours (k, 4) of each camera of an experiment, as
-    `MotionRecord.outlines`, in at most `MAX_OUTLINED_IMAGES` images.
-    """
+    """Return edges of masks and fitted contours (k, 4) in `MAX_OUTLINED_IMAGES` images."""
     part = finished.solution.part_of(experiment)
     if part is None:
         return {}
@@ -327,9 +321,7 @@ def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
 
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
-    """Return the estimates (E, 4) of each spatially varying constant of a body, by name of the
-    field; empty if there is none.
-    """
+    """Return the estimates (E, 4) of each field of a body, by name."""
     estimates = {}
     for part in body.parts:
         if part.field is not None:

@@ -166,9 +166,7 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
 
 
 def _estimates_at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
-    """Return the estimates of parameters and derived moduli, without coefficients of fields, before
-    the correction of the discretisation error, by name.
-    """
+    """Return the estimates before the correction, by name, without fields."""
     return {
         name: each.at_optimum(name, linear=name in parameters.list_linear_names())
         for name, each in result.collect_estimates().items()
@@ -221,9 +219,7 @@ def _updated_shares(
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
-    """Return the levels that an earlier call finished, with the values of `names` alone; empty
-    without a file.
-    """
+    """Return the levels that an earlier call finished, with values of `names` alone."""
     if not file.is_file():
         return []
     require_own(file)

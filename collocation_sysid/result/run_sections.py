@@ -259,9 +259,7 @@ def _undetermined_sentence(result: Result) -> list[str]:
 
 
 def _coverage_sentence(result: Result) -> str:
-    """Return a sentence on what the combined intervals contain, and which discretisation error they
-    do not contain; equilibria have no step error, specimens neither.
-    """
+    """Return what combined intervals contain, and which numerical error they do not."""
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
@@ -430,9 +428,7 @@ def refinement_table(result: Result) -> Table | Line:
 
 
 def _interval_text(ends: tuple[float, float] | None, factor: float, deviation: float | None) -> str:
-    """Return the ends of an interval, multiplied by a factor, to the place of a deviation; "" for
-    None.
-    """
+    """Return scaled ends of an interval to the place of a deviation; "" for None."""
     if ends is None:
         return ""
     low, high = (rounded(factor * end, deviation) for end in ends)
@@ -472,18 +468,14 @@ def fit_section(result: Result) -> TitledParts:
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
-    """Return the times of search, checks and pictures as text, such as "search 1.2 s, checks
-    3.4 s"; pictures that were not drawn are left out.
-    """
+    """Return times such as "search 1.2 s, checks 3.4 s"."""
     parts = {"search": elapsed.search, "checks": elapsed.checks, "pictures": elapsed.pictures}
     known = (f"{part} {time_s:.1f} s" for part, time_s in parts.items() if time_s is not None)
     return ", ".join(known)
 
 
 def _iterations_text(result: Result) -> str:
-    """Return the number of iterations, how much time [s] of the search they took, and how much of
-    that linear algebra and evaluations took, as text.
-    """
+    """Return iterations, time [s], and shares of linear algebra and evaluations."""
     timing = result.timing_s
     return (
         f"{result.iterations} iterations in {timing.total:.1f} s of the search "
@@ -547,9 +539,7 @@ def notes_section(result: Result) -> TitledParts:
 
 
 def _cards(result: Result) -> Cards:
-    """Return the main numbers: the most important stiffness (or else the first estimate), and the
-    misfits of what was measured. The result must have an estimate.
-    """
+    """Return the most important stiffness, or the first estimate, and the misfits."""
     values = result.collect_estimates()
     fit = result.fit
     simulated = result.rollout
@@ -600,9 +590,7 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of the estimated places of its markers [mm]; an experiment
-    without markers is left out.
-    """
+    """Yield a table of the estimated places [mm] of each experiment."""
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
         "Positions that were not given have a prior as wide as the body."
@@ -624,9 +612,7 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield for each experiment a table of its other nuisance parameters in readable units such as
-    mm, ms or degrees, see `_size_text`.
-    """
+    """Yield a table of the other nuisance parameters in readable units."""
     explanation = (
         "Estimated for this recording alone, together with the parameters; the prior has a mean "
         "of zero."
@@ -665,9 +651,7 @@ def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
 
 
 def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
-    """Return the largest marker residuals of a run folder as (error [m], time [s], marker), largest
-    first.
-    """
+    """Return the largest marker residuals as (error [m], time [s], marker)."""
     arrays = read_arrays(run)
     worst = []
     for key in (key for key in arrays if key.rpartition("/")[2] == "residuals_m"):

@@ -243,9 +243,7 @@ def _basis(result: Result) -> list[str]:
 
 
 def _fit(result: Result) -> Iterator[Shown]:
-    """Yield the quality of the fit and of the forward simulations: a line for one recording, a
-    table with a row for each of several.
-    """
+    """Yield the quality of fits and simulations: a line for one, a table for several."""
     fitted = result.fit.experiments
     simulated = result.rollout.experiments
     quality = []
@@ -291,9 +289,7 @@ def _fit_errors(fitted: FittedExperiment) -> str:
 
 
 def _simulation_text(simulated: SimulatedExperiment) -> str:
-    """Return the errors of a forward simulation in words; of a validation, those of the blind
-    prediction and beside it those of a copy of the nearest measurements.
-    """
+    """Return the errors of a simulation; of a validation those of a copy, too."""
     if simulated.failed is not None:
         return f"failed: {simulated.failed}"
     own = copy_fields(PredictionErrors, simulated)

@@ -398,9 +398,7 @@ def require_only_written(folder: Path) -> None:
 
 
 def _replace_folder(new: Path, target: Path, backup: Path) -> None:
-    """Rename the folder `new` to `target`; an existing `target` is moved to `backup`, which must
-    not exist, and removed once that succeeded.
-    """
+    """Rename `new` to `target`; an existing one is removed by way of `backup`."""
     if not target.exists():
         new.rename(target)
         return

@@ -283,9 +283,7 @@ def _iteration_table(lines: list[Iteration]) -> Shown:
 
 
 def _iteration_row(line: Iteration) -> tuple[str, ...]:
-    """Return the table row of an iteration: number, marker error [mm], violation [N], parameters,
-    and time [s].
-    """
+    """Return number, marker error [mm], violation [N], parameters and time [s]."""
     values = (f"{value:.4g}" for value in line.parameters.values())
     rms_mm = f"{line.rms_m * 1e3:.4f}"
     violation = f"{line.violation_n:.1e}"

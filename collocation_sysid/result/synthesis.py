@@ -106,9 +106,7 @@ class Recipe:
 def _share_of_experiment(
     progress: Callable[[float], None] | None, index: int, count: int
 ) -> Callable[[float], None] | None:
-    """Return a function that reports the share of one simulation, by its index among `count`, as a
-    share of all to `progress`; None if that is None.
-    """
+    """Return a function that reports one simulation of `count` to `progress`."""
     if progress is None:
         return None
     return lambda share: progress((index + share) / count)
@@ -329,9 +327,7 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[ForceSensorSection]:
-    """Return the table layout of each force sensor, those of grasps before those of obstacles;
-    empty if `section` is None, for a problem without a file.
-    """
+    """Return the tables of force sensors, grasps before obstacles."""
     moved = section.moved_sections if section is not None else []
     return [each.sensor for each in moved if each.sensor is not None]
 
@@ -359,9 +355,7 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
 
 
 def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
-    """Return the table of each experiment in the problem file, by name of the experiment; empty for
-    a problem without a file.
-    """
+    """Return the table of each experiment by name; empty without a file."""
     if (origin := problem.origin) is None:
         return {}
     file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))
@@ -396,9 +390,7 @@ def _table_names(
 
 
 def _numbered_key(kind: str, index: int) -> str:
-    """Return the key of a file of a kind, such as "poses", for the grasp with this index from 0:
-    poses, poses_2, …
-    """
+    """Return the key of the grasp with this index: poses, poses_2, …"""
     return f"{kind}_{index + 1}" if index else kind
 
 

@@ -117,9 +117,7 @@ def simulate_experiments(
 
 
 def _report_completed_share() -> Callable[[float], None]:
-    """Return a function that reports the completed share of one simulation, from 0 to 1, to the
-    counters of `counted_phase`.
-    """
+    """Return a function that reports the share of a simulation to `counted_phase`."""
     completed = 0.0
 
     def report(share: float) -> None:
@@ -391,9 +389,7 @@ def _step_error_share(problem: Problem, transcription: Transcription) -> float |
 
 
 def _step_s(problem: Problem, transcription: Transcription) -> float:
-    """Return the step of the forward simulation of the recording of `transcription` [s]: the one of
-    `problem.rollout`, by default finer than the grid of the fit.
-    """
+    """Return the step of the forward simulation [s], by default finer than that of the fit."""
     is_smooth = sample_distance(transcription.experiment) >= SMOOTH_SAMPLES
     count = min(max(2 if is_smooth else 4, 2 * transcription.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or transcription.experiment.timestep_s / count

@@ -171,9 +171,7 @@ def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None
 
 
 def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:
-    """Yield a concern for each fitted body with a mesh that is too coarse for its bending, and of
-    which an elastic constant is estimated.
-    """
+    """Yield each fitted body with an elastic estimate that is too coarse for bending."""
     fitted = [each for each in problem.experiments if not each.validation]
     estimated = {without_region(item.name) for item in problem.parameters.free}
     bodies = dict.fromkeys(each.body for each in fitted if each.specimen is None)
@@ -187,8 +185,6 @@ def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:
 
 
 def _elastic_names(body: Body) -> set[str]:
-    """Return the names of the moduli and of the constants of the materials of a body, without
-    regions.
-    """
+    """Return the moduli and constants of the materials of a body, without regions."""
     constants = (constant.name for part in body.parts for constant in part.material.constants)
     return {*ELASTIC, *constants}

@@ -141,9 +141,7 @@ def nearest_recording_error(
 
 
 def _reason_against_copy(experiment: Experiment, other: Experiment) -> str:
-    """Return why the measurements of `other` cannot be compared with those of a recording as a
-    prediction, such as other markers; "" if they can.
-    """
+    """Return why `other` is no prediction of a recording, such as other markers, or ""."""
     if reason := reason_against_copy(experiment, other):
         return reason
     starts_s = experiment.t_s[0], other.t_s[0]

@@ -264,9 +264,7 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
 
 
 def _fit_result(answer: SolvedProblem) -> FitResult:
-    """Return the residuals of the fit of each experiment and of all together, with expected noise
-    and sentences on nuisance parameters; cached properties of the answer are computed.
-    """
+    """Return the residuals of each experiment and of all, with sentences on nuisance parameters."""
     solution = answer.solution
     experiments = {}
     for part in solution.parts:
@@ -308,10 +306,7 @@ def _sensor_errors(error: PredictionErrors) -> dict[str, Any]:
 
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
-    """Return the errors of the forward simulations of all experiments, with the RMS over all marker
-    samples and the maximum over the fitted ones; both None if none of these has markers and a
-    simulation.
-    """
+    """Return the errors of all simulations, RMS over samples and the fitted maximum."""
     experiments = {}
     squares = []
     largest = []
@@ -329,9 +324,7 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
 
 
 def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
-    """Return the errors of the forward simulation of an experiment; if it failed, only the reason
-    and whether the experiment was fitted. `answer.rollouts` must have an entry for it.
-    """
+    """Return the errors of an experiment's simulation; if it failed, the reason."""
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
@@ -356,9 +349,7 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
 
 
 def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
-    """Return the nuisance parameters of the fitted experiments, without the places of markers, by
-    experiment and label.
-    """
+    """Return nuisance parameters but places of markers, by experiment and label."""
     deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, NuisanceResult]] = {}
     for part in answer.solution.parts:
@@ -370,9 +361,7 @@ def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
 
 
 def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
-    """Yield up to two sentences on the places of markers: how far stated ones with a prior moved,
-    and how accurately unknown ones are estimated. `places` are by name of the marker.
-    """
+    """Yield how far stated places moved, and how accurate unknown ones are."""
     moved = {
         n: place.displacement_m or 0.0
         for n, place in places.items()
@@ -395,9 +384,7 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 
 
 def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
-    """Yield sentences on the nuisance parameters of an experiment except the places, with estimate
-    and prior.
-    """
+    """Yield sentences on nuisance parameters but places, with estimate and prior."""
     nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
     for row in (*part.transcription.experiment.nuisance.list_kinds(), GAUGE):

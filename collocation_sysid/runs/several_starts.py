@@ -80,10 +80,7 @@ class _KnownMinimum(Exception):
 
 
 def _until_known(method: Method, known: Sequence[Solution]) -> Method:
-    """Return a method that raises `_KnownMinimum` as soon as an iterate with complete recordings
-    has the loss of a known solution, up to `SAME_LOSS`, and its parameters, up to
-    `SAME_PARAMETERS`.
-    """
+    """Return a method that raises `_KnownMinimum` where a known solution is reached."""
 
     def solve(
         collocation: Collocation, watch: Watch | None = None, start: Array | None = None

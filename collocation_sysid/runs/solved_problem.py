@@ -135,9 +135,7 @@ class SolvedProblem:
         }
 
     def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
-        """Return the estimate to report: corrected for the known discretisation error and known
-        effects, with combined and statistical uncertainties.
-        """
+        """Return the estimate corrected for known errors, with uncertainties."""
         item = next(
             (each for each in self.solution.collocation.parameters.components if each.name == name),
             None,
@@ -298,9 +296,7 @@ class SolvedProblem:
         )
 
     def _compute_discretisation_corrections(self) -> dict[str, float]:
-        """Return the ratio of the reported value to the optimum of each estimated scalar parameter,
-        by name; 1 if the optimum is zero.
-        """
+        """Ratio of reported value to optimum, by name."""
         return {
             item.name: each.value / each.optimum if each.optimum else 1.0
             for item in self.solution.collocation.parameters.free_scalars
@@ -528,9 +524,7 @@ class SolvedProblem:
         )
 
     def _relative_by_value(self) -> Array:
-        """Return the derivatives (k,) of the relative coordinates of the estimated parameters by
-        their values.
-        """
+        """Return the derivatives (k,) of relative coordinates by values."""
         parameters = self.solution.collocation.parameters
         by_value = relative_derivatives(parameters, self.solution.q)
         for k, item in enumerate(parameters.free):
@@ -540,9 +534,7 @@ class SolvedProblem:
         return by_value
 
     def _collect_relative_deviations(self) -> Array:
-        """Return the combined standard uncertainties (k,) of the relative coordinates; NaN where
-        there is none.
-        """
+        """Return their combined standard uncertainties, or NaN."""
         known = [_or_nan(self.estimates[n].combined_std_error) for n in self._estimated_names]
         return np.abs(self._relative_by_value()) * np.array(known)
 
@@ -552,9 +544,7 @@ class SolvedProblem:
 
     @cached_property
     def _complete_covariance(self) -> Array:
-        """Finite combined covariance (k, k) of the relative coordinates, see
-        `Uncertainty.complete_covariance`.
-        """
+        """Finite combined covariance (k, k) of relative coordinates."""
         assert self.uncertainty is not None
         assert self.systematic_effects is not None
         parameters = self.solution.collocation.parameters
@@ -608,9 +598,7 @@ class SolvedProblem:
         return self.estimates[name].reason is None and self.estimates[name].is_determined
 
     def _stated_covariance(self) -> tuple[list[str], Array, Array]:
-        """Return names, values (k,) and finite combined covariance (k, k) of the scalar parameters
-        that are not at a bound; none without error bars.
-        """
+        """Names, values and covariance of scalars that are not at a bound."""
         if self.uncertainty is None or self.systematic_effects is None:
             return [], np.zeros(0), np.zeros((0, 0))
         free = enumerate(self._estimated_names)
@@ -619,9 +607,7 @@ class SolvedProblem:
         return [*kept.values()], values, self._complete_covariance[np.ix_([*kept], [*kept])]
 
     def _modulus_slopes(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the relative derivatives (k,) of the derived moduli by the logarithms of some
-        parameters.
-        """
+        """Return ∂ln of the derived moduli by logarithms of parameters (k,)."""
         assert self.systematic_effects is not None
         sizes = relative_derivatives(self.solution.collocation.parameters, self.solution.q)
         places = [self._estimated_names.index(name) for name in names]
@@ -663,9 +649,7 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of the estimate `name`, which must exist, in `to_frame`, by column; NaN
-        for unknown numbers.
-        """
+        """Return the row of an estimate in `to_frame`; NaN for unknown numbers."""
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)
@@ -722,9 +706,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def _estimate_text(estimate: ReportedEstimate) -> str:
-    """Return an estimate as text without its unit: the value, then " ± " and the combined standard
-    uncertainty, and the combined interval in brackets, these two only if they are known.
-    """
+    """Return "value ± uncertainty [interval]" without unit, as far as known."""
     error = "" if estimate.combined_std_error is None else f" ± {estimate.combined_std_error:.2g}"
     interval = (
         "" if estimate.combined95 is None else " [{:.5g}, {:.5g}]".format(*estimate.combined95)

@@ -211,9 +211,7 @@ def _solve_by(
 
 
 def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float] | None:
-    """Return the most likely of the correlation lengths [m] that the fields of a problem allow, by
-    name of the field; None if there is no choice or the solution did not converge.
-    """
+    """Return the most likely correlation length [m] by field; None without a choice."""
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     has_choice = any(len(field.field.lengths_m) > 1 for field in fields)
     if not has_choice or not solution.status.converged:
@@ -483,9 +481,7 @@ def _program_and_start(
 
 
 def _feature_notes(solution: Solution) -> list[str]:
-    """Return the notes of all features on the fitted experiments of a solution, in their order;
-    empty without any.
-    """
+    """Return the notes of all features on the fitted experiments, in their order."""
     parts = solution.parts
     lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
     return lost + [note for part in parts for feature in FEATURES for note in feature.notes(part)]
@@ -573,9 +569,7 @@ def _better_of(
     watch: Watch | None,
     choose: Callable[[Solution], SecondStart | None],
 ) -> Solution:
-    """Return the better of a solution and of that from the start chosen for it, see
-    `best_of_second_start`.
-    """
+    """Return the better of a solution and of that from the start chosen for it."""
     if first.status in FINAL_STATUSES or not first.history:
         return first
     try:

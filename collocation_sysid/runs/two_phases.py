@@ -122,9 +122,7 @@ def solve_two_phases(
 def _sample_posterior(
     problem: Problem, search: _PhaseSearch, solution: Solution, fit: LinearisedFit
 ) -> tuple[PhasePosterior, float, int, bool]:
-    """Sample the posterior of phases and parameters, from the solution with a smooth field and its
-    measurements, linearised, on.
-    """
+    """Sample phases and parameters from the solution with a smooth field on."""
     in_logarithms = _linearise_at(problem, search, solution=solution)
     phases = initial_phases(
         in_logarithms.information(), in_logarithms.faces, volumes_m3=search.modes.volumes_m3
@@ -218,9 +216,7 @@ def _representative_phases(probability: Array, volumes_m3: Array) -> Array:
 
 
 def _linearise_at(problem: Problem, search: _PhaseSearch, solution: Solution) -> ElementSurrogate:
-    """Return the measurements linearised at a solution by the logarithm of the constant in every
-    element, instead of the shapes of the field.
-    """
+    """Linearise measurements by the logarithm of every element at a solution."""
     solved = solution.collocation
     body = _two_phase_body(solution, search)
     part = body.parts[search.number]
@@ -284,9 +280,7 @@ def _collocation_with_elements(
 
 
 def _contrast_prior(problem: Problem, search: _PhaseSearch) -> ContrastPrior:
-    """Return the prior of the logarithm of the contrast: that of the field, or that of the user, or
-    the value that the user has fixed.
-    """
+    """Return the prior of ln contrast: the field's, the user's, or the fixed value."""
     (item,) = (item for item in problem.parameters.scalars if item.name == search.contrast)
     if item.is_fixed:
         assert item.guess is not None
@@ -353,9 +347,7 @@ def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:
-    """Return a copy of the solution with bodies whose two-phase fields have these samples;
-    variables and associations are the same.
-    """
+    """Return the solution with bodies whose two-phase fields have these samples."""
     collocation = solution.collocation
     bodies: dict[int, Body] = {}
     for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):

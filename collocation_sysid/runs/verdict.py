@@ -208,9 +208,7 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 def _prediction_concerns(
     solution: Solution, rollouts: Mapping[str, ForwardSimulation | str]
 ) -> Iterator[Concern]:
-    """Yield concerns about forward simulations of fitted recordings that differ from the
-    measurements by more than the noise; failed simulations, given by their reason, are ignored.
-    """
+    """Yield fitted recordings whose simulation misses by more than the noise."""
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation) and solution.part_of(name) is not None:
             for misfit in rollout.misfits:

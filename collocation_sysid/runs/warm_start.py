@@ -140,9 +140,7 @@ class WarmStart:
         return collocation.with_marker_places(places_m)
 
     def _known_places(self, transcription: Transcription) -> dict[int, Array]:
-        """Return the earlier place (3,) [m] of each marker whose place is estimated in a
-        transcription, by index of the marker; markers without an earlier place are left out.
-        """
+        """Return the earlier place (3,) [m] of markers with estimated places."""
         places_m = self.places_m.get(transcription.experiment.name, {})
         names = transcription.experiment.markers.names
         estimated = transcription.association.markers.estimated.tolist()

@@ -246,9 +246,7 @@ def _correlations(dependence: Dependence) -> tuple[bool, bool]:
 
 
 def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return one concern, as a list, with the parameters on which recordings disagree; empty if
-    there are none, or if recordings were not compared.
-    """
+    """Return a concern with the parameters on which recordings disagree, or nothing."""
     scatter = uncertainty.scatter
     disagreeing = [] if scatter is None else np.flatnonzero(scatter.find_disagreements()).tolist()
     names = [
@@ -410,9 +408,7 @@ def _advice(probe: Probe, is_still: bool) -> str:
 
 
 def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
-    """Return the addition to a message on a drift of the stiffness that names the specimens whose
-    branches differ clearly, with the remedy; "" if there are none.
-    """
+    """Return the specimens whose branches differ clearly, with the remedy; "" if there are none."""
     sizes = branch_differences(experiments)
     if not sizes:
         return ""

@@ -303,9 +303,7 @@ def _parameter_estimate(
 
 
 def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
-    """Return an estimate multiplied by a ratio, which may be negative: value, standard error (by
-    its absolute value) and interval, in ascending order.
-    """
+    """Return an estimate multiplied by a ratio, which may be negative."""
     ends = estimate.statistical95 and sorted(
         (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
     )
@@ -321,9 +319,7 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 
 
 def _estimate_at_bound(value: float) -> Estimate:
-    """Return the estimate of a value at a bound, or that follows from one: without standard error
-    and interval, with a reason.
-    """
+    """Return an estimate without standard error and interval, with the reason."""
     return Estimate(
         value, at_bound=True, reason="it ended at a bound, or follows from a parameter that did"
     )
@@ -414,9 +410,7 @@ def without_long_term_moduli(
 
 
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
-    """Return one note for each parameter that is not identifiable, and one for two parameters that
-    are confounded with each other.
-    """
+    """Return a note for each parameter that is not identifiable, or for two confounded ones."""
     notes = []
     mentioned = set()
     for name, reason in reasons.items():

@@ -177,9 +177,7 @@ class FieldEstimate:
 
     @cached_property
     def _data_information(self) -> tuple[Array, Array]:
-        """Information H (m, m) of the data alone and the score b (m,), see the module's
-        documentation; eigenvalues of the covariance are limited to at most 1.
-        """
+        """H (m, m) and score b (m,) of the data alone, eigenvalues at most 1."""
         values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
         # Rounding, or error bars that are wider than the fit's: no less than nothing.
         values = np.clip(values, 1e-12, 1.0)
@@ -188,10 +186,7 @@ class FieldEstimate:
 
     @cached_property
     def _is_wider_than_prior(self) -> bool:
-        """Whether the largest eigenvalue of `covariance` exceeds that of the prior by `WIDER`,
-        because residuals are much larger than the noise, or whether it is not finite; then there
-        is no valid evidence.
-        """
+        """Whether misfit widens the covariance beyond the prior: no valid evidence."""
         known = self.covariance
         return not np.isfinite(known).all() or np.linalg.eigvalsh(known)[-1] > WIDER
 
@@ -224,9 +219,7 @@ class FieldEstimate:
         return self._log_evidence(prior) - self._log_evidence(np.eye(size))
 
     def _log_evidence(self, prior: Array) -> float:
-        """Return ln Z(D) for a prior covariance D (m, m) of the coefficients, up to a constant that
-        does not depend on D.
-        """
+        """Return ln Z(D) for a prior covariance D (m, m), up to a constant."""
         alone, score = self._data_information
         both = np.eye(len(alone)) + alone @ prior
         return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
@@ -441,9 +434,7 @@ def mean_logarithm(
 
 
 def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> GeneratedFunction:
-    """Return the generated logarithm of the mean of a part's field as a function of q; for a
-    density, the generated ratio to the stated density.
-    """
+    """Return ln of the mean of a part's field as a function of q; of a density its ratio."""
     body = constants.body
     part = constants.body.parts[part_index]
 

@@ -46,9 +46,7 @@ def identifiability_sentences(
 
 
 def _single_sentences(uncertainty: Uncertainty) -> list[str]:
-    """Return one sentence, as a list, about the parameters with a useful interval and its half
-    width, well determined ones (up to `WELL_FIXED`) first; empty if there are none.
-    """
+    """Return a sentence on the parameters with a useful interval, well determined first."""
     factors = {
         name: factor
         for name in uncertainty.names
@@ -64,9 +62,7 @@ def _single_sentences(uncertainty: Uncertainty) -> list[str]:
 
 
 def _other_convention(uncertainty: Uncertainty) -> list[str]:
-    """Return one sentence, as a list, about the moduli of the other elastic convention with a
-    useful interval; empty if there are none, or if no elastic constant is estimated.
-    """
+    """Return a sentence on the moduli of the other elastic convention with a useful interval."""
     if not set(ELASTIC) & {without_region(name) for name in uncertainty.names}:
         return []
     parts = []
@@ -87,9 +83,7 @@ def _other_convention(uncertainty: Uncertainty) -> list[str]:
 
 
 def _interval_factor(estimate: Estimate) -> float | None:
-    """Return √(upper/lower) of the statistical interval of an estimate; None without one, if its
-    lower end is not positive, or if the factor is `HOPELESS` or more.
-    """
+    """Return √(upper/lower) of the statistical interval; None without one, or if hopeless."""
     if estimate.statistical95 is None or not estimate.statistical95[0] > 0:
         return None
     factor = float(np.sqrt(estimate.statistical95[1] / estimate.statistical95[0]))
@@ -97,9 +91,7 @@ def _interval_factor(estimate: Estimate) -> float | None:
 
 
 def _precision_text(factor: float) -> str:
-    """Return an interval's half width, given as a factor of 1 or more, as text: in per cent below
-    1.5, "no useful range" from `HOPELESS` on.
-    """
+    """Return a half width, given as a factor, as text: in per cent below 1.5."""
     if factor < PERCENT:
         return f"±{100 * (factor - 1):.2g} %"
     return f"within a factor of {factor:.2g}" if factor < HOPELESS else "no useful range"

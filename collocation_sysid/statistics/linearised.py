@@ -336,9 +336,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
 
 
 def _covariance_by_phases(collocation: Collocation) -> Array | None:
-    """Return the covariance (nq, nq) of q due to unknown phases of two-phase fields; None if there
-    is no such field, or if none has samples.
-    """
+    """Return the covariance (nq, nq) due to unknown phases; None without samples of them."""
     names = [item.name for item in collocation.parameters.free]
     covariance: Array | None = None
     for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):

@@ -213,9 +213,7 @@ def initial_phases(
 def _total_variation_estimate(
     data: ElementInformation, faces: InternalFaces, settings: SamplerSettings
 ) -> Array:
-    """Return the logarithms z (E,) of least squares and least total variation, with p eliminated,
-    by `SamplerSettings.sharpenings` reweighted least-squares solves.
-    """
+    """Return z (E,) of least squares and least total variation, p eliminated."""
     normal, score = data.eliminated
     jumps = faces.build_jump_operator()
     z = data.base
@@ -230,9 +228,7 @@ def _total_variation_estimate(
 
 
 def _class_threshold(values: Array, weights: Array) -> float:
-    """Return the threshold between two classes of values (E,) with the least weighted variance
-    within (Otsu).
-    """
+    """Return the threshold of least weighted variance within two classes (Otsu)."""
     order = np.argsort(values)
     sorted_values = values[order]
     weight = np.cumsum(weights[order])
@@ -384,9 +380,7 @@ class _Chains:
         return self.estimate_mean_contrasts() + noise
 
     def propose(self, rng: np.random.Generator) -> float:
-        """Propose one flip in each chain and accept or reject it, in place; return the share of
-        accepted ones.
-        """
+        """Propose a flip in each chain; return the share of accepted ones."""
         forward = np.cumsum(self._weights(self._energies), axis=1)
         drawn = rng.random((len(forward), 1)) * forward[:, -1:]
         chosen = np.minimum((forward < drawn).sum(axis=1), forward.shape[1] - 1)
@@ -404,9 +398,7 @@ class _Chains:
         return np.exp(np.clip(-energies / 2, -self._limit, self._limit))
 
     def _flip_energies(self) -> Array:
-        """Return, for each chain and element, −ln of the ratio of the posteriors with and without
-        its phase flipped (C, E).
-        """
+        """Return −ln of the ratio of posteriors with each phase flipped (C, E)."""
         signs = 1 - 2 * self.phases
         before = self._information[:, None]
         information = before + 2 * signs * self._normal_sums + self._diagonal

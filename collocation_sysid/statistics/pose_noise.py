@@ -121,9 +121,7 @@ def with_pose_noise(
 
 
 def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
-    """Return the noise of a grasp's poses: for translation and rotation separately as stated, or as
-    estimated if nothing is stated (None); `name` is that of the experiment.
-    """
+    """Return the noise of a grasp's poses, as stated or else estimated."""
     rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
     sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad

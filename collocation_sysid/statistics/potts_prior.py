@@ -77,9 +77,7 @@ class PottsHyperprior:
     def _draw_chain(
         self, phase: Array, balance: Array, start: Array, rng: np.random.Generator
     ) -> Array:
-        """Draw (J, B) of one chain from its phases (E,) and face balance (E,); `start` (2,) is the
-        start of the search for the mode.
-        """
+        """Draw (J, B) of a chain; the search for the mode begins at `start`."""
         regressors = np.column_stack([balance, np.ones_like(balance)])
         mean = np.array([self.face_nats, 0.0])
         precision = np.array([self.face_deviation, self.element_deviation])

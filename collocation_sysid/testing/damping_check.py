@@ -204,9 +204,7 @@ def _check_derivatives(
 
 
 def _check_dissipation(check: PropertyCheck, stress: DampingStress, F: Array, where: str) -> None:
-    """Require that no eigenvalue of the symmetric part of ∂P_v/∂Ḟ at F (9,) is negative beyond
-    rounding: P_v:Ḟ ≥ 0 for every rate.
-    """
+    """Require ∂P_v/∂Ḟ at F (9,) without negative eigenvalue, up to rounding."""
     by_rate = stress.evaluate(F, np.zeros(9)).by_rate
     powers = np.linalg.eigvalsh((by_rate + by_rate.T) / 2)
     if not powers[0] >= -ROUNDING * np.abs(powers).max():
@@ -221,9 +219,7 @@ def _check_dissipation(check: PropertyCheck, stress: DampingStress, F: Array, wh
 def _check_objectivity(
     check: PropertyCheck, stress: DampingStress, F: Array, rate: Array, where: str
 ) -> None:
-    """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for one random rotation Q and one random spin Ω
-    (skew-symmetric).
-    """
+    """Require P_v(QF, Q(Ḟ + ΩF)) = Q P_v(F, Ḟ) for a random Q and Ω."""
     value = stress.evaluate(F, rate).stress
     Q = random_rotation(check.rng)
     spin = np.asarray(ca.skew(3 * check.rng.standard_normal(3)), dtype=float)

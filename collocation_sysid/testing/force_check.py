@@ -135,9 +135,7 @@ def check_force(
 
 
 def _places(rng: np.random.Generator, positions_m: ArrayLike | None) -> Array:
-    """Return the places (k, 3) at which a force is checked: the given ones, or `STATES` random ones
-    in a box of 0.1 m if `positions_m` is None [m].
-    """
+    """Return given places (k, 3) [m], or `STATES` random ones in a box of 0.1 m."""
     if positions_m is None:
         return rng.uniform(0.01, 0.1, (STATES, 3))
     return np.asarray(positions_m, dtype=float).reshape(-1, 3)
@@ -271,9 +269,7 @@ def _column(values: Any) -> Any:
 def _check_derivatives(
     check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], where: str
 ) -> None:
-    """Compare value and derivatives of the generated force with the plain law and with
-    differences.
-    """
+    """Compare the generated force with the plain law and with differences."""
     u, data = state
     columns = data[:, None]
     y, jacobian = law.generated.evaluate_with_jacobian(u[:, None], columns)
@@ -312,9 +308,7 @@ def _check_energy(
     energy: Callable[..., Any],
     where: str,
 ) -> None:
-    """Require that the force on a node without velocity is minus the gradient of the energy, both
-    by automatic differentiation of `energy` and by central differences of its values.
-    """
+    """Require that the force at rest is −∇energy, automatically and by differences."""
     u = state[0].copy()
     u[3:6] = 0.0
     force = law.evaluate_plain(u, state[1])[:3]
@@ -336,9 +330,7 @@ def _check_energy(
 def _check_dissipation(
     check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], where: str
 ) -> None:
-    """Require (f(x, v) − f(x, 0))·v ≤ 0 at one state for `VELOCITIES` random velocities of
-    different size.
-    """
+    """Require (f(x, v) − f(x, 0))·v ≤ 0 for `VELOCITIES` random velocities."""
     u = state[0].copy()
     velocity = slice(law.dofs, 2 * law.dofs)
     u[velocity] = 0.0
@@ -360,9 +352,7 @@ def _check_dissipation(
 
 
 def _check_messages(check: PropertyCheck, force: NodeForce, values: dict[str, float]) -> None:
-    """Require that a definition of a constant that the law does not have, and a problem that lacks
-    the value of a constant, are refused by the name of the constant.
-    """
+    """Require that unknown and missing constants are refused by name."""
     misspelt = f"no_{next(iter(values), 'constant')}"
     check.require_refusal(
         lambda: NodeForce.from_law(
@@ -377,9 +367,7 @@ def _check_messages(check: PropertyCheck, force: NodeForce, values: dict[str, fl
 def _check_round_trips(
     check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], file: str | Path | None
 ) -> None:
-    """Require the same forces at one state after pickling and, unless `file` is None, from a
-    problem file that names the law in this Python file.
-    """
+    """Require the same forces after pickling and from a problem file."""
 
     def evaluate(force: NodeForce) -> Array:
         """Return the force at a state."""

@@ -85,9 +85,7 @@ class PlainInternalForce:
         return [*node_fields, ca.SX.sym("geometry", width, points), ca.SX.sym("c", constants)]
 
     def _build_element_force(self) -> ca.SX:
-        """Return the symbolic force (3·nodes,) of one element on its nodes, elastic and viscous,
-        without mass-proportional damping.
-        """
+        """Force (3·nodes,) of an element, without γ_m."""
         x, v, _, geometry, constants = self._symbols
         part = self.body.parts[0]
         nodes = self.body.element.nodes
@@ -102,16 +100,12 @@ class PlainInternalForce:
         return force
 
     def _split(self, material: Material) -> list[int]:
-        """Return the offsets of the constants of the material and of the damping law in those of an
-        element, and their total number: the argument of `casadi.vertsplit`.
-        """
+        """Offsets of the material's and the law's constants, and their number."""
         count = len(material.constants)
         return [0, count, self._symbols[-1].numel()]
 
     def _stress(self, F: ca.SX, rate: ca.SX, constants: list[ca.SX]) -> ca.SX:
-        """Return the first Piola–Kirchhoff stress (9,) of material and damping law at F (9,) and
-        its rate (9,).
-        """
+        """Return P (9,) of material and damping law at F and its rate."""
         part = self.body.parts[0]
         symbols = [ca.SX.sym("F", 9), ca.SX.sym("rate", 9)]
         psi = part.material.psi(ca.reshape(symbols[0], 3, 3), constants[0])
@@ -266,9 +260,7 @@ def _check_derivatives(
 
 
 def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> None:
-    """Require that the compiled force without velocities is minus the gradient of the compiled
-    energy, in one random direction, by central differences.
-    """
+    """Require that the force at rest is minus the gradient of the compiled energy."""
     named = dict(zip(body.constants, theta, strict=True))
     constants = {c.name: named[c.name] for c in body.parts[0].material.constants}
     direction = LARGE_CHANGE_M * check.rng.standard_normal(x.size)
@@ -284,9 +276,7 @@ def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> N
 
 
 def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, theta: Array) -> None:
-    """Require f(Qx, Q(v + ω × x)) = Q f(x, v) for a random rotation Q and spin ω, with γ_m, the
-    last entry of `theta`, set to zero in a copy.
-    """
+    """Require f(Qx, Q(v + ω × x)) = Q f(x, v) for a random Q and ω, without γ_m."""
     constants = theta.copy()
     constants[-1] = 0.0
     Q = Rotation.from_quat(check.rng.standard_normal(4)).as_matrix()
@@ -305,9 +295,7 @@ def _check_objectivity(check: PropertyCheck, body: Body, x: Array, v: Array, the
 
 
 def _check_dissipation(check: PropertyCheck, body: Body, by_velocity: Array) -> None:
-    """Require that no velocity increases the energy: no eigenvalue of the symmetric part of ∂f/∂v
-    `by_velocity` (3n, 3n) is positive beyond rounding.
-    """
+    """Require that no velocity increases the energy beyond rounding."""
     powers = np.linalg.eigvalsh((by_velocity + by_velocity.T) / 2)
     if not powers[-1] <= EXACT * np.abs(powers).max():
         check.fail(

@@ -141,9 +141,7 @@ class EnergyDerivatives:
 
     @cached_property
     def _function(self) -> ca.Function:
-        """Function of F (9,), column after column, at the values of the constants: ψ, P = ∂ψ/∂F and
-        ∂P/∂F by automatic differentiation.
-        """
+        """ψ, P = ∂ψ/∂F and ∂P/∂F of F (9,), differentiated automatically."""
         F = ca.SX.sym("F", 9)
         psi = self.material.psi(ca.reshape(F, 3, 3), ca.SX(ca.DM(self.values)))
         tangent, stress = ca.hessian(psi, F)
@@ -232,9 +230,7 @@ def random_rotation(rng: np.random.Generator) -> Array:
 
 
 def _check_undeformed(check: PropertyCheck, law: EnergyDerivatives) -> None:
-    """Require zero energy and stress at F = I, relative to the largest stiffness, and a stiffness
-    that is positive for every symmetric strain.
-    """
+    """Require zero energy and stress, and a positive stiffness, at F = I."""
     state = law.evaluate(np.eye(3).ravel())
     stiffness = max(float(np.abs(state.tangent).max()), np.finfo(float).tiny)
     zero = np.zeros(9)
@@ -337,9 +333,7 @@ def _check_objectivity(check: PropertyCheck, law: EnergyDerivatives, F: Array, w
 
 
 def _check_messages(check: PropertyCheck, material: Material, values: dict[str, float]) -> None:
-    """Require that a definition of a constant that the energy does not have, and a problem that
-    lacks the value of the last constant, are refused by the name of the constant.
-    """
+    """Require that unknown and missing constants are refused by name."""
     misspelt = f"no_{material.constants[0].name}"
     check.require_refusal(
         lambda: Material.from_energy(material.energy, material.name, Constant(misspelt)),
@@ -356,9 +350,7 @@ def _check_round_trips(
     file: str | Path | None,
     function: str | None,
 ) -> None:
-    """Require the same energies at small strains after pickling and, unless `file` is None, from a
-    problem file that names the energy function in this Python file.
-    """
+    """Require the same energies after pickling and from a problem file."""
     constants = np.array([*values.values()])
     deformations = [
         *deformation_gradients(np.random.default_rng(0), DEFORMATIONS, largest_strain=ROUND_TRIP)

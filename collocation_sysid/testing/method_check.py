@@ -144,9 +144,7 @@ def _check_answer(
 
 
 def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iteration]) -> None:
-    """Require a history that `watch` got line by line, with losses that decrease, and a finite
-    loss.
-    """
+    """Require a watched history with losses that decrease, and a finite loss."""
     if not solution.history:
         check.fail("the history of the solve is empty", 0, expected="at least one line")
     if lines != list(solution.history):
@@ -174,9 +172,7 @@ def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iterati
 
 
 def _check_options(check: PropertyCheck, method: Any) -> None:
-    """Require that wrong options of a method are refused by name, and a round trip through a
-    problem file.
-    """
+    """Require that wrong options are refused by name, and a round trip of right ones."""
     kind = type(method)
     key = f"solver.{method.name}"
     check.require_refusal(

@@ -92,9 +92,7 @@ def check_nuisance(
 
 
 def _with_row(experiment: Experiment, row: Deviation) -> Experiment:
-    """Return the experiment in which the parameter of a row is estimated; the argument is not
-    modified.
-    """
+    """Return the experiment in which the parameter of a row is estimated."""
     nuisance = experiment.nuisance
     if row not in KINDS:
         return replace(experiment, nuisance=replace(nuisance, own=(*nuisance.own, row)))
@@ -103,16 +101,12 @@ def _with_row(experiment: Experiment, row: Deviation) -> Experiment:
 
 
 def _value_count(row: Deviation) -> int:
-    """Return the number of values of one component of a row: the number of its axes, 1 without
-    axes.
-    """
+    """Return the number of axes of a row, 1 without axes."""
     return len(row.axes.split()) or 1
 
 
 def _read(row: Deviation, y: Array, values: Array, t_s: float, data: NuisanceMap) -> Array:
-    """Return the reading (3,) of a row, or the delay (1,) of its clock if it has no reading, by
-    calling its function with numbers.
-    """
+    """Return the reading (3,), or the delay (1,), of a row, called with numbers."""
     argument = ca.DM(values)
     result = (
         row.reading(ca.DM(y), argument, t_s, data)  # type: ignore[arg-type]
@@ -123,9 +117,7 @@ def _read(row: Deviation, y: Array, values: Array, t_s: float, data: NuisanceMap
 
 
 def _check_reading(check: PropertyCheck, row: Deviation, collocation: Collocation) -> None:
-    """Require that zero has no effect, that derivatives are right, and that predicted markers are
-    the reading.
-    """
+    """Require no effect at zero, right derivatives, and predictions by the reading."""
     assert row.reading is not None
     (transcription,) = collocation.transcriptions
     data = transcription.nuisance
@@ -165,9 +157,7 @@ def _check_reading(check: PropertyCheck, row: Deviation, collocation: Collocatio
 
 
 def _marker_residual(collocation: Collocation) -> MarkerResidual:
-    """Return the measurement model of the markers of a small recording, which must have exactly one
-    experiment with markers.
-    """
+    """Return the marker model of a recording with one experiment with markers."""
     (transcription,) = collocation.transcriptions
     (markers,) = (r for r in transcription.residuals if isinstance(r, MarkerResidual))
     return markers
@@ -176,9 +166,7 @@ def _marker_residual(collocation: Collocation) -> MarkerResidual:
 def _check_predicted_reading(
     check: PropertyCheck, row: Deviation, collocation: Collocation
 ) -> None:
-    """Require that predicted markers are the reading of those without the parameter, at every
-    sample.
-    """
+    """Require predicted markers by the reading, at every sample."""
     residual = _marker_residual(collocation)
     data = residual.nuisance
     x = _smooth_motion(collocation)
@@ -264,9 +252,7 @@ def _check_round_trips(
     file: str | Path | None,
     name_in_file: str | None,
 ) -> None:
-    """Require the same effect and prior after pickling and, unless `file` is None, from a problem
-    file that names the row in this Python file.
-    """
+    """Require the same effect and prior after pickling and from a file."""
     y = np.array([0.03, 0.05, 0.02])
     values = (row.sigma or USUAL_SIGMA) * np.linspace(0.3, 0.5, _value_count(row))
     t_s = float(np.mean(data.recorded_s))

@@ -83,9 +83,7 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
 
 
 def _blocks(program: Collocation) -> list[tuple[slice, str]]:
-    """Return the slices of the variables z of a program with lifted variables, each with its
-    meaning for a sentence; a slice may be empty.
-    """
+    """Return the slices of z, each with its meaning; a slice may be empty."""
     return [
         (slice(program.nq), "the parameters"),
         (slice(program.nq, program.phi_columns.start), "the positions"),

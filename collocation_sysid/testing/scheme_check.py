@@ -78,9 +78,7 @@ def check_scheme(scheme: str | Scheme) -> None:
 
 
 def _moment(coefficients: tuple[float, ...], power: int) -> float:
-    """Return Σ_i c_i (−i)^power over all coefficients: the stencil's value of (t / Δt)^power at
-    time zero, i steps back.
-    """
+    """Return Σ_i c_i (−i)^power: the stencil's value of (t / Δt)^power."""
     return sum(c * (-float(i)) ** power for i, c in enumerate(coefficients))
 
 
@@ -184,9 +182,7 @@ class PlainRows:
 
 
 def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
-    """Require that the largest error of a damped oscillator decreases with the stated order, within
-    `ORDER_TOLERANCE`.
-    """
+    """Require that errors of a damped oscillator decrease with the stated order."""
     omega = ANGULAR_FREQUENCY_RAD_S
     errors = []
     for count in STEP_COUNTS:

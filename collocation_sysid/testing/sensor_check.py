@@ -169,9 +169,7 @@ class SensorExpression:
 def _check_derivatives(
     check: PropertyCheck, expression: SensorExpression, u: Array, where: str
 ) -> None:
-    """Compare value and derivatives of the expression in SX at u with the expression called with
-    numbers and its central differences.
-    """
+    """Compare value and derivatives with numbers and central differences."""
     plain = expression.evaluate_plain(u)
     weights = check.rng.standard_normal(len(plain))
     y, jacobian, hessian = (each.full() for each in expression.automatic.call([u, weights]))

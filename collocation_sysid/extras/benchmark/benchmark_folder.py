@@ -130,9 +130,7 @@ def _write_body(
 
 
 def _mesh(experiment: Experiment) -> TetMesh:
-    """Return the mesh of the body of an experiment; for a material test without a mesh a cube of
-    `CUBE_DIVISIONS`, with sides of `CELL_SIZE_M` and a corner at the origin.
-    """
+    """Return the body's mesh; a cube for a material test without one."""
     if experiment.specimen is None:
         return experiment.body.mesh
     return box_mesh((CELL_SIZE_M,) * 3, CUBE_DIVISIONS, origin_m=(0.0, 0.0, 0.0))
@@ -141,9 +139,7 @@ def _mesh(experiment: Experiment) -> TetMesh:
 def _body_content(
     body: BenchmarkBody, entry: Mapping[str, Any], experiment: Experiment, values: dict[str, float]
 ) -> dict[str, Any]:
-    """Return the content of body.json without its "recordings": names, source, licence, law,
-    damping, element, density and constants of a body.
-    """
+    """Return the content of body.json without its "recordings"."""
     modelled = experiment.body
     (part,) = modelled.parts
     (density,) = modelled.densities(modelled.theta_from_values(values))
@@ -168,9 +164,7 @@ def _body_content(
 def _write_recording(
     experiment: Experiment, signals: RecordingSignals, is_held_out: bool, folder: Path
 ) -> dict[str, Any]:
-    """Write the tables of a recording to the existing folder of its body, and return its entry of
-    "recordings" in body.json.
-    """
+    """Write the tables of a recording, and return its entry in body.json."""
     measured = signals.measured
     name = safe_name(experiment.name)
     files = {

@@ -82,9 +82,7 @@ def body_readme(content: Mapping[str, Any]) -> str:
 
 
 def _introduction(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield Markdown paragraphs on the specimen, the note if it is not empty, source and
-    licence.
-    """
+    """Yield specimen, note, source and licence."""
     kind = (
         "Measured data."
         if content["is_measured"]
@@ -129,9 +127,7 @@ def _material(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on the mesh: its files, which homogeneous tests have too,
-    and what it was used for.
-    """
+    """Yield the files of the mesh, which homogeneous tests have too, and their use."""
     yield "## Mesh\n"
     yield "`mesh.vtu`, and the same as tables: `nodes.csv` with the undeformed, stress-free nodes, and"
     yield "`tetrahedra.csv` with the nodes of each tetrahedron. Indices count from 0, in the order of"
@@ -147,9 +143,7 @@ def _mesh(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of the Markdown section on a recording: its task, its files and the format of the
-    prediction.
-    """
+    """Yield task, files and the format of the prediction of a recording."""
     name = recording["file_name"]
     files = recording["files"]
     held_out = (
@@ -176,9 +170,7 @@ def _recording(recording: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
-    """Yield two lines of Markdown on a material test without a mesh: the stretches that are given,
-    and the stresses to be predicted.
-    """
+    """Yield the given stretches, and the stresses to be predicted."""
     yield (
         f"- `{files['stretches']}` has the stretches along x, y and z of each sample. Where a cell is "
         "blank, the stretch is free and the stress along that axis vanishes. Shear is zero."
@@ -190,9 +182,7 @@ def _homogeneous_test(files: Mapping[str, str]) -> Iterator[str]:
 
 
 def _motion(recording: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines of Markdown on gravity, start, air and grasps of a recording of a body with a
-    mesh, and on the forces to be predicted if its "quantity" is "forces".
-    """
+    """Yield gravity, start, air and grasps, and the forces to be predicted if they are."""
     gravity = ", ".join(f"{value:.6g}" for value in recording["gravity_m_s2"])
     yield f"- Gravity: [{gravity}] m/s²."
     if recording["kind"] == "static":

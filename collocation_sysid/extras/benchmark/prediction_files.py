@@ -84,9 +84,7 @@ def read_prediction(file: Path, measured: Signal) -> Signal:
 
 
 def _read_table(file: Path, measured: Signal) -> tuple[Array, Array]:
-    """Return the keys (N,) and the values (N, C) of all rows of a CSV table, with the columns of
-    `measured` in their order; blank lines are skipped, other columns ignored.
-    """
+    """Return keys (N,) and values (N, C) of a CSV table; other columns are ignored."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
             rows = [row for row in csv.reader(lines)]

@@ -166,16 +166,12 @@ def score(recording: StoredRecording, source: str, predicted: Signal) -> Score:
 
 
 def _errors(predicted: Signal, measured: Signal) -> Array:
-    """Return predicted minus measured values (T, C) in the unit of the signals; NaN where nothing
-    was measured.
-    """
+    """Return predicted minus measured values (T, C); NaN where nothing was measured."""
     return predicted.values - measured.values
 
 
 def _distances(errors: Array, measured: Signal) -> Array:
-    """Return the distances (k,) of markers [m], or the magnitudes of the differences of loads, of
-    all samples in one array; those that are NaN are left out.
-    """
+    """Return distances of markers [m], or magnitudes of differences, without NaN."""
     sizes = np.abs(errors)
     if measured.quantity == "markers":
         sizes = np.linalg.norm(errors.reshape(len(errors), -1, len(AXES)), axis=2)

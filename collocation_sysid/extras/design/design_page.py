@@ -70,18 +70,14 @@ def _error_table(design: Design) -> Table:
 
 
 def _percent(share: float) -> str:
-    """Return a relative error `share` as text in percent; empty for NaN, "not determined" from 1000
-    % on.
-    """
+    """Return a relative error in percent; "" for NaN, "not determined" from 1000 % on."""
     if np.isnan(share):
         return ""
     return f"{100 * share:.3g} %" if share < 10 else "not determined"
 
 
 def _column_note(design: Design) -> str:
-    """Return a sentence that says what the columns "before" and "after" of the error bars refer
-    to.
-    """
+    """Return what the columns "before" and "after" refer to."""
     duration = f"{design.experiment.duration_s:.4g} s"
     after = f"after: the designed motion of {duration}"
     if design.added:

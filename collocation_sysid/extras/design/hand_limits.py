@@ -83,9 +83,7 @@ class Limits(Section):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> Limits:
-        """Return the limits, unchanged; raise `ValueError` for corners in the wrong order, or fewer
-        cameras than `cameras_per_marker`.
-        """
+        """Refuse corners in the wrong order, and too few cameras."""
         for key in ("workspace_m", "markers_box_m"):
             corners = getattr(self, key)
             if corners is not None and not (np.array(corners[0]) < corners[1]).all():
@@ -158,9 +156,7 @@ class Limits(Section):
 
 
 def _beyond_cone(camera: CameraSection, points_m: Array) -> Array:
-    """Return the angles (…) [rad] by which points (…, 3) [m] are outside the cone of a camera's
-    field of view; negative inside.
-    """
+    """Return angles [rad] outside of a camera's field of view; negative inside."""
     position_m = np.array(camera.position_m)
     ray = points_m - position_m
     axis = np.array(camera.looks_at_m) - position_m
@@ -218,9 +214,7 @@ class HandBounds:
         return self._translation_shares(course) | self._rotation_shares(course)
 
     def _translation_shares(self, course: TimeDerivatives) -> dict[str, float]:
-        """Return the largest translation, speed and acceleration as shares of their limits, by name
-        of the limit: "workspace_m", "speed_m_s" and "acceleration_m_s2".
-        """
+        """Return extent, speed and acceleration over their limits."""
         shift, rate, curvature = (each[:, :3] for each in course)
         limits = self.limits
         return {
@@ -230,10 +224,7 @@ class HandBounds:
         }
 
     def _rotation_shares(self, course: TimeDerivatives) -> dict[str, float]:
-        """Return the largest rotation, angular speed and angular acceleration as shares of their
-        limits, by name of the limit: "rotation_deg", "angular_speed_deg_s" and
-        "angular_acceleration_deg_s2".
-        """
+        """Return rotation, angular speed and acceleration over their limits."""
         turn, rate, curvature = (each[:, 3:] for each in course)
         velocity, acceleration = angular_motion(turn, rate, curvature=curvature)
         quantities = {
@@ -259,9 +250,7 @@ class HandBounds:
         return motion.scaled(shift, self._rotation_scale(course))
 
     def _rotation_scale(self, course: TimeDerivatives) -> float:
-        """Return the factor, at most 1, of the rotation vectors with which all limits of the
-        rotation are satisfied, by repeated reduction.
-        """
+        """Return the factor ≤ 1 with which all limits of rotation hold."""
         scale = 1.0
         while (largest := max(self._rotation_shares(course.scaled(scale)).values())) > WITHIN:
             scale *= TIGHTER * WITHIN / largest

@@ -168,9 +168,7 @@ class HandMotion:
         )
 
     def _window(self, t: Array) -> TimeDerivatives:
-        """Return the window w (T, 1) at times t (T,) [s] since the start, and its first two
-        derivatives.
-        """
+        """Return the window w (T, 1) at times [s] and two derivatives."""
         rising = t <= self.active_s / 2
         u = np.clip(np.where(rising, t, self.active_s - t) / self.rise_s, 0.0, 1.0)
         slope = np.where(rising, 1.0, -1.0) / self.rise_s
@@ -219,7 +217,5 @@ def _jacobian_factors(angle: Array) -> tuple[Array, ...]:
 
 
 def _to_unit_interval(u: Array | float) -> Array:
-    """Return numbers between 0 and 1, of the same shape, from any numbers: 0.5 from 0, increasing,
-    and nearly uniform for standard normal ones.
-    """
+    """Return numbers in (0, 1), nearly uniform for standard normal ones."""
     return 0.5 * (1 + np.tanh(0.8 * np.asarray(u)))

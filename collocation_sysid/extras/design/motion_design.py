@@ -434,9 +434,7 @@ def _before(objective: MotionObjective, add: bool) -> ErrorBars | None:
 
 
 def _draws_from_recordings(problem: Problem, options: DesignOptions) -> tuple[list[Array], Array]:
-    """Solve the existing recordings; return draws of the parameters q around the estimate, and the
-    information of the recordings.
-    """
+    """Solve the recordings; return draws of q and their information."""
     solution = solve(problem)
     solution.unless_interrupted()
     if not solution.status.converged:

@@ -135,9 +135,7 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
 
 
 def _step_times_s(body: IdentifiedBody) -> Array:
-    """Return the time [s] of each step of the deck: all samples of a static recording (T,), else
-    the first one alone (1,).
-    """
+    """Return the times [s] of the steps: all static samples, else the first."""
     return body.experiment.t_s[: None if body.experiment.is_static else 1]
 
 
@@ -447,9 +445,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
 
 
 def _read_final_state(file: Path, count: int, steps: int) -> tuple[Array | None, Array]:
-    """Return the displacements (n, 3) [m] and obstacle forces (o, 3) [N] at the end of the last
-    step.
-    """
+    """Return displacements (n, 3) and obstacle forces (o, 3) of the last step."""
     if not file.is_file():
         return None, np.zeros((0, 3))
     table = np.full((count, 3), np.nan)

@@ -149,9 +149,7 @@ class TargetCapabilities:
         return [*sentences, *self._load_limitations(body)]
 
     def _load_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield sentences on forces and point masses on nodes that the simulator cannot express, or
-        that change within the recording; none without such loads.
-        """
+        """Yield what of loads on nodes the simulator cannot express."""
         e = body.experiment
         if e.forces and self.node_forces:
             yield self.node_forces

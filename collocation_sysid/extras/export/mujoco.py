@@ -144,9 +144,7 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _geom_attributes(solid: Solid) -> str:
-    """Return the XML attributes of a solid in MuJoCo: type, size, position [m] and rotation in the
-    frame of its obstacle; rounded edges are left out.
-    """
+    """Return type, size, position and rotation of a solid, without rounded edges."""
     shape = Primitive.from_solid(solid)
     turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
     size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
@@ -175,9 +173,7 @@ def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
 
 
 def _node_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the free nodes (not held along all axes), each a body on three slides; the
-    name of the body contains the index of the node from 0: "node0", "node1", …
-    """
+    """Return each free node as a body on three slides, "node0", "node1", …"""
     lines = ""
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):
@@ -228,9 +224,7 @@ def _mean_edge_m(body: IdentifiedBody) -> float:
 
 
 def _keyframe_xml(body: IdentifiedBody) -> str:
-    """Return the XML of the key frame "start", the state at the first sample: poses of the grasps,
-    then displacements of the free nodes, and their velocities.
-    """
+    """Return the key frame "start": poses, displacements and velocities."""
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
     started = body.experiment.initial_velocities_m_s
@@ -243,9 +237,7 @@ def _keyframe_xml(body: IdentifiedBody) -> str:
 
 
 def _stable_step_s(body: IdentifiedBody) -> float:
-    """Return a timestep [s] that divides the sampling interval and keeps the explicit integration
-    stable.
-    """
+    """Return a timestep that divides the interval and keeps integration stable."""
     state = body.body.nodes_m.reshape(1, -1)
     at = body.body.linearise(state, np.zeros_like(state), theta=body.theta)
     stiffness = body.body.pattern.matrix(-at.by_position[0])
@@ -312,9 +304,7 @@ def _import_mujoco() -> ModuleType:
 def _compare_first_frequency(
     body: IdentifiedBody, mujoco: ModuleType, model: Any
 ) -> PredictionComparison:
-    """Return the comparison of the first natural frequency of the undeformed body in MuJoCo and
-    here [Hz], in vacuum and without rigid modes.
-    """
+    """Compare the first frequency [Hz] in vacuum, without rigid modes."""
     data = mujoco.MjData(model)
     free = ~body.is_node_prescribed
     grasps = len(body.experiment.grasps)

@@ -185,9 +185,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
-    """Return shape, size, position and rotation of an obstacle at time `t_s` [s], and its friction,
-    for the JSON file.
-    """
+    """Return shape, size, place and friction of an obstacle for the JSON file."""
     shape = Primitive.from_solid(obstacle.shape)
     place_m, turn = shape.pose_at(obstacle, t_s)
     sizes = shape.size_m if len(shape.size_m) else np.zeros(2)

@@ -79,9 +79,7 @@ class Primitive:
 
 
 def _rotation_of_z_to(axis: Array) -> Rotation:
-    """Return a rotation of the z axis to a vector (3,) of any length above zero; the angle about
-    the vector is arbitrary.
-    """
+    """Return a rotation of the z axis to a vector of any length."""
     return Rotation.align_vectors(axis[None], np.array([[0.0, 0.0, 1.0]]))[0]
 
 
@@ -181,9 +179,7 @@ class Facets:
 
 
 def _unit_normals(corners: Array) -> Array:
-    """Return the unit normals (f, 3) of triangles with corners (f, 3, 3); for a triangle without
-    area NaN, with a RuntimeWarning of NumPy.
-    """
+    """Return unit normals (f, 3) of triangles (f, 3, 3); NaN without area."""
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 

@@ -111,10 +111,7 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
-    """Return the smallest and largest stress [Pa] of all experiments as ends of their common colour
-    scale; 0 and 1 if none is known. Entries of `stresses` are (T, F) arrays, or None; NaN does not
-    count.
-    """
+    """Return the common ends of the colour scale [Pa]; 0 and 1 if none is known."""
     known = [each for each in stresses if each is not None and np.isfinite(each).any()]
     if not known:
         return 0.0, 1.0
@@ -187,9 +184,7 @@ class _Recording:
         self.stream.disconnect()
 
     def _layout(self, replays: Sequence[MotionRecord]) -> Any:
-        """Return the layout of the viewer, a blueprint: the bodies of the experiments beside curves
-        of residuals and parameters and the summary.
-        """
+        """Return the blueprint: bodies beside curves and the summary."""
         views: Any = import_module("rerun.blueprint")
         bodies = [views.Spatial3DView(origin=self._path(e.name), name=e.name) for e in replays]
         curves = [
@@ -204,15 +199,11 @@ class _Recording:
         return views.Blueprint(views.Horizontal(views.Tabs(*bodies), right))
 
     def _path(self, *parts: str) -> str:
-        """Return the path of an entity from its parts, escaped, because names of users may have any
-        characters.
-        """
+        """Return an entity's path from escaped parts: names may have any characters."""
         return self.rr.new_entity_path(list(parts))
 
     def _write_parameters(self, result: Result, span_s: Array) -> None:
-        """Write each parameter of a result with its combined interval, if known, as constant curves
-        between the two times `span_s` [s].
-        """
+        """Write parameters with combined intervals as constant curves."""
         for name, each in result.collect_estimates().items():
             curves = {"value": each.value}
             if each.combined95 is not None:
@@ -265,9 +256,7 @@ class _Recording:
         self._write_forces(replay)
 
     def _up_axis(self, up: Array) -> Any:
-        """Return the viewer's coordinate system whose axis is nearest to a direction (3,), upwards
-        or downwards.
-        """
+        """Return the viewer's axes nearest to a direction (3,)."""
         axis = int(np.abs(up).argmax())
         end = "UP" if up[axis] > 0 else "DOWN"
         return getattr(self.rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{end}")
@@ -314,9 +303,7 @@ class _Recording:
         colour: tuple[int, int, int],
         radius_m: float,
     ) -> None:
-        """Write points at each time; points that are not finite are left out. Nothing is written if
-        none remains.
-        """
+        """Write points at each time that are finite, if any."""
         rr = self.rr
         there = [each[np.isfinite(each).all(axis=1)] for each in points_m]
         if not any(map(len, there)):
@@ -338,9 +325,7 @@ class _Recording:
         self.stream.reset_time()
 
     def _write_residuals(self, replay: MotionRecord) -> None:
-        """Write the distances [mm] of the fitted (or else simulated) markers from the measured
-        ones; without either nothing.
-        """
+        """Write the distances [mm] of fitted or simulated markers."""
         model_m = replay.rolled_out_m if replay.markers_m is None else replay.markers_m
         if model_m is None:
             return
@@ -350,9 +335,7 @@ class _Recording:
             self._write_curve(path, replay.t_s, values=values)
 
     def _write_forces(self, replay: MotionRecord) -> None:
-        """Write each component of forces and torques as measured, fitted and simulated, as far as
-        they are finite; grasps with a sensor are numbered from 1.
-        """
+        """Write forces and torques, measured, fitted and simulated."""
         for number, columns in enumerate(replay.wrenches, 1):
             t_s = columns[:, 0]
             values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
@@ -365,9 +348,7 @@ class _Recording:
                     self._write_curve(path, t_s, values=curve)
 
     def _write_curve(self, path: str, t_s: Array, values: Sequence[float] | Array) -> None:
-        """Write a number `values` (T,) over the times `t_s` (T,) [s] under the entity `path`; times
-        at which it is not finite are left out.
-        """
+        """Write finite values (T,) over times (T,) [s] under `path`."""
         curve = np.asarray(values, dtype=float)
         is_finite = np.isfinite(curve)
         if is_finite.any():
@@ -375,18 +356,14 @@ class _Recording:
             self._send(path, t_s[is_finite], columns=columns, counts=None)
 
     def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
-        """Send columns of the entity `path` at the times `t_s` (T,) [s]; `counts` are the numbers
-        of rows per time, None for one row each.
-        """
+        """Send columns at times (T,); `counts` are rows per time, one by default."""
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)
         self.stream.send_columns(path, times, data)
 
 
 def _polylines(points_m: Array) -> Iterator[Array]:
-    """Yield the lines of points (o, 3) that are separated by rows with a value that is not finite;
-    lines of one point are left out.
-    """
+    """Yield lines separated by rows that are not finite, of two or more points."""
     ends = np.flatnonzero(~np.isfinite(points_m).all(axis=1))
     start = 0
     for end in (*ends, len(points_m)):

@@ -123,9 +123,7 @@ def _tilt_deg(gravity_m_s2: Array) -> float:
 
 
 def _import_usd() -> Any:
-    """Return the modules of usd-core as attributes of one object: `Gf`, `Sdf`, `Usd`, `UsdGeom`,
-    `UsdPhysics`, `UsdShade` and `Vt`.
-    """
+    """Return `Gf`, `Sdf`, `Usd`, `UsdGeom`, `UsdPhysics`, `UsdShade` and `Vt` in one object."""
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
     except ImportError as error:
@@ -174,9 +172,7 @@ def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Arr
 
 
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
-    """Return the mass of each linear tetrahedron [kg] in one array, region after region, from its
-    undeformed volume and the density of its region, without point masses.
-    """
+    """Return the mass of each tetrahedron, region after region, without points."""
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
     pairs = zip(body.regions, volumes, strict=True)
@@ -184,9 +180,7 @@ def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
 
 
 def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
-    """Add the material of a region to the stage under /World/Materials/`name`, in place, and return
-    it.
-    """
+    """Add a region's material under /World/Materials/`name`, and return it."""
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
@@ -209,17 +203,12 @@ def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> 
 
 
 def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
-    """Bind a physics material to a prim, in place; materials bound to its descendants prevail.
-    `pxr` are the modules of `_import_usd`.
-    """
+    """Bind a physics material to a prim; those of descendants prevail."""
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
 
 def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
-    """Set the uniform token attribute `name` of a prim to `text`, in place; `pxr` are the modules
-    of `_import_usd`.
-    """
     kind = pxr.Sdf.ValueTypeNames.Token
     fixed = pxr.Sdf.VariabilityUniform
     prim.CreateAttribute(name, kind, False, fixed).Set(text)
@@ -258,9 +247,7 @@ def _add_gripper(
 
 
 def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
-    """Place a prim at positions (T, 3) [m] and rotations (T) at times (T,) [s]; its default pose is
-    that of the first row.
-    """
+    """Place a prim over times [s]; its default pose is that of the first row."""
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = rotations.as_quat(scalar_first=True)
     place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)

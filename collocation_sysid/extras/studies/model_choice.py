@@ -130,9 +130,7 @@ def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def _pooled_rms(predictions: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the RMS over the samples of all predictions, in their common unit; None if there is no
-    prediction, one of them is missing, or their units differ.
-    """
+    """Return the RMS of all predictions in their common unit, or None."""
     if not predictions or any(each.get("rms") is None for each in predictions):
         return None
     if len({each["unit"] for each in predictions}) > 1:
@@ -155,9 +153,7 @@ def _add_criterion(rows: Sequence[Row]) -> None:
 
 
 def _add_ratios(rows: Sequence[Row]) -> None:
-    """Add "log_ratio", the logarithm of the ratio of its prediction error to the smallest one, and
-    its standard error "log_ratio_error" to each row, in place.
-    """
+    """Add "log_ratio" to the best, and "log_ratio_error", to each row."""
     best = _best_prediction(rows)
     for row in rows:
         row["log_ratio"] = row["log_ratio_error"] = None
@@ -188,9 +184,7 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    """Return the converged model with the smallest prediction error "held_out_rms" for held-out
-    data; None if no converged model has predicted all recordings. `rows` are those of `model_rows`.
-    """
+    """Return the converged model that predicts held-out data best, or None."""
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
@@ -217,9 +211,7 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
 
 
 def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
-    """Return the converged models, in their order, whose prediction error is equal to the best one
-    within `errors` standard errors, or practically equal (`EQUIVALENT_ERROR`).
-    """
+    """Return converged models as good as the best within `errors`, or in practice."""
     return [
         row
         for row in rows
@@ -271,9 +263,7 @@ def bound_sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def _reasons(rows: Sequence[Row], chosen: Row) -> str:
-    """Return in words which model to use, why, and how certain that is, and in which estimates
-    equally good laws disagree, see `advice`.
-    """
+    """Return which model to use, why, how certainly, and where others disagree."""
     others = [row for row in rows if row is not chosen and row["converged"]]
     use = f"Use {chosen['model']}"
     if not others:
@@ -359,9 +349,7 @@ def _ratio_text(ratio: float, error: float) -> str:
 
 
 def _prediction_text(row: Row) -> str:
-    """Return the prediction error "held_out_rms" of a model (a row of `model_rows`), which must not
-    be None, as text with three digits and its unit for display, such as "0.52 mm".
-    """
+    """Return a known prediction error as text, such as "0.52 mm"."""
     factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
@@ -497,9 +485,7 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
 
 
 def _independent_measurements(block: ResidualBlock, process: ErrorProcess) -> float:
-    """Return the equivalent number of independent measurements in one block of residuals, above
-    zero and at most the number of measurements.
-    """
+    """Return the equivalent number of independent measurements."""
     lags = np.arange(1, len(process.autocorrelation))
     in_time = 1 + 2 * float((1 - lags / len(block.t_s)) @ process.autocorrelation[1:])
     is_observed = block.channels[2].any(axis=0)
@@ -567,9 +553,7 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
 
 
 def _complete_record(problem: Problem, method: str) -> dict[str, Any]:
-    """Return the record of a fit to all recordings, with the estimates and the budget that the
-    command solve reports; see `fit_record`.
-    """
+    """Return the record of a fit to all recordings, with budget."""
     began_s = time.perf_counter()
     finished = solve_and_check(problem, method, seek_causes=False)
     solution = finished.solution

@@ -269,25 +269,19 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
 
 
 def _measured_counts(problem: Problem) -> dict[str, int]:
-    """Return how many numbers are measured in each fitted recording, by name, see
-    `measured_count`.
-    """
+    """Return how many numbers each fitted recording has, by name."""
     return {e.name: measured_count(e) for e in problem.experiments if not e.validation}
 
 
 def _measured_text(measured: Mapping[str, int]) -> str:
-    """Return the names of recordings and how many numbers are measured in each as text, for
-    messages: "'swing' (600 numbers) and 'press' (80 numbers)"; empty without recordings.
-    """
+    """Return "'swing' (600 numbers) and 'press' (80 numbers)"."""
     return " and ".join(f"'{name}' ({count} numbers)" for name, count in measured.items())
 
 
 def _require_region(
     body: Mapping[str, Any], region: str | None, branches: bool, path: Path
 ) -> None:
-    """Raise `InputError` for an unknown region, or, if `branches` are compared, for branches in the
-    file that belong to other regions.
-    """
+    """Refuse an unknown region, or branches of other regions in the file."""
     names = [each["name"] for each in body.get("region", [])]
     if region is not None and not names:
         message = f"found the region {region!r}, but the object has no regions; leave out --region"
@@ -385,9 +379,7 @@ def _with_part_material(
 
 
 def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
-    """Return the shear modulus at small strain [Pa] that follows from guesses or fixed values; None
-    if unknown.
-    """
+    """Return the shear modulus [Pa] of guesses or fixed values; None if unknown."""
 
     def guess(name: str) -> float:
         """Return the guess or fixed value of a constant; NaN if it has none."""
@@ -429,9 +421,7 @@ def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
 def _branch_tables(
     own: Sequence[Mapping[str, Any]], count: int, others: set[str], region: str | None
 ) -> list[dict[str, Any]]:
-    """Return the tables of `count` branches: the first ones of the file, followed by new ones if
-    there are fewer.
-    """
+    """Return `count` tables: the first of the file, then new ones."""
     tables = [dict(each) for each in own[:count]]
     used_names = {each["name"] for each in tables} | others
     names = (f"prony_{k}" for k in range(1, count + len(used_names) + 1))
@@ -446,9 +436,7 @@ def _with_memory(
     tables: Sequence[Mapping[str, Any]],
     times_s: tuple[float, float],
 ) -> dict[str, Any]:
-    """Return the parameters with a share and a time constant of each branch; those that the file
-    has are kept.
-    """
+    """Return parameters with share and time of each branch, known ones kept."""
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
     unchanged = {

@@ -164,10 +164,7 @@ def _watch(
 
 
 def _crash_message(code: int, stderr: IO[bytes]) -> str:
-    """Return how a process with this exit code ended (negative for a signal), with the last line of
-    its error output, if there is any. `stderr` is the file with that output, which is read from its
-    start.
-    """
+    """Return how a process ended, with the last line of its error output."""
     cause = killed_by(code) or f"the process ended with code {code}"
     stderr.seek(0)
     lines = stderr.read()[-2000:].decode(errors="replace").split("\n")
@@ -321,9 +318,7 @@ def run_all(
 
 
 def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """Return the record of a run from its finished future; if that raises, a record of a crash,
-    because its worker was lost.
-    """
+    """Return the record of a finished future; a lost worker is a crash."""
     try:
         return future.result()
     except Exception as error:

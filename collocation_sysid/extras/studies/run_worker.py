@@ -79,9 +79,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tip_record(finished: Run) -> dict[str, Any] | None:
-    """Return measured and simulated track of the marker farthest from the grasp in the undeformed
-    body, of the first fitted experiment, for JSON; None without markers.
-    """
+    """Return tracks of the marker farthest from the grasp, for JSON, or None."""
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers
     nodes_m = experiment.body.nodes_m

@@ -222,9 +222,7 @@ def _range_values(key: str, text: str) -> Iterable[str]:
 
 
 def _split_values(text: str) -> list[str]:
-    """Split text at the commas that are outside brackets, braces and quotes; items are stripped,
-    empty ones left out.
-    """
+    """Split at commas outside of brackets, braces and quotes."""
     items = [""]
     open_brackets = 0
     quote = ""

@@ -309,9 +309,7 @@ def report_section(report: StudyReport) -> TitledParts:
 
 
 def _in_words(head: str) -> str:
-    """Return the heading in words for a short heading `head` of the terminal, such as "E [Pa]" for
-    "E Pa"; unchanged if there is none.
-    """
+    """Return a heading in words, such as "E [Pa]" for "E Pa"."""
     if head.startswith("Δ") and head.endswith(" %"):
         return f"error of {head[1:-2]} [%]"
     symbol, space, unit = head.partition(" ")
@@ -495,9 +493,7 @@ def model_views(rows: Sequence[Row]) -> list[Table]:
 def _transposed_view(
     title: str, names: Mapping[str, Cell], cells: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
-    """Return a table with a line for each cell and a column for each row, for many cells and few
-    rows.
-    """
+    """Return a line for each cell and a column for each of few rows."""
     (name,) = names.values()
     lines = tuple((head, *(cell(row) for row in rows)) for head, cell in cells.items())
     return Table(title, ("", *(name(row) for row in rows)), rows=lines)
@@ -525,9 +521,7 @@ def _table_view(
 
 
 def _text_cell(name: str) -> Cell:
-    """Return the cell of the value that rows have under this name: a function of a row that returns
-    the value as text by `str`. The function raises `KeyError` for rows without it.
-    """
+    """Return the cell that shows the value under this name by `str`."""
     return lambda row: str(row[name])
 
 

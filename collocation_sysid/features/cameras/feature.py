@@ -130,9 +130,7 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
 
 
 def _misses_surface(distances: Array) -> bool:
-    """Whether the distances of points from the surface, in standard deviations, are larger than
-    noise; also if none is compared (all NaN).
-    """
+    """Whether distances in σ are larger than noise, or none is compared."""
     compared = distances[np.isfinite(distances)]
     return not len(compared) or root_mean(compared**2) > LARGEST_NOISE
 

@@ -256,9 +256,7 @@ class _ImageComparison:
         self.known: dict[MeasuredPixels, _Fit] = {}
 
     def hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the mistakes whose correction lets the image fit far better; if there is none, a
-        pose that is far off its prior.
-        """
+        """Yield corrections that fit far better, else a pose far off its prior."""
         stated = self.fit(self.stated)
         test = HypothesisTest(
             stated.misfit,

@@ -67,18 +67,13 @@ class CameraDescription:
 
 
 def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
-    """Return a copy of the description with the translation of the camera's pose multiplied by a
-    factor.
-    """
     pose = seeing.pose.copy()
     pose[:3, 3] *= factor
     return replace(seeing, pose=pose)
 
 
 def _rotated(seeing: CameraDescription, rotation: list[list[int]]) -> CameraDescription:
-    """Return a copy of the description with the camera's frame rotated by a matrix (3, 3), about
-    its own axes: the rotation of the pose is multiplied by it on the right.
-    """
+    """Return a copy with the camera's frame rotated about its own axes."""
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3] @ np.array(rotation, dtype=float)
     return replace(seeing, pose=pose)
@@ -286,8 +281,6 @@ class _CameraTrial:
         return []
 
     def _corrected(self, mistakes: tuple[str, ...]) -> CameraDescription:
-        """Return the stated description with some mistakes, keys of `MISTAKES` or `POWERS`,
-        corrected one after the other.
-        """
+        """Return the stated description with mistakes corrected in turn."""
         undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
         return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.declared)

@@ -116,9 +116,7 @@ class _MotionComparison:
         self.rough_m = max(depth.sigma_m, ROUGHLY * self.camera.size_m)
 
     def hypotheses(self, experiment: str) -> Iterator[Hypothesis]:
-        """Yield the mistakes whose correction lets the images fit far better; the argument is the
-        name of the experiment.
-        """
+        """Yield the mistakes whose correction fits far better."""
         misfit_m = self.misfit_m(self.stated)
         if misfit_m <= self.rough_m:
             return
@@ -176,9 +174,7 @@ class _MotionComparison:
         return misfit_m
 
     def _shapes_in_camera(self, described: ImageTimes) -> list[tuple[Array, Array]]:
-        """Return for each image the visible points of the surface [m] and their unit normals,
-        (P, 3) each, in the camera's stated frame.
-        """
+        """Return visible points [m] and normals (P, 3) of each image."""
         rows = np.interp(described.times_s, self.at_s, np.arange(len(self.at_s)))
         rotations, translations_m = self.camera.poses
         shapes = []

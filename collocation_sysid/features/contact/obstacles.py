@@ -108,9 +108,7 @@ def _normal_and_tangential_n(obstacle: Obstacle, forces: ObstacleForces) -> tupl
 def _pulling(
     experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the load of an obstacle has a wrong sign or zero, because it pulls
-    at the body.
-    """
+    """Yield a load of a wrong sign or zero, because the obstacle pulls."""
     limit_n = _noise_n(experiment, forces)
     pushing_n, _ = _normal_and_tangential_n(obstacle, forces)
     if not len(pushing_n):
@@ -183,9 +181,7 @@ def _outside_friction_cone(
 def _undriven_load(
     experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that an obstacle moves, because its load changes although nothing
-    does.
-    """
+    """Yield that an obstacle moves, because its load changes and nothing else does."""
     times_s = forces.t_s
     motions = [part for grasp in experiment.grasps for part in grasp.poses.at(times_s)]
     loads = [experiment.declared_node_forces_n(times_s), experiment.point_mass_at_nodes_kg(times_s)]
@@ -259,11 +255,7 @@ def _load_without_contact(
 
 
 def _smallest_gaps_m(experiment: Experiment, obstacle: Obstacle, times_s: Array) -> Array:
-    """Return the smallest signed distance of the undeformed body in its grasps from an obstacle at
-    times (S,) [s], as (S,) [m].
-
-    Corners, edges and faces of the surface are sampled.
-    """
+    """Return the smallest gaps (S,) [m] of the rigidly moved surface."""
     body = experiment.body
     triangles = body.mesh.surface
     corners = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])

@@ -65,9 +65,7 @@ def as_specimen_concerns(
 
 
 def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
-    """Return the placeholders "laws", "range" and "others": fitted laws, range of the stretches or
-    strains, and laws to compare with.
-    """
+    """Return fitted laws, range of stretches or strains, and laws to compare with."""
     laws = list(
         dict.fromkeys(part.material.name for each in experiments for part in each.body.parts)
     )
@@ -98,9 +96,7 @@ def _changes_volume(experiment: Experiment) -> bool:
 
 
 def _ranges(experiments: Sequence[Experiment]) -> Iterator[str]:
-    """Yield the range of the stretches of all tests but simple shear, and that of the amounts of
-    shear, if there are such tests.
-    """
+    """Yield the range of the stretches, and of the amounts of shear."""
     tests = [each.specimen.test for each in experiments if each.specimen]
     for is_shear, name, offset in ((False, "stretches", 1.0), (True, "amounts of shear", 0.0)):
         values = [

@@ -257,9 +257,7 @@ def _young_text(solution: Solution) -> str:
 def _refit(
     solution: Solution, experiments: Sequence[Experiment], iterations: int
 ) -> Solution | None:
-    """Return the fit of other experiments with the parameters of a solution, from their guess; None
-    if it fails.
-    """
+    """Return the fit of other experiments from a solution's parameters; None on failure."""
     method = ReducedSpace(max_iterations=iterations, tolerance=TOLERANCE)
     try:
         refit = method(replace(solution.collocation, experiments=tuple(experiments)))
@@ -304,18 +302,14 @@ def _is_explained(
 
 
 def _is_correlated(residuals: Array) -> bool:
-    """Return whether consecutive residuals (n,) are more alike than those of noise
-    (`UNCORRELATED`).
-    """
+    """Return whether consecutive residuals (n,) are more alike than noise."""
     squares = float(np.sum(residuals**2))
     products = float(np.sum(residuals[1:] * residuals[:-1]))
     return products > UNCORRELATED / np.sqrt(max(1, len(residuals))) * squares
 
 
 def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
-    """Return a copy of the experiment of a specimen with at most `most_samples` of its samples,
-    evenly chosen by index, without markers and without sensors that have no value there.
-    """
+    """Return a specimen with at most `most_samples` samples, evenly chosen."""
     count = len(experiment.t_s)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
     readings = [
@@ -333,9 +327,7 @@ def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
 
 
 def _initial_slope(experiment: Experiment) -> float:
-    """Return the median of stress over strain [Pa] among the smaller half of the strains, without
-    sign; NaN without a strain.
-    """
+    """Return the median |stress / strain| [Pa] of the smaller strains, or NaN."""
     strain, _ = specimen_strains(experiment)
     stress_pa = experiment.readings[0].measured_values[:, 0]
     is_known = np.isfinite(stress_pa) & (strain != 0)
@@ -346,9 +338,7 @@ def _initial_slope(experiment: Experiment) -> float:
 
 
 def _misfit(parts: Sequence[ExperimentIterate]) -> float:
-    """Return the root of the squares of residuals and nuisance parameters, in standard deviations,
-    per measured value; NaN residuals are ignored.
-    """
+    """Return the RMS of residuals and nuisance parameters in σ, without NaN."""
     count = sum(len(residuals) for part in parts for residuals in _residuals(part))
     return float(np.sqrt(_square_sum(parts) / max(1, count)))
 
@@ -360,9 +350,7 @@ def _square_sum(parts: Sequence[ExperimentIterate]) -> float:
 
 
 def _residuals(part: ExperimentIterate) -> list[Array]:
-    """Return for each component of each sensor its residuals (n,) over sigma, in the order of the
-    samples and without NaN.
-    """
+    """Return residuals (n,) over σ for each component of each sensor, without NaN."""
     rows: list[Array] = []
     for sensor in part.transcription.residuals_of(CustomSensorResidual):
         motion = part.motion_for(sensor.observable)
@@ -373,9 +361,7 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
 
 
 def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Hypothesis]:
-    """Yield each common mistake that is possible for a specimen, untested, with the experiment that
-    corrects it.
-    """
+    """Yield each common mistake that is possible, with its correction, untested."""
     for row in likely_mistakes(experiment, other_slopes_pa):
         if hypothesis := corrected_hypothesis(row, experiment):
             yield hypothesis
@@ -443,9 +429,7 @@ def _of_unit(experiment: Experiment, unit: str) -> Correction:
 
 
 def _of_another_kind(experiment: Experiment, test: str) -> Correction:
-    """Return a copy of the experiment with the same numbers, but those of another kind of test;
-    None if that test cannot have all of them.
-    """
+    """Return the numbers as of another test; None if it cannot have all."""
     assert experiment.specimen is not None
     if experiment.specimen.held or (
         test == "simple-shear" and "stretch" in experiment.specimen.columns
@@ -484,9 +468,7 @@ def _of_another_kind(experiment: Experiment, test: str) -> Correction:
 
 
 def _of_undeformed_gap(experiment: Experiment) -> Correction:
-    """Return a copy of the experiment of a pre-stretched shear test whose amounts of shear are the
-    displacement over the distance before the stretch.
-    """
+    """Return shear amounts over the distance before the stretch."""
     deformation = experiment.specimen
     assert deformation is not None
     if not deformation.held:
@@ -503,9 +485,7 @@ def _of_undeformed_gap(experiment: Experiment) -> Correction:
 
 
 def _without_placeholder(experiment: Experiment, name: str) -> Correction:
-    """Return the experiment without a further measurement whose strains, or stresses, are all
-    exactly zero: it was not measured.
-    """
+    """Return the experiment without a measurement that is all zero."""
     (gauge,) = (each for each in experiment.readings if each.name == name)
     values = gauge.measured_values[np.isfinite(gauge.measured_values)]
     if not (values == (1.0 if name == LATERAL_NAME else 0.0)).all():
@@ -525,9 +505,7 @@ def area_ratios(deformation: HomogeneousDeformation, strain: Array) -> Array | N
 
 
 def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
-    """Return a copy of the experiment with its stresses multiplied by factors (T,); sensors of
-    other quantities or with other samples are unchanged.
-    """
+    """Return the experiment with stresses multiplied by factors (T,)."""
     readings = [
         replace(gauge, values=gauge.measured_values * factors[:, None])
         if gauge.unit == STRESS_UNIT and len(gauge.sample_times_s) == len(factors)
@@ -538,9 +516,7 @@ def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
 
 
 def _strained(experiment: Experiment, factor: float) -> Experiment:
-    """Return a copy of the experiment with its prescribed strains multiplied by a factor; measured
-    values are unchanged.
-    """
+    """Return the experiment with prescribed strains multiplied by a factor."""
 
     def scaled(grasp: Grasp) -> Grasp:
         """Return a grasp with its positions multiplied by the factor."""

@@ -111,9 +111,7 @@ def _stacked(fit: LinearisedFit, offsets: Sequence[int]) -> tuple[Array, Array, 
 
 
 def _remaining_squares(matrix: Array, residual: Array) -> float:
-    """Return the sum of squares of residuals (n,) that no combination of the columns of a matrix
-    (n, p) explains.
-    """
+    """Return the squares (n,) that no combination of columns explains."""
     scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     step = -np.linalg.pinv(matrix / scale) @ residual
     return float(np.sum((residual + (matrix / scale) @ step) ** 2))

@@ -107,9 +107,7 @@ class WrenchDeviation:
         return [*hypotheses, *self._offset_hypotheses(corrected)]
 
     def _other_axes(self) -> tuple[Hypothesis, Array] | None:
-        """Return the hypothesis of a sign or of axes that explains the variation of the wrench, and
-        the wrench (S, 6) so corrected; None if the stated description is about as good.
-        """
+        """Return clearly better signs or axes, and the corrected wrench."""
         stated = self._explained_share(self.measured)
         trials = [(Hypothesis("wrench-sign", self.subject), -self.measured, 0.0)]
         for axes, turned in with_other_axes(self.measured, has_sign=False):
@@ -123,9 +121,7 @@ class WrenchDeviation:
         return replace(trials[best][0], strength=strength), trials[best][1]
 
     def _explained_share(self, values: Array) -> float:
-        """Return the share of the variance of a wrench (S, 6) about its mean that the simulation
-        explains with the best gain that is not negative.
-        """
+        """Return the share of variance explained with the best gain ≥ 0."""
         measured = _centred(values)
         simulated = np.where(np.isfinite(measured), _centred(self.simulated), np.nan)
         products = np.nansum(measured * simulated)
@@ -133,9 +129,7 @@ class WrenchDeviation:
         return float(products**2 / squares) if products > 0 and squares else 0.0
 
     def _offset_hypotheses(self, corrected: Array) -> Iterator[Hypothesis]:
-        """Yield the hypothesis of an offset of a wrench (S, 6) if that is the largest part of its
-        deviation and larger than a usual tare.
-        """
+        """Yield the offset, if it dominates and exceeds a usual tare."""
         difference = corrected - self.simulated
         if not np.isfinite(difference).any():
             return
@@ -212,9 +206,7 @@ def has_inertial_wrenches(experiment: Experiment) -> bool:
 
 
 def _column_means(values: Array) -> Array:
-    """Return the mean (6,) of each column; NaN is ignored, and returned for a column without
-    values.
-    """
+    """Return the mean (6,) without NaN; NaN for a column without values."""
     is_measured = np.isfinite(values)
     counts = is_measured.sum(axis=0)
     sums = np.nansum(values, axis=0)

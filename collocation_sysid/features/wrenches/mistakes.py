@@ -165,9 +165,7 @@ def wrench_mistakes(collocation: Collocation) -> tuple[list[Hypothesis], list[st
 
 
 def _misses(part: ExperimentIterate) -> bool:
-    """Whether the root mean square of the residuals of any wrench sensor of an experiment exceeds
-    `NOISE_LEVEL` standard deviations; false without sensors.
-    """
+    """Whether a wrench sensor's RMS residual exceeds `NOISE_LEVEL` σ."""
     return any(
         float(np.sum(sensor.residuals(observation, part.phi) ** 2))
         > NOISE_LEVEL**2 * sensor.is_compared.reshape(-1, 6).sum()
@@ -176,9 +174,7 @@ def _misses(part: ExperimentIterate) -> bool:
 
 
 def _markers_misfit(part: ExperimentIterate) -> float:
-    """Return the root mean square of the markers' residuals in standard deviations; 0 without
-    samples.
-    """
+    """Return the RMS of the markers' residuals in σ; 0 without samples."""
     ((markers, positions),) = part.residuals_of(MarkerResidual)
     residuals = markers.residuals(positions, part.phi)
     return float(
@@ -191,9 +187,7 @@ def _markers_misfit(part: ExperimentIterate) -> float:
 def _from_markers(
     collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
 ) -> list[ExperimentIterate]:
-    """Return experiments fitted together to their markers alone, with the nuisance parameters of
-    the wrenches at zero.
-    """
+    """Return a fit to markers alone, without nuisance parameters of wrenches."""
     if not transcriptions:
         return []
     without_wrenches = [
@@ -221,9 +215,7 @@ def _with_tools(part: ExperimentIterate, estimated: ExperimentIterate) -> Experi
 
 
 def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
-    """Return the hypotheses for all wrench sensors of experiments fitted to their markers alone,
-    those of each sensor in the order of `_OneSensor.causes`.
-    """
+    """Return the hypotheses for all wrench sensors, fitted to markers alone."""
     hypotheses: list[Hypothesis] = []
     for part in parts:
         forced = part.reactions
@@ -266,9 +258,7 @@ class _OneSensor:
         self._place = self.declared.wrenches.index(sensor.wrench)
 
     def causes(self) -> Iterator[Hypothesis]:
-        """Yield the hypotheses whose correction improves the fit far enough, if the misfit exceeds
-        `NOISE_LEVEL`; if there are none, that of a large tare.
-        """
+        """Yield what improves the fit far enough, else a large tare."""
         accepted: list[Hypothesis] = []
         misfit = self.misfit(self.declared)
         if misfit > NOISE_LEVEL:
@@ -277,9 +267,7 @@ class _OneSensor:
         yield from accepted or self._large_tare()
 
     def _large_tare(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that the mean difference of a component, without any tare, exceeds
-        `LARGEST_TARE` deviations of the tare's prior; nothing without a tare.
-        """
+        """Yield a mean difference beyond `LARGEST_TARE` σ of the tare's prior."""
         tare = self.declared.nuisance.tare
         if not tare:
             return
@@ -392,9 +380,7 @@ class _OneSensor:
         yield Hypothesis("wrench-tare", subject, corrected=free)
 
     def _mistakes(self) -> Iterator[tuple[Deviation, float]]:
-        """Yield each common mistake with the handicap of its hypothesis: signs, frame, axes, units,
-        gains, point and clock.
-        """
+        """Yield each common mistake with the handicap of its hypothesis."""
         wrench = self.sensor.wrench
 
         def mistake(
@@ -463,9 +449,7 @@ def _without_tare(values: Array, tare: float) -> Array:
 
 
 def _slope(measured: Array, predicted: Array) -> float:
-    """Return the factor of the prediction that fits the samples best, by least squares, of either
-    sign; NaN if the prediction is zero. NaN in either is ignored.
-    """
+    """Return the least-squares factor of the prediction; NaN if it is zero."""
     square = float(np.nansum(predicted**2))
     return float(np.nansum(measured * predicted)) / square if square else np.nan
 

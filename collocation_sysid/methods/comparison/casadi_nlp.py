@@ -112,9 +112,7 @@ class CasadiSolver(MethodOptions):
         return settings
 
     def _plugin_settings(self) -> dict[str, Any]:
-        """Return the options of the plugin that follow from those of the method; each subclass
-        defines them.
-        """
+        """Return the plugin's options that follow from the method's."""
         raise NotImplementedError
 
 

@@ -191,9 +191,7 @@ def minimise_cg_descent(
 
 
 def _next_direction(d: Array, previous: Array, g: Array, y: Array, truncation: float) -> Array:
-    """Return the next direction of descent (n,); the steepest descent after a step without positive
-    curvature.
-    """
+    """Return a direction of descent (n,); steepest after a step without curvature."""
     curvature = float(d @ y)
     if curvature <= 0:
         return -g
@@ -214,9 +212,7 @@ def _initial_step(x: Array, f: float, g: Array) -> float:
 
 
 def _initial_step_after(line: _LineSearch, last: float, change: float) -> float:
-    """Return the initial step size of a later line search: I1 (parabola through a sample of the
-    value, which is evaluated) or I2.
-    """
+    """Return the step of a later line search: I1 (parabola) or I2."""
     if change > SMALL_CHANGE * abs(line.value):
         sample_step = SAMPLED * last
         value = line.value_at(sample_step)
@@ -269,9 +265,7 @@ class _AverageValue:
         self.size += (abs(value) - self.size) / self.weight
 
     def note_change(self, change: float) -> None:
-        """Count only the approximate Wolfe conditions from now on if a change of the value is at
-        most `switch` times the average size.
-        """
+        """Keep to the approximate conditions after a change of `switch` C."""
         if change <= self.options.switch * self.size:
             self.approximate = True
 
@@ -367,9 +361,7 @@ class _LineSearch:
             return None
 
     def _try(self, step: float) -> _LineTrial:
-        """Return the trial at a step size, and count it; where the function is not finite its value
-        is infinite and its slope NaN.
-        """
+        """Return and count a trial; infinite value, NaN slope where not finite."""
         if self.trials >= self.options.max_trials:
             raise _TrialsExhausted
         self.trials += 1
@@ -399,11 +391,7 @@ class _LineSearch:
         return is_decreased and not self.approximate
 
     def _bracket(self, step: float) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval (a, b) with a descending end a, of a value up to `limit`, and an
-        ascending end b, from a first step size above zero, rules B0 … B3.
-
-        See `_try` for the exceptions.
-        """
+        """Return a descending end a and an ascending end b, rules B0 … B3."""
         low = self.start
         while True:
             trial = self._try(step)
@@ -415,11 +403,7 @@ class _LineSearch:
             step = EXPANSION * step
 
     def _update(self, a: _LineTrial, b: _LineTrial, step: float) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval within (a, b) with the trial at `step` as one of its ends, rules U0 …
-        U3; (a, b) itself if `step` is outside or NaN.
-
-        See `_try` for the exceptions.
-        """
+        """Return an interval with the trial at `step` as an end, rules U0 … U3."""
         if not a.step < step < b.step:
             return a, b
         trial = self._try(step)
@@ -430,11 +414,7 @@ class _LineSearch:
         return self._cut(a, trial)
 
     def _cut(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval within (a, b) with an ascending end, from a descending trial a with a
-        value up to `limit` and a trial b above it, by bisection, rule U3.
-
-        See `_try` for the exceptions.
-        """
+        """Return an interval with an ascending end by bisection, rule U3."""
         while True:
             trial = self._try((1 - CUT) * a.step + CUT * b.step)
             if trial.slope >= 0:
@@ -445,11 +425,7 @@ class _LineSearch:
                 b = trial
 
     def _double_secant(self, a: _LineTrial, b: _LineTrial) -> tuple[_LineTrial, _LineTrial]:
-        """Return an interval within (a, b) after up to two secant steps, rules S1 … S4; (a, b)
-        itself if the secant step is outside or NaN.
-
-        See `_try` for the exceptions.
-        """
+        """Return an interval after up to two secant steps, rules S1 … S4."""
         step = _secant(a, b)
         low, high = self._update(a, b, step=step)
         if high.step == step:
@@ -460,9 +436,7 @@ class _LineSearch:
 
 
 def _secant(a: _LineTrial, b: _LineTrial) -> float:
-    """Return the step size at which the linear interpolation of the slopes of two trials is zero;
-    NaN if the slopes are equal.
-    """
+    """Return the step at which the interpolated slope is zero; NaN for equal slopes."""
     if a.slope == b.slope:
         return np.nan
     return (a.step * b.slope - b.step * a.slope) / (b.slope - a.slope)

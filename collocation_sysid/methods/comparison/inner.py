@@ -134,12 +134,7 @@ class _ConvergenceCheck:
         self.converged = False
 
     def __call__(self, s: Array) -> bool:
-        """Report the iterate s (free variables,), and return whether its gradient is within the
-        tolerance.
-
-        `converged` and the replacement value of the scaled problem are updated. Exceptions of
-        `report` and of the merit function are not caught.
-        """
+        """Report s (free,); return whether its gradient is within tolerance."""
         z, value, gradient = self.scaled.evaluate_at(s)
         self.scaled.replacement_value = STEEP * abs(value) + 1e-300
         projected = self.scaled.project_gradient(s, z, gradient=gradient)
@@ -208,9 +203,7 @@ class _ScaledMerit:
         self._last: tuple[Array, tuple[Array, float, Array]] | None = None
 
     def to_variables(self, s: Array) -> Array:
-        """Return all variables (variables,) from s (free,); constant ones have their initial
-        values.
-        """
+        """Return all variables from s (free,); constant ones stay."""
         z = self.z.copy()
         free_values = z[self.free] + self.unit * s
         free_values[self.mapped] = self.middle + self.half * np.sin(self._angles(s))
@@ -222,18 +215,13 @@ class _ScaledMerit:
         return self.angle + (self.unit * s)[self.mapped] / (self.half * np.cos(self.angle))
 
     def _slopes(self, s: Array) -> Array:
-        """Return the derivatives (free,) of the free variables by unit · s: those of the sine map
-        for mapped variables, 1 for others.
-        """
+        """Return ∂z/∂(unit · s) (free,): of the sine map, 1 for others."""
         slopes = np.ones(len(s))
         slopes[self.mapped] = np.cos(self._angles(s)) / np.cos(self.angle)
         return slopes
 
     def evaluate_at(self, s: Array) -> tuple[Array, float, Array]:
-        """Return z (variables,), the merit m and ∂m/∂z (variables,) at s (free,); a call with the
-        same s as the last one does not evaluate again. See `MeritFunction.value_and_gradient` for
-        inverted elements and the exceptions.
-        """
+        """Return z, m and ∂m/∂z at s (free,), cached for the last s."""
         if self._last is None or not np.array_equal(self._last[0], s):
             z = self.to_variables(s)
             value, gradient = self.merit.value_and_gradient(z)
@@ -241,23 +229,17 @@ class _ScaledMerit:
         return self._last[1]
 
     def value(self, s: Array) -> float:
-        """Return the merit function m at s (free,), without its gradient; infinite if an element is
-        inverted. See `MeritFunction.value` for the exceptions.
-        """
+        """Return m at s (free,); infinite if an element is inverted."""
         return self.merit.value(self.to_variables(s))
 
     def value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """Return m and ∂m/∂s (free,) at s (free,); infinite and NaN if an element is inverted. See
-        `MeritFunction.value_and_gradient` for the exceptions.
-        """
+        """Return m and ∂m/∂s; infinite and NaN if inverted."""
         _, value, gradient = self.evaluate_at(s)
         scale = self.unit * self._slopes(s)
         return value, gradient[self.free] * scale
 
     def finite_value_and_gradient(self, s: Array) -> tuple[float, Array]:
-        """Return m and ∂m/∂s (free,) at s (free,); `replacement_value` and zeros if the merit is
-        infinite. See `MeritFunction.value_and_gradient` for the exceptions.
-        """
+        """Return m and ∂m/∂s; `replacement_value` and zeros if infinite."""
         value, gradient = self.value_and_gradient(s)
         return (
             (value, gradient) if np.isfinite(value) else (self.replacement_value, np.zeros(len(s)))

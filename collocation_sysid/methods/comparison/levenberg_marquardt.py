@@ -207,9 +207,7 @@ class _QuadraticModel:
     order: list[Index]
 
     def predicted_decrease(self, step: Array) -> float:
-        """Return the decrease of the model, in the unit of the merit, by a step (variables,),
-        without damping; negative if the model increases.
-        """
+        """Return the decrease by a step, without damping."""
         constraint_change = self.jacobian @ step
         curvature = float(step @ (self.hessian @ step)) + self.rho * float(
             constraint_change @ constraint_change
@@ -233,9 +231,7 @@ class _QuadraticModel:
             return self._step(damping)
 
     def _step(self, damping: float) -> Array | None:
-        """Return the step (variables,) of the model with `damping` added to the diagonal, of the
-        positions and of the parameters; None if the matrix is not positive definite.
-        """
+        """Return the step with damping; None if not positive definite."""
         positions = self._positions
         border = self.problem.parameter_indices
         band = self._band.copy("F")
@@ -312,9 +308,7 @@ class _QuadraticModel:
 
     @cached_property
     def _position_block(self) -> sp.coo_array:
-        """Sparse block (free positions, free positions) of the matrix, with both triangles and
-        without damping.
-        """
+        """Block of the free positions, both triangles, without damping."""
         of_x = self._jacobian_blocks[0]
         positions = self._positions
         position_hessian = sp.csr_array(self.hessian)[positions][:, positions]
@@ -353,9 +347,7 @@ class _QuadraticModel:
 
 
 def _narrow_order(square: sp.coo_array) -> Index:
-    """Return an order (n,) of the rows and columns that makes the band of a symmetric sparse matrix
-    (n, n) narrower, as indices of the columns in the new order; the identity if none is found.
-    """
+    """Return an order (n,) that narrows the band of a symmetric matrix, or the identity."""
     order = reverse_cuthill_mckee(sp.csr_array(square), symmetric_mode=True).astype(np.int64)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))

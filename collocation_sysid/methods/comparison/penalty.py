@@ -428,17 +428,13 @@ class _PenaltySolve:
         )
 
     def _record(self) -> None:
-        """Add the last iterate to the history, as variables of the given problem with its loss;
-        exceptions of the recorder's `watch` are not caught.
-        """
+        """Add the last iterate to the history, with the loss of the given problem."""
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
         self.recorder.add_variables(self.iterations, z, loss=nlp.objective(z) / nlp.loss_scale)
 
     def _violation(self) -> ConstraintViolation:
-        """Return the violation at the last iterate: residuals [N] with grasped nodes at their
-        prescribed positions, and constraints without this change.
-        """
+        """Violation with grasped nodes at their goals, and without this change."""
         nlp = self.problem.original
         z = self.problem.to_original(self.variables)
         newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z))

@@ -138,9 +138,7 @@ class DepthCameraModel:
 
     @cached_property
     def _correction(self) -> GeneratedFunction:
-        """Generated function `corrected_expression` of the camera's nuisance parameters; its data
-        are a point and its ray (6,).
-        """
+        """`corrected_expression` of φ; data are a point and its ray (6,)."""
 
         def expression(own: ca.SX, data: ca.SX) -> ca.SX:
             values = self.nuisance.values_by_row(own, self.parameter_indices)

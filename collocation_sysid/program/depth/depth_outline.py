@@ -284,17 +284,13 @@ def outline_points(
 
 
 def _first_of_each_cube(points_m: Array, edge_m: float) -> Index:
-    """Return the indices, ascending, of the first of the points (P, 3) in each cube of a grid with
-    edges of `edge_m` [m].
-    """
+    """Return the first point (P, 3) in each cube of a grid, ascending."""
     _, first = np.unique(np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True)
     return np.sort(first)
 
 
 def _covered(points: Array, triangles: Array) -> NDArray[np.bool_]:
-    """Return the mask (P,) of points (P, 2) of an image that lie within, or on the border of, any
-    of its triangles (T, 3, 2).
-    """
+    """Return which points (P, 2) lie in or on any of their triangles (T, 3, 2)."""
     covered = np.zeros(len(points), dtype=bool)
     if not len(triangles):
         return covered
@@ -323,9 +319,7 @@ def _edges(
     gate_m: float,
     sample: int,
 ) -> dict[str, NDArray]:
-    """Return the planes through the edges in an image that belong to points of an outline, by
-    attribute name of `Outline`, with "faces" (P,) in place of "nodes".
-    """
+    """Return planes through the edges that belong to points of an outline, by attribute."""
     camera = camera_in.depth.camera
     empty = no_depth_is_empty(camera_in, image_m, sample=sample, size_m=camera_in.size_m)
 
@@ -413,9 +407,7 @@ def _nearest_ends(
     shown_at: Callable[[Array], NDArray[np.int64]],
     expected: Array | float = 0.0,
 ) -> Array:
-    """Return the offsets (P,) along the normals of an outline at which the image of the body ends
-    [pixels]; NaN where it does not end.
-    """
+    """Return offsets (P,) [pixels] at which the image of the body ends, or NaN."""
     tangents = np.column_stack([-points.outwards[:, 1], points.outwards[:, 0]])
     start = points.pixels + along_px * tangents
     shown = shown_at(start + offsets[:, None, None] * points.outwards)
@@ -491,7 +483,5 @@ def _planes(
 
 
 def _concatenated_rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
-    """Return the points (P, 3) at depth one on the rays of several sets of pixels (P, 2), one array
-    per set, computed in one call.
-    """
+    """Return points at depth one on the rays of several sets of pixels."""
     return np.split(camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels))

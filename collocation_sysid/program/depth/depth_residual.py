@@ -53,9 +53,7 @@ GROWING = 1.2
 
 
 def _surface_positions(correspondences: SurfaceCorrespondences, times: int) -> PointPositions:
-    """Return the surface nodes of the body at a number of times as an observable, which is stored
-    with the camera's model, because it is the same for all correspondences.
-    """
+    """Return the surface nodes as an observable, stored with the camera's model."""
     stored = correspondences.camera.surface_observables
     if times not in stored:
         body = correspondences.body
@@ -135,9 +133,7 @@ class DepthResidual(CorrespondenceResidual):
 
     @property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions by the numbers of vectors and of data, stored with the
-        camera's model.
-        """
+        """Generated functions by numbers of vectors and of data."""
         return self.correspondences.camera.depth_expressions
 
     @property

@@ -65,16 +65,12 @@ class OutlineResidual(DepthResidual):
 
     @property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions by the numbers of vectors and of data, stored with the
-        camera's model.
-        """
+        """Generated functions by numbers of vectors and of data."""
         return self.correspondences.camera.outline_expressions
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images as for depth, with the width of a pixel [m] as last datum; one
-        where there is no edge.
-        """
+        """As for depth, with the width of a pixel [m] (or one) as last datum."""
         places, data = super()._stencil
         width_m = np.where(
             self.correspondences_in_use.is_compared, self.correspondences_in_use.pixel_m, 1.0

@@ -304,9 +304,7 @@ class SurfaceCorrespondences(Correspondences):
         return gate_m if gate_m <= NARROWER * self.gate_m else self.gate_m
 
     def _expected_distance_m(self, shapes_m: Array, phi: Array) -> float:
-        """Return `SPREAD` times the median distance of the compared points from the surface [m];
-        infinite without any.
-        """
+        """Return `SPREAD` times the median distance, or infinity."""
         distances_m = self.signed_distances_m(shapes_m, phi)
         all_of_them = np.abs(distances_m[np.isfinite(distances_m)])
         return SPREAD * float(np.median(all_of_them)) if len(all_of_them) else np.inf
@@ -415,10 +413,7 @@ def _match_image(
 def _nearest_facing(
     world: Array, surface: VisibleSurface, x: Array, eye_m: Array | None, gate_m: float
 ) -> _NearestPoints:
-    """Return the points near a shape, and the nearest points of faces towards the camera.
-
-    There are none if no face is towards the camera.
-    """
+    """Return the points near a shape and the nearest of faces towards the camera."""
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
     in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))

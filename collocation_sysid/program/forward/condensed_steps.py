@@ -486,9 +486,7 @@ class CondensedSteps:
     def _condensed_at(
         self, start: ForcesOnActiveDofs, now: ForcesOnActiveDofs
     ) -> CondensedStiffness:
-        """Return the condensed matrices at present forces and at the dofs that are active at the
-        start of the step or now.
-        """
+        """Return matrices at dofs active at the start or now."""
         dofs = (
             start.dofs if np.array_equal(now.dofs, start.dofs) else np.union1d(start.dofs, now.dofs)
         )

@@ -115,9 +115,7 @@ def _factorised(
 
 
 def _step_length(correction: Array, by_load: Array, most: float) -> tuple[float, float]:
-    """Return the part of a correction and the growth of the load, at most `most`, whose gradients
-    (points, 3, 3) together are at most `LARGEST_GRADIENT`.
-    """
+    """Return shares of correction and load whose gradients stay in `LARGEST_GRADIENT`."""
     c = (correction**2).sum(axis=(1, 2)) - LARGEST_GRADIENT**2
     if c.max() >= 0:
         return LARGEST_GRADIENT / float(np.linalg.norm(correction, axis=(1, 2)).max()), 0.0

@@ -176,9 +176,7 @@ def find_stability_loss(
 
 
 def _lowest(forces: Forces, x: Array, free: Index, distance_1_s2: float) -> tuple[float, Array]:
-    """Return the eigenvalue λ [1/s²] of K φ = λ M φ that is nearest to a shift at or below zero,
-    the lowest one near the end of a stable path, and φ (free,).
-    """
+    """Return λ [1/s²] of K φ = λ M φ nearest to a shift at or below zero, and φ (free,)."""
     state = x.reshape(1, -1)
     stiffness = -forces.linearise(state, np.zeros_like(state)).by_position[0]
     root = sp.diags_array(1 / np.sqrt(forces.mass.inertia_kg[0, free]))

@@ -199,18 +199,13 @@ class _NewmarkEquations(StepEquations):
         return self.with_prescribed_positions(guess)
 
     def with_prescribed_positions(self, x: Array) -> Array:
-        """Return a copy of positions x (3n,) [m] with the prescribed dofs at their positions at the
-        end of the step.
-        """
+        """Return x [m] with prescribed dofs at the end."""
         moved = x.copy()
         moved[self._prescribed_dofs] = self._prescribed[0]
         return moved
 
     def kinematics(self, x: Array) -> tuple[Array, Array]:
-        """Return velocities [m/s] and accelerations [m/s²], (3n,) each, at the end of the step at
-        positions x (3n,) [m]; the accelerations include those due to local
-        forces.
-        """
+        """Return velocities and accelerations at the end x, with local forces."""
         v = self._slope * x + self._known_v
         a = self._slope**2 * x + self._known_a
         # Finite differences of a grasp's motion ring under this rule; its own motion does not.
@@ -223,23 +218,17 @@ class _NewmarkEquations(StepEquations):
         return x[None], self.kinematics(x)[0][None]
 
     def states(self, x: Array) -> tuple[Array, Array]:
-        """Return the mean position ξ [m] and velocity ν [m/s] of the step, (1, 3n) each, if it ends
-        at x (3n,) [m].
-        """
+        """Return ξ [m] and ν [m/s] of the step, (1, 3n), if it ends at x."""
         before = self._state.x
         return (before + x)[None] / 2, (x - before)[None] / self._step_s
 
     def residual_without_local(self, x: Array) -> Array:
-        """Return the force balance (3n,) [N] without local forces at the end positions x (3n,)
-        [m].
-        """
+        """Return the force balance (3n,) [N] without local forces."""
         v, a = self.kinematics(x)
         return self._forces.total(x, v)[0] - self.mass_kg * a
 
     def linearise_without_local(self, x: Array) -> NewtonLinearisation:
-        """Return the force balance (3n,) [N] without local forces at x (3n,) [m], and its
-        derivative by x.
-        """
+        """Return it with its derivative by x."""
         v, a = self.kinematics(x)
         slope = self._slope
         at = self._forces.linearise(x, v)
@@ -319,27 +308,21 @@ class _Stepper:
         return state
 
     def reactions_and_positions(self, state: _State, dofs: Index) -> tuple[Array, Array]:
-        """Return the reaction forces without local ones on dofs (g,) [N], and their positions (g,)
-        [m].
-        """
+        """Return reactions without local ones [N] and positions [m]."""
         if not len(dofs):
             return np.zeros(0), np.zeros(0)
         reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
         return reaction[dofs], state.x[dofs]
 
     def _force(self, state: _State, load_s: float) -> Array:
-        """Return all forces (3n,) [N] except local ones in a state, under the loads at the time
-        `load_s`.
-        """
+        """Return all forces (3n,) [N] but local ones under the loads at `load_s`."""
         forces = self._forces(load_s)
         for each in state.previous_histories:
             forces = each.insert_at_same_time(forces)
         return forces.without_local_forces().total(state.x, state.v)[0]
 
     def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
-        """Return the forces under the loads at the time `load_s` [s]; local ones are averaged over
-        a step of `step_s` [s], or evaluated at the state if that is zero.
-        """
+        """Return forces at `load_s`; local ones averaged over `step_s` unless zero."""
         return Forces.from_experiment(self.experiment, load_s, theta=self.theta, step_s=step_s)
 
     def _local_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
@@ -367,9 +350,7 @@ class _Stepper:
         )
 
     def _after_release(self, state: _State, goal_s: float) -> _State:
-        """Return the state with new accelerations at dofs that a grasp has released between the
-        state's time and `goal_s`; the same state if there are none.
-        """
+        """Return new accelerations at dofs released before `goal_s`."""
         before = self._solver(state.t_s)
         after = self._solver(goal_s)
         if before is after:
@@ -377,10 +358,7 @@ class _Stepper:
         return self._balanced(state, goal_s, dofs=np.setdiff1d(after.free, before.free))
 
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
-        """Return the state with the accelerations of some dofs (indices) computed from the forces
-        on them, without local forces, under the loads at the time `load_s`; the other accelerations
-        are kept.
-        """
+        """Return accelerations of dofs from the forces at `load_s`, without local ones."""
         acceleration = state.a.copy()
         acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)

@@ -527,9 +527,7 @@ def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
 
 
 def _in_moved_frame(offset: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the expression of force and torque (6,) in a frame that is rotated and translated by
-    an offset.
-    """
+    """Return force and torque (6,) in a frame rotated and moved by an offset."""
     turn, shift = ca.vertsplit(offset, 3)
     axes, force, torque, point = ca.vertsplit(data, [0, 9, 12, 15, 18])
     axes = ca.reshape(axes, 3, 3).T

@@ -97,9 +97,7 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
 
 
 def _header_counts(content: bytes) -> tuple[int, int | None]:
-    """Return the numbers of points and frames in the header; None for the frames if their counter
-    overflowed.
-    """
+    """Return the numbers of points and frames, None if the counter of frames overflowed."""
     start = _BLOCK * (content[0] - 1)
     if len(content) < max(start + 4, _BLOCK):
         raise InputError("the file is truncated: the C3D header is incomplete; export it again")
@@ -128,9 +126,7 @@ def _header_counts(content: bytes) -> tuple[int, int | None]:
 
 
 def _labels(parameters: Mapping[str, NDArray]) -> list[str]:
-    """Return the labels of the points, stripped, in the order of the points; those beyond the 255th
-    are in the parameters LABELS2, LABELS3 …
-    """
+    """Return the stripped labels; those beyond the 255th are in LABELS2, LABELS3 …"""
     keys = [key for key in parameters if key.startswith("LABELS")]
     ordered = sorted(keys, key=lambda key: int(key.removeprefix("LABELS") or 1))
     return [str(label).strip() for key in ordered for label in parameters[key]]

@@ -144,9 +144,7 @@ def decode_image(message: Any) -> Any:
 
 
 def _decode_compressed(kind: str, data: bytes) -> Any:
-    """Return the pixels of a compressed image: counts, or metres for compressed 32FC1, NaN where
-    there is no depth.
-    """
+    """Return pixels: counts, or metres for compressed 32FC1, NaN without depth."""
     packed = "compressedDepth" in kind
     try:
         counts = read_png(BytesIO(data[_PACKED.itemsize :] if packed else data))

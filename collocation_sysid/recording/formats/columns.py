@@ -277,9 +277,7 @@ def _find_columns(
     mapped: Mapping[str, str],
     column_advice: Callable[[TextTable], str] | None = None,
 ) -> dict[str, tuple[int, float]]:
-    """Return index of the column and factor to SI of each quantity that the table has, by the
-    quantity's key; quantities without a column are omitted.
-    """
+    """Return index and factor to SI of each quantity that the table has, by key."""
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
@@ -392,9 +390,7 @@ def find_time(grid: TextTable, measured: Collection[int] = ()) -> tuple[int, flo
 
 
 def _fitting_names(grid: TextTable, quantity: Quantity) -> Mapping[int, str | None]:
-    """Return the unit by index of each column whose name fits a quantity, whatever its unit; None
-    for a column without a unit, 1 if the quantity is `unitless`.
-    """
+    """Return the unit by index of each column whose name fits a quantity; None without."""
     units = {
         k: name_and_unit(column)[1]
         for k, column in enumerate(grid.columns)
@@ -493,9 +489,7 @@ def other_columns_text(grid: TextTable, quantities: Sequence[Quantity] = ()) -> 
 
 
 def _other_word(column: str) -> str:
-    """Return the word of a column's name that makes it another quantity than any that is read; ""
-    without one.
-    """
+    """Return the word that makes a column another quantity than any that is read, or ""."""
     keys = ("other", "difference", "storage", "loss", "modulus")
     words = _words(name_and_unit(column)[0])
     return next((word for key in keys for word in sorted(words & QUALIFIERS[key])), "")
@@ -539,9 +533,7 @@ def _words(name: str) -> set[str]:
 
 
 def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
-    """Check that every column holds a known quantity; see `_columns_error` for `quantities` and
-    `all_of`.
-    """
+    """Check that every column holds a known quantity."""
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
@@ -570,9 +562,7 @@ def _columns_error(
 
 
 def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
-    """Return the error for a column without a unit (`unit` is None), or with a unit of another
-    dimension than `quantity` has.
-    """
+    """Return the error for a column without unit, or with one of another dimension."""
     name = name_and_unit(column)[0] or column
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = (

@@ -79,9 +79,7 @@ class _LazyImages(Sequence[Array]):
         return len(self.messages)
 
     def __getitem__(self, place: Any) -> Any:
-        """Return the image (rows, columns) [m] at an index, not a slice; an `InputError` if it
-        cannot be decoded.
-        """
+        """Return an image (rows, columns) [m], decoded now."""
         with located(self.path):
             return _in_metres(decode_image(self.messages[place]), self.count_m)
 
@@ -178,9 +176,7 @@ def _read_topic(
 
 
 def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
-    """Return topic and first message of the nearest camera_info in a topic's namespace or above;
-    None without it, or if the message is no camera model.
-    """
+    """Return the nearest camera_info in a namespace or above and its message, or None."""
     above = [str(each) for each in PurePosixPath(topic).parents]
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
     if (name := next((each for each in names if each in log.topics), None)) is None:
@@ -237,9 +233,7 @@ def _in_metres(image: Array, count_m: float | None) -> Array:
 
 
 def _require_possible_lengths(values_m: Array) -> None:
-    """Raise an `InputError` if a length [m] is beyond `LARGEST_LENGTH_M` in magnitude, which no
-    camera can have measured; values that are not finite are not compared.
-    """
+    """Refuse lengths beyond `LARGEST_LENGTH_M`; not finite ones pass."""
     largest_m = np.max(np.abs(values_m), initial=0.0, where=np.isfinite(values_m))
     if largest_m > LARGEST_LENGTH_M:
         raise InputError(
@@ -298,9 +292,7 @@ def _read_npz(path: Path) -> DepthFileContent:
 
 @contextmanager
 def _standard_error_silenced() -> Iterator[None]:
-    """Discard what compiled code writes to the standard error of this process in a ``with`` block;
-    do nothing if it is closed.
-    """
+    """Discard what compiled code writes to the standard error of this process."""
     try:
         saved_descriptor = os.dup(2)
     except OSError:  # it is closed
@@ -316,9 +308,7 @@ def _standard_error_silenced() -> Iterator[None]:
 
 
 def _read_exr(path: Path) -> Array:
-    """Read the depths (rows, columns) of an OpenEXR image in its own unit: the channel Z, else R,
-    else Y, else V, else the first.
-    """
+    """Read depths of an OpenEXR image in its unit: channel Z, else R, Y, V, or the first."""
     try:
         library = import_module("OpenEXR")
     except ImportError as missing:
@@ -343,9 +333,7 @@ def _points_from_columns(columns: Mapping[str, Array]) -> Array:
 
 
 def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
-    """Return points (P, 3) with the columns of normals appended (P, 6), or unchanged if there are
-    none.
-    """
+    """Append the columns of normals, if there are any."""
     for names in NORMALS:
         if set(names) <= set(columns):
             return np.column_stack([points, *(columns[name] for name in names)])

@@ -110,9 +110,7 @@ class LogFrames:
         return bool(np.ptp(poses, axis=0).max() <= SAME_POSE)
 
     def _pose_in_root(self, frame: str, path: Iterable[tuple[str, str]]) -> Array:
-        """Return the pose (4, 4) of a frame in the uppermost frame of a path of static edges that
-        leads upwards from it.
-        """
+        """Return the pose (4, 4) in the uppermost frame of a path of static edges."""
         above = {child: parent for parent, child in path}
         pose = np.eye(4)
         while frame in above:

@@ -217,9 +217,7 @@ class _Mcap:
         self._path = path
 
     def __enter__(self) -> Log:
-        """Open the file; return self, with topics and start. Raise an `InputError` if it has no
-        summary.
-        """
+        """Open the file; an `InputError` if it has no summary."""
         from mcap.reader import make_reader
         from mcap_protobuf.decoder import DecoderFactory as Protobuf
         from mcap_ros2.decoder import DecoderFactory as Ros2
@@ -254,9 +252,7 @@ class _Json:
     """Decodes JSON messages of MCAP files."""
 
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
-        """Return the function that decodes a message to objects with attributes; None for another
-        encoding than "json". The schema is not used.
-        """
+        """Return the decoder to objects; None for another encoding than "json"."""
         if message_encoding != "json":
             return None
         return partial(json.loads, object_hook=lambda each: SimpleNamespace(**each))
@@ -276,9 +272,7 @@ class _Dataset:
     names: dict[str, list[str]] = field(default_factory=dict)
 
     def __enter__(self) -> Log:
-        """Read the names of the features; return self. Features that are indices or not numbers,
-        and the timestamp, are no topics.
-        """
+        """Read the features; indices, timestamps and those without numbers are no topics."""
         require_packages("pyarrow")
         info = json.loads((self.path / "meta" / "info.json").read_text(encoding="utf-8"))
         self._episodes = int(info["total_episodes"])

@@ -57,9 +57,7 @@ def read_columns(path: Path) -> Mapping[str, Array]:
 
 
 def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
-    """Return the columns (P,) by name of a file whose first element is `vertex` with numbers only;
-    None for any other.
-    """
+    """Return columns by name if the first element is `vertex` with numbers only."""
     header, end, body = content[:LONGEST_HEADER].partition(b"end_header\n")
     lines = [line.split() for line in header.decode("ascii", "replace").splitlines()]
     lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]

@@ -84,9 +84,7 @@ def _frame(message: Any) -> str:
 
 
 def _require_one_frame(frames: dict[str, set[str]]) -> None:
-    """Raise an `InputError` if points are in different frames; `frames` has the names of the frames
-    of each topic.
-    """
+    """Raise an `InputError` if points are in different frames, by topic."""
     if len(set().union(*frames.values())) <= 1:
         return
     stated = "; ".join(

@@ -52,9 +52,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 
 
 def _has_column_names(row: Row) -> bool:
-    """Return whether a row holds column names instead of numbers: one of its first three cells
-    begins with a letter and is not "nan".
-    """
+    """Return whether one of the first three cells begins with a letter, and is not "nan"."""
     return any(re.match(r"[A-Za-z]", cell) and cell.lower() != "nan" for cell in row.cells[:3])
 
 

@@ -267,9 +267,7 @@ def read_table(text: str) -> TextTable:
 
 
 def _is_unit(cell: str) -> bool:
-    """Return whether a cell may be a unit: blank, in round or square brackets, or a known unit of
-    any dimension.
-    """
+    """Return whether a cell may be a unit: blank, in brackets, or known."""
     bare = cell.strip("()[]")
     bracketed = cell in (f"({bare})", f"[{bare}]")
     return not bare or bracketed or any(si_factor(bare, dimension) for dimension in UNITS)

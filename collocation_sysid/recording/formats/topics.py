@@ -176,9 +176,7 @@ def topic_as_csv(address: TopicAddress) -> bytes:
 
 
 def _marker_frames(log: Log) -> list[str]:
-    """Return the frames in which topics with points are stated, each once, by the first message of
-    each topic.
-    """
+    """Return the frames of topics with points, each once, by their first messages."""
     frames = []
     for name in log.topics:
         for _, message in islice(log.messages(name), 1):
@@ -204,9 +202,7 @@ def frame_of_message(message: Any) -> str:
 
 
 def _describe_topic(log: Log, path: Path, name: str, marker_frames: Iterable[str]) -> LogTopic:
-    """Return the description of a topic from its first messages: type, number of messages, rate,
-    possible uses and the addresses to write for them.
-    """
+    """Return type, count, rate, possible uses and addresses of a topic."""
     kind, count = log.topics[name]
     first = list(islice(log.messages(name), _FIRST))
     span = first[-1][0] - first[0][0] if len(first) > 1 else 0
@@ -250,9 +246,7 @@ def _describe_topic(log: Log, path: Path, name: str, marker_frames: Iterable[str
 
 
 def _possible_uses(columns: set[str], message: Any) -> str:
-    """Return the possible uses of messages as text, from their `columns` of numbers and one
-    example; empty if there are no columns.
-    """
+    """Return the possible uses of messages as text, from columns and an example."""
     if not columns:
         return ""
     if columns == {*POSE}:
@@ -320,9 +314,7 @@ def measurement_time_s(message: Any, recorded_ns: int, start_ns: int) -> float:
 
 
 def _nanoseconds(stamp: Any) -> int:
-    """Return a stamp of seconds and nanoseconds, under any of the usual field names, in
-    nanoseconds; a missing field counts as 0.
-    """
+    """Return a stamp in nanoseconds; a missing field counts as 0."""
     counted = {10**9: ("sec", "seconds", "secs"), 1: ("nanosec", "nsec", "nanos", "nsecs")}
     return sum(
         factor * int(next((getattr(stamp, name) for name in names if hasattr(stamp, name)), 0))
@@ -359,9 +351,7 @@ def _message_values(message: Any, *, by_namespace: bool) -> Row:
 
 
 def _pose_of_message(message: Any) -> tuple[float, ...] | None:
-    """Return position (x, y, z) and quaternion (x, y, z, w) of a message, in the first fields of
-    `_POSES` that it has; None if it has no quaternion.
-    """
+    """Return position and quaternion (x, y, z, w) of a message; None without."""
     for position, rotation in _POSES:
         if hasattr(turned := nested_field(message, rotation), "w"):
             return (*_vector(nested_field(message, position)), *_vector(turned), turned.w)
@@ -384,9 +374,7 @@ def _points_of_message(message: Any, *, by_namespace: bool) -> dict[str, tuple[f
 
 
 def _pixels_of_message(message: Any, *, by_namespace: bool) -> Row:
-    """Return the pixels of the items of the first list, and how sure the tracker is of them, by
-    column; empty if they have none.
-    """
+    """Return pixels of the first list, and how sure the tracker is, by column."""
     row: Row = {}
     for k, item in enumerate(first_list(message)):
         places = (nested_field(item, path) if path else item for path in _PIXELS)
@@ -684,9 +672,7 @@ def frame_path(
 def _poses_from_joints(
     columns: list[str], values: Array, address: TopicAddress, unit: str | None
 ) -> Array:
-    """Return poses (T, 7) of a robot's link from joint positions (T, joints), by its URDF file:
-    position [m], then quaternion (x, y, z, w).
-    """
+    """Return poses (T, 7) of a link from joint positions by the URDF file."""
     require_packages("pytransform3d")
     from pytransform3d.transformations import pq_from_transform
     from pytransform3d.urdf import UrdfTransformManager

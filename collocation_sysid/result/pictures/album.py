@@ -162,9 +162,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
 
 
 def _infinities_as_nan(markers_m: Array | None) -> Array | None:
-    """Return a copy of markers (T, M, 3) with NaN in place of infinities, where a method or
-    simulation diverged; None for None.
-    """
+    """Return markers with NaN in place of infinities, where a method diverged."""
     return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
 
 

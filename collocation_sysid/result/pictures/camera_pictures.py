@@ -149,9 +149,7 @@ def _sentence_figure(text: str) -> Figure:
 
 
 def _new_panels(points: Array, times: Array, rows: int) -> tuple[NDArray[np.object_], float]:
-    """Return panels (rows, times) with the proportions of the points' extent, and the area of a
-    dot.
-    """
+    """Return panels (rows, times) with the points' proportions, and a dot's area."""
     inch = PAGE_MM / MM_PER_INCH
     count = len(times)
     across = min(1 / count, MAX_PANEL_SHARE)

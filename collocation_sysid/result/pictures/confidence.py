@@ -166,9 +166,7 @@ class _DeviationAxis:
 
     @classmethod
     def from_reach(cls, reach: float) -> _DeviationAxis:
-        """Return an axis with round numbers within ± `reach`, a deviation of a logarithm above
-        zero: in percent, or as factors if it is wider than `FACTOR_THRESHOLD`.
-        """
+        """Return an axis in percent, or in factors if it is wide."""
         if reach > FACTOR_THRESHOLD:
             factor = round_length(np.exp(0.9 * reach))
             size = float(np.log(factor))

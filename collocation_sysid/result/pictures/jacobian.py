@@ -98,9 +98,7 @@ def jacobian_sparsity(collocation: Collocation, z: Array) -> Figure:
 
 
 def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array]:
-    """Return the problem of all fitted experiments on their first samples, which contain at least
-    `SHOWN_STEPS` time steps if the recordings do, and its variables.
-    """
+    """Return the fitted experiments on at least `SHOWN_STEPS` time steps, and variables."""
     count = -(-SHOWN_STEPS // collocation.substeps) + SPARE_SAMPLES
     few = [
         shortened_experiment(transcription.experiment, count, shortens_sensors=True)
@@ -117,9 +115,7 @@ def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array
 
 
 def _draw_magnitudes(axes: Axes, matrix: sp.csc_array, norm: LogNorm) -> AxesImage:
-    """Draw the magnitudes of a sparse matrix on a raster no finer than the picture, and return the
-    image.
-    """
+    """Draw a sparse matrix on a raster no finer than the picture."""
     rows, columns = matrix.shape  # type: ignore[misc]
     entries = sp.coo_array(matrix)
     raster = np.full((min(RASTER_SIZE, rows), min(RASTER_SIZE, columns)), -1.0)

@@ -190,9 +190,7 @@ def _are_named_in_front(
 def _write_names(
     axes: Axes, dots: Array, names: Sequence[str], middle: float, edges: tuple[float, float]
 ) -> None:
-    """Write names in the margins, level with their markers but not overlapping, with a line to
-    each.
-    """
+    """Write names in the margins, level with their markers, without overlap."""
     on_left = dots[:, 0] < middle
     for edge, members, align in zip(
         edges, (np.flatnonzero(on_left), np.flatnonzero(~on_left)), ("right", "left"), strict=True

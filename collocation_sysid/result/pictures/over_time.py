@@ -162,9 +162,7 @@ def marker_tracks(
 
 
 def _axes_boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, Box]:
-    """Return the positions of an upper and a lower pair of axes, each as (left, bottom, width,
-    height) in shares of the figure.
-    """
+    """Return upper and lower axes as (left, bottom, width, height) in shares."""
     width = _column_width_mm()
     layout = TRACK_LAYOUT
     x = (layout.first_margin_mm + axis * (width + layout.column_gap_mm)) / PAGE_MM

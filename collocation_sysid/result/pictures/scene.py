@@ -86,9 +86,7 @@ def aspect_ratio(camera: ParallelCamera, points_m: Array) -> float:
 
 
 def _projected_extent(camera: ParallelCamera, points_m: Array) -> tuple[Array, Array]:
-    """Return the lower left and the upper right corner (2,) [m] of points (…, 3) in the picture of
-    a camera; points that are NaN are left out.
-    """
+    """Return the corners (2,) [m] of points in a picture, without NaN."""
     places = camera.project(points_m).reshape(-1, 2)
     return np.nanmin(places, axis=0), np.nanmax(places, axis=0)
 

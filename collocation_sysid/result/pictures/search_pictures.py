@@ -86,9 +86,7 @@ def convergence(
 
 
 def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
-    """Return the ranges of iterations, as slices of `history`, over which the same share of the
-    timesteps was fitted; empty without iterations.
-    """
+    """Return slices of `history` over which the same share was fitted."""
     shares = [iteration.share for iteration in history]
     starts = [k for k in range(len(shares)) if k == 0 or shares[k] != shares[k - 1]]
     return [slice(a, b) for a, b in pairwise([*starts, len(shares)])] if starts else []

@@ -125,8 +125,6 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
 
 
 def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
-    """Return groups of indices of ascending values, in which neighbours are nearer to each other
-    than `gap`; every value is in one group.
-    """
+    """Return groups of indices of ascending values nearer than `gap`."""
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
     return [group for group in np.split(np.arange(len(ascending)), breaks) if len(group)]

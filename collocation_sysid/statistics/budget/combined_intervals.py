@@ -152,7 +152,5 @@ def _clip(bounds: Interval, value: float) -> float:
 
 
 def _interval(at: IntervalCoordinate, low: float, high: float, bounds: Interval) -> Interval:
-    """Return the interval between two coordinates, `low` and `high`, as values clipped to
-    bounds.
-    """
+    """Return the interval between two coordinates, as values clipped to bounds."""
     return _clip(bounds, at.to_value(low)), _clip(bounds, at.to_value(high))

@@ -363,9 +363,7 @@ def propagate_columns(
 
 
 def _without_row_changes(motion: ObservedMotion, inertia_n: Array | float) -> ObservedMotion:
-    """Return the motion with `inertia_n` (N, g, c) [N], or a number, subtracted from the changes of
-    its reaction forces; a motion without reaction forces is returned as it is.
-    """
+    """Return the motion with `inertia_n` (N, g, c) [N] taken from the changes of its reactions."""
     reactions = motion.reactions
     if reactions is None:
         return motion

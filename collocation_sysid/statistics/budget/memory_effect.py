@@ -86,9 +86,7 @@ def memory_forces_n(
 def _with_unit_branches(
     body: Body, theta: Array, relaxation_times_s: Sequence[float]
 ) -> tuple[Body, Array]:
-    """Return the body with a branch of memory for each relaxation time in each part, and its
-    constants, in which the shares are one.
-    """
+    """Return the body with a branch for each relaxation time in each part, and θ with shares 1."""
     count = len(relaxation_times_s)
     branches = tuple(Prony(f"memory_{k}") for k in range(count))
     parts = tuple(replace(part, prony=branches) for part in body.parts)
@@ -103,9 +101,7 @@ def _with_unit_branches(
 
 
 def _overstress_by_time(state: MemoryState, count: int) -> Array:
-    """Return the overstress (count, width) [Pa] of all points for each relaxation time alone, of a
-    body of `_with_unit_branches` with this number of relaxation times.
-    """
+    """Return the overstress (count, width) [Pa] of each relaxation time alone."""
     memory = state.body.memory
     overstress = np.zeros((count, memory.width))
     for number, branch in enumerate(memory.branches):

@@ -194,9 +194,7 @@ def _equivalent_forces(
 
 
 def _sampled_rows(xi: Array, *, is_static: bool) -> Index:
-    """Return those of the evaluations along a motion (N, 3n) [m] between which the motion is linear
-    to the accuracy of e; all of equilibria.
-    """
+    """Return the evaluations between which the motion is linear to the accuracy of e."""
     every = np.arange(len(xi))
     largest_m = np.abs(xi - xi.mean(axis=0)).max()
     for distance in ROW_DISTANCES if not is_static else ():
@@ -216,9 +214,7 @@ def _forces_by_row(dynamics: Dynamics, x: Array, rows: Index) -> Iterator[Forces
 
 
 def _interpolation(body: Body, finer: Body) -> sp.csr_array:
-    """Return the matrix (m, n) of the shape functions of a body at the nodes of its refinement;
-    nodes of obstacle frames, which come last in both, stay.
-    """
+    """Return the shape functions (m, n) of a body at the nodes of its refinement."""
     own = len(body.nodes.points_m)
     count = len(finer.nodes.points_m)
     cell_of_node = np.empty(count, dtype=np.int64)
@@ -239,9 +235,7 @@ def _interpolation(body: Body, finer: Body) -> sp.csr_array:
 
 
 def _given_dofs(by_dof: sp.csr_array) -> tuple[NDArray[np.bool_], Index]:
-    """Return which dofs (3m,) of the finer mesh are dofs of the given mesh, and for each dof of
-    the given mesh (3n,) that of the finer one.
-    """
+    """Return which dofs (3m,) are dofs of the given mesh, and where those (3n,) are."""
     is_given = np.diff(by_dof.indptr) == 1
     entries = by_dof.tocoo()
     given = np.empty(int(entries.col.max()) + 1, dtype=np.int64)

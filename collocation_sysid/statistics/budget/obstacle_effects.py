@@ -116,9 +116,7 @@ def rigid_contact_change_n(experiment: Experiment, dynamics: Dynamics, x: Array)
 
 
 def _contacts_with_energy(forces: Forces) -> list[Contact]:
-    """Return the contact forces with an energy, without those of complementarity; empty without
-    obstacles.
-    """
+    """Return the contact forces with an energy, without those of complementarity."""
     return [
         term
         for term in forces.external_terms

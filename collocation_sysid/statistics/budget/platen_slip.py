@@ -140,9 +140,7 @@ def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
 
 
 def _axis_between_platens(iterate: ExperimentIterate) -> int | None:
-    """Return the axis along which grips press the body; None if there is none, if obstacles touch
-    the body, or if other measurements than loads show the grip.
-    """
+    """Return the axis along which grips press the body; None where they do not, alone."""
     experiment, prescribed = iterate.transcription.experiment, iterate.equations.prescribed
     if experiment.obstacles or not is_load_only(experiment):
         return None
@@ -152,9 +150,7 @@ def _axis_between_platens(iterate: ExperimentIterate) -> int | None:
 def _moved_equilibrium(
     solver: NewtonSolver, equations: tuple[Residual, Linearise], x: Array, goal_m: Array
 ) -> Array | None:
-    """Return the equilibrium (3n,) [m] with the prescribed dofs where `goal_m` (3n,) has them, by
-    as few increments from the equilibrium x (3n,) as lead there; None if none do.
-    """
+    """Equilibrium (3n,) [m] with dofs at `goal_m`, by few increments from x; None without."""
     held = solver.is_prescribed
     for count in STICKING_INCREMENTS:
         state = x
@@ -243,9 +239,7 @@ def _tangential_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> l
 
 
 def _relaxed(stiffness: sp.csc_array, force_n: Array, kept: Index, positions_m: Array) -> Array:
-    """Return the displacements (3n,) [m] that balance forces (3n,) [N] to first order, without the
-    rigid motions that the kept dofs leave free.
-    """
+    """Return displacements (3n,) [m] that balance forces to first order, without rigid motions."""
     moving = np.setdiff1d(np.arange(len(force_n)), kept)
     is_kept: NDArray[np.bool_] = np.zeros(len(force_n), dtype=bool)
     is_kept[kept] = True

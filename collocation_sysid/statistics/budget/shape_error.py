@@ -172,11 +172,7 @@ def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Arra
 
 
 def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> Array:
-    """Return a copy of values (n, m) at the corners in which those inside the surface are replaced
-    by the solution of Laplace's equation on the mesh graph.
-
-    `surface` has the indices of the nodes whose values remain.
-    """
+    """Return values (n, m) with those inside the surface replaced by a solution of Laplace."""
     count = len(nodes.points_m)
     extended = values.copy()
     inside = np.setdiff1d(np.arange(count), surface)
@@ -194,9 +190,7 @@ def _harmonic_extension(nodes: ElementNodes, surface: Index, values: Array) -> A
 
 
 def _extend_to_all_nodes(body: Body, corner_fields: Array) -> Array:
-    """Return fields (m, n, 3) at all nodes from those at the corners (m, corners, 3): mid nodes
-    have the mean of both ends, nodes of obstacle frames zero.
-    """
+    """Return fields (m, n, 3) from corners: means at mid nodes, zero at obstacle frames."""
     fields = np.zeros((len(corner_fields), *body.nodes_m.shape))
     corners = corner_fields.shape[1]
     fields[:, :corners] = corner_fields

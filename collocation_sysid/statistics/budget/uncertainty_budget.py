@@ -493,9 +493,7 @@ def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
 
 
 def _estimate_derivatives(fit: LinearisedFit, parameters: Parameters, q: Array) -> dict[str, Array]:
-    """Return the derivatives (nq,) of each estimate by q, by name: parameters, tied ones and
-    derived moduli; zero for fixed ones.
-    """
+    """Return the derivatives (nq,) of each estimate by q, by name; zero for fixed ones."""
     values = parameters.values(q)
     slopes = {name: np.zeros(len(q)) for name in values}
     for k, item in enumerate(parameters.free):

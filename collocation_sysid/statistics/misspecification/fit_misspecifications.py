@@ -239,9 +239,7 @@ def _refit_hypotheses(
 def _corrected_again(
     hypothesis: Hypothesis, alone: _Refitter, trial: HypothesisTest
 ) -> Iterator[Hypothesis]:
-    """Yield a hypothesis about a sensor, if its correction does not suffice with the correction of
-    another linear step.
-    """
+    """Yield a hypothesis about a sensor, corrected again beside another linear step."""
     refitted = alone.fit(hypothesis.corrected)
     if refitted is not None and (hypothesis.remaining or 0.0) > 1.0:
         again = sensor_hypotheses(refitted, NOISE, declared=alone.declared)
@@ -287,9 +285,7 @@ def _named_alone_or_together(
 
 
 def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return hypotheses as one, as likely as the likeliest, whose message contains theirs in their
-    order; nothing if there are none.
-    """
+    """Return hypotheses as one, as likely as the likeliest, with their messages in order."""
     if not hypotheses:
         return []
     texts = (replace(each, subject="", corrected=None).message for each in hypotheses)
@@ -298,9 +294,7 @@ def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
-    """Yield the direction of gravity that suits the natural modes best, as a hypothesis with the
-    experiment `declared` in it as its correction; nothing if there is no other direction.
-    """
+    """Yield the direction of gravity that suits the natural modes best."""
     others = gravity_hypotheses(comparison.declared)
     nearest = min(others, key=lambda each: comparison.misfit_m(each.corrected), default=None)
     if nearest is not None:
@@ -309,9 +303,7 @@ def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> It
 
 
 def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesis]:
-    """Yield hypotheses, about the subject `of`, of all grasps one layer of elements deeper, and one
-    less deep, where that is possible; `corrected` is the changed experiment.
-    """
+    """Yield all grasps one layer of elements deeper, and one less deep."""
     for deeper, deep in ((True, "more"), (False, "fewer")):
         if (layered := _with_shifted_grasps(declared, deeper)) is not None:
             yield Hypothesis("grasp-layer", of, data={"deep": deep}, corrected=layered)
@@ -405,17 +397,13 @@ class _Refitter:
             self.known[declared] = solution
 
     def fit(self, experiment: Experiment) -> Solution | None:
-        """Return the fit of an experiment; None if there is none, or no sweeps are left. Results
-        are cached.
-        """
+        """Return the fit of an experiment, cached; None if there is none or no sweeps are left."""
         if experiment not in self.known:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
     def discrepancy_after_refit(self, corrected: Experiment | LinearCorrection) -> float | None:
-        """Return the discrepancy after a refit, see `_discrepancy`, or with a linear correction;
-        None if there is no fit.
-        """
+        """Return the discrepancy after a refit or linear correction; None without fit."""
         fitted, share = self._fit_and_share(corrected)
         return None if fitted is None else _discrepancy(fitted) * float(np.sqrt(share))
 
@@ -434,9 +422,7 @@ class _Refitter:
     def _fit_and_share(
         self, corrected: Experiment | LinearCorrection
     ) -> tuple[Solution | None, float]:
-        """Return the fit of a changed experiment; or that of the stated one, with the share of its
-        χ² that a linear correction leaves.
-        """
+        """Return the fit, and the share of its χ² that a linear correction leaves."""
         if isinstance(corrected, LinearCorrection):
             return self.fit(self.declared), corrected.share
         return self.fit(corrected), 1.0
@@ -465,10 +451,7 @@ class _Refitter:
 def _clock_hypotheses(
     alone: _Refitter, declared: Experiment, stated: Solution, of: str
 ) -> Iterator[Hypothesis]:
-    """Yield the clock lag for which residuals and velocities agree best, after a few refits, as one
-    hypothesis; nothing if no lag decreases the misfit, or if it is so small that the fit estimates
-    it already.
-    """
+    """Yield the lag for which residuals and velocities agree best, after a few refits."""
     least = _discrepancy(stated)
     lag_s = 0.0
     shifted = declared

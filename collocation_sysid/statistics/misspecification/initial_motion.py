@@ -119,9 +119,7 @@ def _loads_change(experiment: Experiment) -> bool:
 
 
 def _grasp_motion_m(experiment: Experiment, count: int) -> float:
-    """Return the largest extent of the motion of a point of the body that is moved rigidly with its
-    grasp [m], in the first `count` samples and as much longer as clocks may differ.
-    """
+    """Return the largest extent [m] of a point moved rigidly with its grasp in `count` samples."""
     t_s = experiment.t_s
     prior_s = experiment.nuisance.time_shift_s or 0.0
     end_s = t_s[count - 1] + CLOCK_DEVIATIONS * prior_s
@@ -131,9 +129,7 @@ def _grasp_motion_m(experiment: Experiment, count: int) -> float:
 
 
 def _typical_noise_m(tracks_m: Array) -> Array:
-    """Return the noise of each marker (M,) [m] from the median of the squared third differences of
-    the tracks (T, M, 3) [m]; zero for a marker without any.
-    """
+    """Return each marker's noise (M,) [m] from third differences of tracks (T, M, 3)."""
     squares = np.sum(np.diff(tracks_m, n=3, axis=0) ** 2, axis=2)
     noise_m = np.zeros(tracks_m.shape[1])
     # The median of χ² with three degrees of freedom is 2.37, the mean 3.

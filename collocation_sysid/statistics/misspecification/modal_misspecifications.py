@@ -117,18 +117,14 @@ def _with_stated_frames(experiment: Experiment, hypotheses: list[Hypothesis]) ->
 
 
 def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses of other axes of the tracks that bring them far nearer to the undeformed
-    body moved by its grasps; nothing without samples.
-    """
+    """Yield axes of the tracks that bring them far nearer to the rigidly moved body."""
     markers = experiment.markers
     body = experiment.body
     places_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
     size_m = float(np.linalg.norm(np.ptp(body.mesh.compute_bounds_m(), axis=0)))
 
     def remaining_misfit(tracks_m: Array) -> float:
-        """Return the median distance of tracks (T, M, 3) from the rigid positions [m], with a floor
-        for deformations.
-        """
+        """Return the median distance [m] from the rigid positions, with a floor."""
         distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
         return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
@@ -142,9 +138,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
-    """Yield the tracks (T, M, 3) with their axes in every other order and of either sign, as
-    untested hypotheses about the experiment of a name; the changed tracks are their `corrected`.
-    """
+    """Yield tracks with their axes in every other order and of either sign, untested."""
     for axes, turned in with_other_axes(tracks_m):
         yield Hypothesis(
             "markers-axes", name, data={"axes": axes}, corrected=turned, handicap=ONE_OF_MANY
@@ -274,9 +268,7 @@ class ModalComparison:
         predicted = self.response.predict(self.declared)
 
         def remaining_misfit(tracks_m: Array) -> float:
-            """Return the misfit [m] of tracks (T, M, 3) from the prediction of the best
-            stiffness.
-            """
+            """Return the misfit [m] from the best prediction."""
             turned = replace(self.declared, tracks_m=tracks_m)
             return float(self._misfits_m(turned, predicted).min())
 
@@ -297,10 +289,7 @@ class ModalComparison:
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
 
     def _frame_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield untested hypotheses of a rigid motion before the poses ("gripper-frame"), and of a
-        rigid motion of the tracks ("camera-frame"), each fitted; nothing if the markers' places
-        are collinear.
-        """
+        """Yield fitted rigid motions before the poses and of the tracks, untested."""
         declared = self.declared
         places_m = self.response.places_m
         if not _determines_rotation(places_m):
@@ -323,9 +312,7 @@ class ModalComparison:
         yield Hypothesis("camera-frame", declared.name, corrected=moved_tracks, handicap=FITTED)
 
     def _clock_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the untested hypothesis of that of the `LAGS_S` that fits best; nothing if the
-        recording is too short for all of them.
-        """
+        """Yield that of the `LAGS_S` that fits best, untested."""
         declared = self.declared
         predicted = self.response.predict(declared)
         allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)].tolist()
@@ -338,10 +325,7 @@ class ModalComparison:
             )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that markers have each other's names, by the best assignment of
-        tracks to predictions, if on these markers it fits far better; nothing with fewer than
-        two markers or a marker without samples.
-        """
+        """Yield that markers have each other's names, if that fits far better."""
         declared = self.declared
         names = self.experiment.markers.names
         squares = np.sum(
@@ -368,18 +352,14 @@ class ModalComparison:
 
 
 def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:
-    """Return a copy of the description with the tracks `tracks_m` (T, M, 3) [m] of some markers
-    (indices) only; the others are missing (NaN).
-    """
+    """Return a description in which only some markers (indices) have tracks, `tracks_m`."""
     few_m = np.full_like(tracks_m, np.nan)
     few_m[:, markers] = tracks_m[:, markers]
     return replace(declared, tracks_m=few_m)
 
 
 def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
-    """Return rotation (3, 3) and translation (3,) that map points `from_m` to `to_m`, both (T, M,
-    3) [m], by least squares; points that are NaN in either are ignored.
-    """
+    """Return R (3, 3) and t (3,) from points (T, M, 3) to others by least squares."""
     both = np.isfinite(from_m[..., 0]) & np.isfinite(to_m[..., 0])
     a = from_m[both]
     b = to_m[both]
@@ -388,9 +368,7 @@ def _fit_rigid_motion(from_m: Array, to_m: Array) -> tuple[Array, Array]:
 
 
 def _determines_rotation(places_m: Array) -> bool:
-    """Whether places (M, 3) determine a rotation: at least three, whose second principal extent is
-    above a tenth of the first, so that they are not nearly collinear.
-    """
+    """Whether three or more places (M, 3) are not nearly collinear."""
     if len(places_m) < 3:
         return False
     extents = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
@@ -426,9 +404,7 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 
 
 def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Yield untested hypotheses of inverted poses, inverted rotations and other quaternion
-    orders, each of the poses as they are in the file, before a constant first motion is applied.
-    """
+    """Yield inverted poses, inverted rotations and other quaternion orders, untested."""
     poses = declared.without_first_motion()
     inverse = poses.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, poses.translations_m)

@@ -94,10 +94,7 @@ def with_laws(body: Body, material: Material | None, damping: DampingLaw | None)
 
 
 def _likely_mistakes(body: Body) -> Iterator[Deviation]:
-    """Yield the likely mistakes about a body: its laws and, if it can be made again, its section,
-    its widths, and a mesh that was made under its weight. The name of a row is the code of its
-    hypothesis.
-    """
+    """Yield the likely mistakes about a body; the name of a row is its hypothesis' code."""
     materials = ("", *other_materials(body))
     dampings = ("", *other_dampings(body))
     for laws in [(m, d) for m in materials for d in dampings][1:]:
@@ -128,9 +125,7 @@ def _other_laws(material: str, damping: str) -> Deviation:
 
 
 def _other_width(axis: int) -> Deviation:
-    """Return the row of a body that is wider along an axis of the mesh (index), about the middle of
-    its grasped nodes, as a share of the width.
-    """
+    """Return the row of a body that is wider along an axis, as a share of the width."""
 
     def effect(at: ExperimentAtAnswer, _: int) -> Effect:
         moved_m = np.zeros_like(at.body.nodes_m)
@@ -151,17 +146,13 @@ def _other_width(axis: int) -> Deviation:
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Return the effect of a mesh that was made under the whole weight of the body along one of its
-    axes (index).
-    """
+    """Return the effect of a mesh made under the whole weight along an axis (index)."""
     sag = sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
     return Effect(at.force_change_by_reference(sag))
 
 
 def _stress_free(experiment: Experiment, amplitudes: Array) -> Correction:
-    """Return the experiment with the mesh as made under gravity along a direction; None if the
-    amplitudes are not those of the whole weight.
-    """
+    """Return the experiment with the mesh made under gravity; None unless of the whole weight."""
     share = float(np.linalg.norm(amplitudes))
     if not WHOLE_WEIGHT[0] < share < WHOLE_WEIGHT[1]:
         return None

@@ -132,9 +132,7 @@ def _likely_section(ratio: float) -> str:
 
 
 def _likely_length(body: Body, *, too_large: bool) -> str:
-    """Return, for a message, what to check of a body that is too large, or else too small: the
-    lengths of a generated mesh, or the unit of a file.
-    """
+    """Return what to check of a body that is too large or too small, for a message."""
     if body.mesh.is_generated:
         return "its lengths, which are in metres"
     unit = 'likely "mm"' if too_large else "the mesh may be in metres already"
@@ -142,9 +140,7 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
 
 
 def _likely_density(body: Body, density_kg_m3: float, size_m: float) -> str:
-    """Return, for a message, what is wrong with an implausible density: the unit of the mesh, if a
-    weighed body is too large or too small as well, or else that of the density or mass.
-    """
+    """Return what is wrong with an implausible density, for a message."""
     thin, dense = DENSITIES_KG_M3
     is_low = density_kg_m3 < thin
     if body.has_declared_mass and (size_m > SIZES_M[1] if is_low else size_m < SIZES_M[0]):
@@ -172,9 +168,7 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
 
 def _excess_factor(value: float, limits: tuple[float, float]) -> float:
-    """Return the factor by which a positive value is outside limits (low, high); at most 1
-    inside.
-    """
+    """Return the factor by which a positive value is outside limits; at most 1 inside."""
     return max(limits[0] / value, value / limits[1])
 
 
@@ -216,9 +210,7 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _pushing_axis(grasp: Grasp, shifts_m: Array, frame: Frame) -> str:
-    """Return the world axis along which an obstacle moves most, from its shifts (S, 3) [m]; "" for
-    a grasp, if the obstacle does not move, or if the frame of its force is not the world.
-    """
+    """Return the world axis along which an obstacle moves most; "" for others."""
     moved_m = np.ptp(shifts_m, axis=0)
     if not isinstance(grasp, Obstacle):
         return ""
@@ -251,9 +243,7 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of the largest step of all markers together that the poses do not have,
-    if it is sudden; only samples with all markers are used.
-    """
+    """Yield the largest sudden step of all markers together that the poses do not have."""
     tracks_m = experiment.markers.positions_at_samples_m
     sigma_m = experiment.markers.sigma_m
     complete = np.isfinite(tracks_m).all(axis=(1, 2))
@@ -325,9 +315,7 @@ def _changes(values: Array) -> bool:
 
 
 def _marker_box_m(experiment: Experiment) -> Array:
-    """Return the lowest and the highest corner (2, 3) of the bounding box of the markers' places on
-    the undeformed body [m].
-    """
+    """Return the corners (2, 3) of the bounding box of the markers' places [m]."""
     places = experiment.markers.predict_positions(experiment.body.nodes_m)
     return np.vstack([places.min(axis=0), places.max(axis=0)])
 
@@ -359,9 +347,7 @@ def step_sizes(x: Array, t_s: Array | None = None) -> Array:
 
 
 def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of the largest jump of points `moved_m` (T, m, 3) [m] carried by the
-    poses, if the markers do not follow it; nothing if no marker is measured there.
-    """
+    """Yield the largest jump of points carried by the poses that markers do not follow."""
     sizes = step_sizes(moved_m).max(axis=1)
     k = int(sizes.argmax())
     markers = step_sizes(experiment.markers.positions_at_samples_m)[k]
@@ -375,9 +361,7 @@ def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hy
 
 
 def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each marker that steps alone and stays displaced against the
-    others.
-    """
+    """Yield a hypothesis for each marker that steps alone and stays displaced."""
     markers = experiment.markers
     tracks_m = markers.positions_at_samples_m
     sizes = step_sizes(tracks_m)
@@ -399,9 +383,7 @@ def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 def _step_hypothesis(
     code: str, experiment: Experiment, k: int, size_m: float, usual_m: float, marker: str = ""
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis of a step between samples k + 1 and k + 2 (indices), if it is at least
-    `SUDDEN` times as large as usual; its strength is this ratio.
-    """
+    """Yield a step between samples k + 1 and k + 2 if it is `SUDDEN` times the usual one."""
     data = {"marker": marker, "by_mm": 1e3 * size_m, "t_s": experiment.t_s[k + 2]}
     if size_m >= SUDDEN * usual_m:
         yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=size_m / usual_m)
@@ -426,17 +408,13 @@ def _is_lasting(tracks: Array, marker: int, sample: int, step_m: float) -> bool:
 
 
 def _usual_change(sizes: Array) -> float:
-    """Return the 90 % quantile of changes of any shape, without NaN and the largest three; 0 if
-    there are three or fewer.
-    """
+    """Return the 90 % quantile of changes without NaN and the largest three; 0 if too few."""
     rest = np.sort(sizes[np.isfinite(sizes)])[:-3]
     return float(np.quantile(rest, LIVELY)) if len(rest) else 0.0
 
 
 def _median_second_difference(track_m: Array) -> float:
-    """Return the median norm of the second differences of a track (T, 3) [m], without gaps; 0 if
-    there are none.
-    """
+    """Return the median norm of second differences (T, 3) [m] without gaps, or 0."""
     norms_m = np.linalg.norm(np.diff(track_m, 2, axis=0), axis=1)
     return float(np.median(norms_m[np.isfinite(norms_m)])) if np.isfinite(norms_m).any() else 0.0
 
@@ -480,9 +458,7 @@ def name_exchange_hypotheses(
 
 
 def _marker_identities(experiment: Experiment) -> tuple[Index, float]:
-    """Return the identity of each marker in each sample, and the factor by which exchanged names
-    fit better.
-    """
+    """Return each marker's identity in each sample, and how much better they fit."""
     markers = experiment.markers
     grasp = carrying_grasp(experiment)
     in_grasp_m = np.array(markers.positions_at_samples_m)

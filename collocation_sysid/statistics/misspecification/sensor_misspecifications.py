@@ -145,9 +145,7 @@ def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]
 
 
 def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
-    """Yield the other order or signs of the axes that bring the values nearest to the prediction;
-    nothing if none is clearly nearer.
-    """
+    """Yield the order or signs of the axes that are clearly nearest to the prediction."""
     measured = sensor.measured_values
 
     def misfit(values: Array) -> float:
@@ -190,9 +188,7 @@ def _linear_mistakes(
 
 
 def _linear_step(fit: LinearisedFit, columns: Sequence[Array], own: int) -> tuple[float, Array]:
-    """Return the decrease of χ², and the amplitudes, of changes (S, m) of the residuals of one block
-    (index) that explain the residuals of a fit best.
-    """
+    """Return decrease of χ² and amplitudes of changes (S, m) that explain a block best."""
     blocks = [np.zeros((*each.residual.shape, len(columns))) for each in fit.blocks]
     samples, groups, each = fit.blocks[own].residual.shape
     changes = np.zeros((samples, groups * each, len(columns)))

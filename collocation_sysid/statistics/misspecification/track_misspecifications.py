@@ -121,9 +121,7 @@ def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Ite
 
 
 def _amplitudes(values: Array, interval_s: float) -> tuple[Array, Array]:
-    """Return frequencies (F,) [Hz] and the amplitudes (F,) of values (T, k) at them, 1 for white
-    noise of variance one; the mean and a linear trend are left out.
-    """
+    """Return frequencies (F,) [Hz] and amplitudes of detrended values, 1 for white noise."""
     count = len(values)
     ramp = np.linspace(-1.0, 1.0, count)
     basis = np.column_stack([np.ones(count), ramp])
@@ -135,9 +133,7 @@ def _amplitudes(values: Array, interval_s: float) -> tuple[Array, Array]:
 
 
 def _cutoff(amplitude: Array) -> int | None:
-    """Return the index of the cutoff of a low-pass filter in amplitudes (F,) over σ; None if they
-    are not those of filtered noise.
-    """
+    """Return the index of the cutoff of a low-pass in amplitudes (F,) over σ; None without."""
     count = len(amplitude)
     passed = np.flatnonzero(amplitude >= PASSED)
     if not len(passed) or not 2 < passed[-1] < 2 * count // 5:

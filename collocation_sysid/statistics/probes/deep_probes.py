@@ -106,9 +106,7 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
 
 
 def _window_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield the refits of a third of every recording's time, for each of the three windows with
-    enough measurements.
-    """
+    """Yield the refits of each third of the time with enough measurements."""
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
         blocks = [_restrict(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
@@ -117,9 +115,7 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
 
 
 def _third(block: ResidualBlock, k: int) -> slice:
-    """Return the slice of the samples in third k (index 0, 1 or 2) of a block's samples, by their
-    number; thirds are as equal as rounding allows.
-    """
+    """Return the slice of third k of a block's samples."""
     ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
     return slice(int(ends[k]), int(ends[k + 1]))
 
@@ -133,9 +129,7 @@ def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
 
 
 def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield the refits of single recordings with enough measurements; nothing if there is only one
-    recording.
-    """
+    """Yield the refits of single recordings with enough measurements, if several."""
     if len(blocks_by_recording(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):

@@ -155,10 +155,7 @@ def compute_profile(
 
 
 def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
-    """Return the change of the parameter on its scale at which the loss has risen enough, on the
-    side to which `step` points; None if it has not at the bound, or after `MOST_DOUBLINGS`
-    doublings of the step.
-    """
+    """Return the change at which the loss has risen enough, on the side of `step`, or None."""
     inside = 0.0
     closest = min if step > 0 else max
     for _ in range(MOST_DOUBLINGS):
@@ -176,9 +173,7 @@ def _find_end(rise: Callable[[float], float], step: float, bound: float) -> floa
 def _message(
     parameter: str, interval: tuple[float | None, float | None], bounds: tuple[float, float]
 ) -> str:
-    """Return the message for an interval of a parameter: two limits, one limit, or not
-    identifiable.
-    """
+    """Return the message: two limits, one limit, or not identifiable."""
     lower, upper = interval
     how = "(95 %, profile likelihood)"
     if lower is not None and upper is not None:
@@ -268,16 +263,12 @@ def profile_of_solution(
 
 
 def _loss_of(solution: Solution) -> float:
-    """Return the loss of a solution, Σ ((ŷ − h(x)) / σ)² (shortened by Huber's loss), with
-    priors.
-    """
+    """Return Σ ((ŷ − h(x)) / σ)², shortened by Huber's loss, with priors."""
     return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
 
 
 def _conditional_changes(fit: LinearisedFit, free: Sequence[str], k: int) -> Array:
-    """Return the change (nq,) of the coordinate of each free parameter with that of the parameter
-    with index k, all others fitted; NaN where the fit does not determine it.
-    """
+    """Return the change (nq,) of each parameter with parameter k; NaN if undetermined."""
     covariance = least_squares_of_fit(fit).covariance()[: len(free), k]
     return covariance / covariance[k]
 
@@ -303,9 +294,7 @@ def _prior_loss(item: Parameter, value: float) -> float:
 
 
 def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
-    """Return the variance of the parameter with index k (from 0) over its variance for independent
-    errors of the stated σ; 1 if that ratio is not finite.
-    """
+    """Return parameter k's variance over that for independent errors of the stated σ."""
     size = relative_derivatives(solution.collocation.parameters, solution.q)[k]
     standard_error = size * least_squares_of_fit(fit).standard_errors[k]
     scale = float(uncertainty.covariance[k, k] / standard_error**2)

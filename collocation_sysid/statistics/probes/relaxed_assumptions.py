@@ -143,9 +143,7 @@ class SolvedFit:
 
 
 def _share_of_interval(change: float, interval: tuple[float, float] | None) -> float | None:
-    """Return a change over the half width of an interval (lower, upper), with the sign of the
-    change; None without an interval.
-    """
+    """Return a change over the half width of an interval; None without one."""
     return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
 

@@ -162,10 +162,7 @@ def toeplitz_product(autocorrelation: Array, values: Array) -> Array:
 
 
 def _lagged(columns: Array, is_present: Mask, lag: int) -> Array:
-    """Return D_k times the columns (T, r) of one channel, with D_k the symmetric matrix of ones at
-    the lag k, zero at samples that are not present (T,); for k = 0 the columns themselves, as
-    they are.
-    """
+    """Return D_k columns, D_k symmetric with ones at lag k, zero at samples not present."""
     if lag == 0:
         return columns
     shifted = np.zeros_like(columns)
@@ -335,9 +332,7 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
 
 
 def _channel_correlation_p(fit: LinearisedFit) -> float:
-    """Return the p-value of the Lagrange-multiplier test of Breusch and Pagan (1980) on all pairs
-    of channels within each block that have more than two common samples; 1 without pairs.
-    """
+    """Return the p-value of Breusch and Pagan (1980) for pairs of channels; 1 without."""
     statistic = 0.0
     pairs = 0
     for block in fit.blocks:
@@ -390,9 +385,7 @@ def error_processes(fit: LinearisedFit, information: Information) -> tuple[Error
 
 
 def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order: int) -> Array:
-    """Return the autocovariances (T,) of a block's errors by lag, by an autoregression, at lags
-    beyond given ones; zero at the given ones.
-    """
+    """Return autocovariances (T,) by an autoregression beyond given lags, zero before."""
     coefficients = _autoregression_of(block, autocovariance[: order + 1])
     tail = max(0.0, autocovariance[0]) * process_autocorrelation(coefficients, len(block.t_s))
     tail[: len(autocovariance)] = 0.0
@@ -400,9 +393,7 @@ def _long_lag_autocovariances(block: ResidualBlock, autocovariance: Array, order
 
 
 def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
-    """Return the coefficients of the autoregression of a block's errors, at most `order`, from
-    autocovariances (order + 1,), see `fit_autoregression`.
-    """
+    """Return the autoregression of a block's errors from autocovariances (order + 1,)."""
     residual = block.channels.residual
     present = block.channels.is_measured
     channels = _effective_channels(_channel_covariance(residual, present))
@@ -410,10 +401,7 @@ def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
 
 
 def _mean_sample_count(present: NDArray[np.bool_]) -> float:
-    """Return the mean number of samples of the channels that have any; 0 if none has.
-
-    `present` (T, 3M) is whether each channel is measured in each sample.
-    """
+    """Return the mean number of samples of channels that have any; `present` (T, 3M)."""
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 
@@ -468,9 +456,7 @@ def _error_process(block: ResidualBlock, slope: Array, autocovariance: Array) ->
 
 
 def _effective_channels(covariance: Array) -> float:
-    """Return the number of equal independent channels whose mean variance would be known as
-    precisely, (tr Σ)² / tr Σ², for a covariance Σ (c, c); 1 if it is zero.
-    """
+    """Return (tr Σ)² / tr Σ², the equal independent channels of Σ (c, c); 1 for zero."""
     squares = float(np.sum(covariance**2))
     return float(np.trace(covariance)) ** 2 / squares if squares > 0 else 1.0
 

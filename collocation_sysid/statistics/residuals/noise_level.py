@@ -174,10 +174,7 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
 
 
 def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
-    """Return the covariance (r, r) of the score due to a block whose noise is at least as stated.
-
-    It is DᵀD times the mean square of the residuals per degree of freedom, but at least once.
-    """
+    """Return DᵀD (r, r) times the mean square of residuals, at least once."""
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
     degrees_of_freedom = max(1.0, block.count_measurements() - float(np.trace(share)))
@@ -290,9 +287,7 @@ def _solve_noise_level(
 
 
 def _bartlett(squares: Array, freedoms: Array) -> float:
-    """Return the p-value of Bartlett's test of equal variances, from sums of squares (G,) and
-    degrees of freedom (G,); 1 for fewer than two groups.
-    """
+    """Return the p-value of Bartlett's test of equal variances; 1 for fewer than two groups."""
     used = (freedoms >= 1) & (squares > 0)
     count = int(used.sum())
     each = freedoms[used]

@@ -190,9 +190,7 @@ def compare_recordings(
 
 
 def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
-    """Return `RecordingComparison.sensitivities` (p, nq n) for n recordings; zero for parameters at
-    a bound, and for those without variance between recordings.
-    """
+    """Return `RecordingComparison.sensitivities` (p, nq n)."""
     own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
     each = np.array([o.compute_information() for o in own])
     scores = np.array([o.compute_score() for o in own])

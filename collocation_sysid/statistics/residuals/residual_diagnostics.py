@@ -96,9 +96,7 @@ def diagnose_markers(fit: LinearisedFit) -> tuple[MarkerDiagnosis, ...]:
 
 
 def _estimated_kinds(fit: LinearisedFit, block: ResidualBlock) -> tuple[bool, bool]:
-    """Return whether marker offsets, and a time shift, of the block's experiment are among the
-    parameters of the fit.
-    """
+    """Return whether marker offsets, and a time shift, of the block are estimated."""
     kinds = [name.removeprefix(f"{block.name}: ") for name in fit.names[fit.shared_count :]]
     return any(k.startswith("offset") for k in kinds), any(k.startswith("time") for k in kinds)
 
@@ -156,9 +154,7 @@ def _diagnose_marker(
 
 
 def _rms_m(block: ResidualBlock, marker: int) -> float:
-    """Return the root mean square distance of a marker (index) with a sample from its measurements
-    [m], including outliers at their full distance.
-    """
+    """Return the RMS distance [m] of a marker from its measurements, outliers included."""
     misfit = block.residual if block.misfit is None else block.misfit
     squares = np.sum(misfit[:, marker] ** 2) / block.is_present[:, marker].sum()
     return float(block.sigma_m[marker] * np.sqrt(squares))
@@ -252,9 +248,7 @@ def _message(
 
 
 def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
-    """Return the description of uncorrelated residuals by their size compared with σ; a few samples
-    may differ by chance.
-    """
+    """Return the description of uncorrelated residuals by their size over σ."""
     factor = diagnosis.noise_factor
     chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * diagnosis.samples)
     if factor > max(LARGEST_AGREEING_RATIO, 1 + chance):
@@ -265,9 +259,7 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
 
 
 def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
-    """Return the description of oscillating residuals: a slow drift for fewer than `FEWEST_PERIODS`
-    periods, else the frequency, compared with that of the motion.
-    """
+    """Return a slow drift, or the frequency compared with that of the motion."""
     share = f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
