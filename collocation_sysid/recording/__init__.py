@@ -4,9 +4,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 
 - `grasp`, `poses`, `measured_wrench`: prescribed displacements, the rigid motions that prescribe
   them, and measured reaction forces.
-- `obstacle`, `obstacle_solids`, `solid_sections`: rigid obstacles, their shapes, and the tables
-  that
-  state them.
+- `obstacle`, `obstacle_solids`: rigid obstacles, their shapes, and the tables that state them.
 - `loads`, `tendon`, `pressure`, `actuator`: point masses, forces, tendons and pressures.
 - `markers`, `placement`: tracked markers and where they sit on the body.
 - `camera`: lenses and poses of cameras; `depth_camera`: depth cameras and scanners.

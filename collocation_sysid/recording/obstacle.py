@@ -22,9 +22,8 @@ from ..fem.meshes.selection import Selection
 from ..fem.pattern import SymmetricPattern
 from .grasp import Grasp, unconverted_poses
 from .node_selection import Nodes, selection_from_section
-from .obstacle_solids import KINDS, Solid, orthogonal_axes
+from .obstacle_solids import KINDS, Solid, SolidSection, orthogonal_axes, solid_from_section
 from .poses import PoseSequence
-from .solid_sections import SolidSection, solid_from_section
 
 if TYPE_CHECKING:
     from ..fem.body import Body

@@ -12,8 +12,7 @@ from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.model.parameters import PARAMETER_KEYS
 from collocation_sysid.problem import recording_schema, schema
 from collocation_sysid.problem.problem_options import RolloutOptions, UncertaintyOptions
-from collocation_sysid.recording import solid_sections
-from collocation_sysid.recording.obstacle_solids import KINDS
+from collocation_sysid.recording.obstacle_solids import KINDS, SolidSection
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 LOADS = [
@@ -37,9 +36,9 @@ def test_a_table_states_a_file_or_a_constant(section: type[Section]):
 
 
 def test_solids_have_the_keys_of_the_table():
-    assert set(KINDS) == set(solid_sections.SolidSection.model_fields)
+    assert set(KINDS) == set(SolidSection.model_fields)
     for name, kind in KINDS.items():
-        form = solid_sections.SolidSection.model_fields[name].annotation
+        form = SolidSection.model_fields[name].annotation
         assert get_args(form)[0].of is kind
 
 
