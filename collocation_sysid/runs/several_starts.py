@@ -9,7 +9,7 @@ known, and the solution with the lowest loss counts.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,17 +26,6 @@ SAME_LOSS = 10.0
 # and need not continue.
 SAME_PARAMETERS = 0.01
 Solve = Callable[[Method, Collocation], Solution]
-
-
-@dataclass(frozen=True, eq=False)
-class CompletedStart:
-    """Start of a search after several starts of a scan were followed to convergence."""
-
-    collocation: Collocation  # with the parameters of the best start as guess
-    scan: Scan  # the same scan with that start as its best
-    # Solution from there; None if it was found by another method than the one asked for.
-    solution: Solution | None
-    note: str  # comparison of the losses, for people; empty if there was one start only
 
 
 def has_local_minima(collocation: Collocation) -> bool:
@@ -115,7 +104,7 @@ def _is_at(line: Iteration, solution: Solution) -> bool:
 
 def follow_starts(
     solver: Method, collocation: Collocation, scan: Scan, solve: Solve
-) -> CompletedStart:
+) -> tuple[Collocation, Scan, Solution | None, str]:
     """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
     The best start of the scan is returned without a solution if the scan found only one start, if
@@ -137,11 +126,12 @@ def follow_starts(
 
     Returns
     -------
-    CompletedStart
-        The best start, with the solution from there if the method is reduced space, and a note
-        on the losses. Its collocation is not associated with the body at the new guess.
+    (collocation, scan, solution, note)
+        Program with the best start as guess, not associated with the body there, the scan with this
+        start as its best, the solution from there if the method is reduced space, and a note on the
+        losses.
     """
-    first = CompletedStart(collocation, scan, solution=None, note="")
+    first = collocation, scan, None, ""
     if not scan.others or not has_local_minima(collocation):
         return first
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
@@ -157,7 +147,7 @@ def follow_starts(
             candidates.append((robust_loss(known.solution), number, known.solution))
             continue
         if solution.status is Status.INTERRUPTED:
-            return first if not is_own else replace(first, solution=solution)
+            return collocation, scan, solution if is_own else None, ""
         if solution.status.converged:
             candidates.append((robust_loss(solution), number, solution))
     if not candidates:
@@ -174,4 +164,4 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = collocation.with_parameters(scan.starts[best])
-    return CompletedStart(started, chosen, solution=solution if is_own else None, note=note)
+    return started, chosen, solution if is_own else None, note

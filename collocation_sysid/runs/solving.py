@@ -365,17 +365,14 @@ def _solve_once(
         solution = None
         comparison = ""
         if scan is not None:
-            scanned = follow_starts(
+            collocation, scan, solution, comparison = follow_starts(
                 solver,
                 collocation,
                 scan=scan,
                 solve=partial(solve_with_renewed_correspondences, watch=watch),
             )
-            scan = scanned.scan
-            solution = scanned.solution
-            comparison = scanned.note
             if solution is None:
-                collocation = associated_at_guess(scanned.collocation)
+                collocation = associated_at_guess(collocation)
         if solution is None:
             solution = solve_with_renewed_correspondences(
                 solver, collocation, watch=watch, start=variables

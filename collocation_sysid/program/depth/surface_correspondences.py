@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -337,14 +337,6 @@ def _aligned_parameters(camera: DepthCameraModel, body: Body, shapes_m: Array, p
     return phi if errors.max(initial=0.0) > FARTHEST else moved
 
 
-class _NearestPoints(NamedTuple):
-    """Points of a cloud, and the points of a surface nearest to them."""
-
-    indices: Index  # (k,): indices of the points in the cloud
-    faces: Index  # (k,): face of each nearest point
-    barycentric: Array  # (k, 3): its barycentric coordinates on the face
-
-
 def _match_image(
     camera: DepthCameraModel,
     surface: VisibleSurface,
@@ -360,10 +352,8 @@ def _match_image(
     cloud = camera.depth.clouds[sample]
     world = camera.world_points(phi, sample)
     eye_m = camera.eye_m(phi, sample)
-    nearest = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
-    indices = nearest.indices
-    faces = nearest.faces
-    weights, feet, normals = surface.evaluate(x, faces, barycentric=nearest.barycentric)
+    indices, faces, barycentric = _nearest_facing(world, surface, x=x, eye_m=eye_m, gate_m=gate_m)
+    weights, feet, normals = surface.evaluate(x, faces, barycentric=barycentric)
     ways = normals if eye_m is None else eye_m - feet
     is_frontal = np.sum(normals * ways, axis=1) >= GRAZING * np.linalg.norm(ways, axis=1)
     offsets = world[indices] - feet
@@ -412,13 +402,14 @@ def _match_image(
 
 def _nearest_facing(
     world: Array, surface: VisibleSurface, x: Array, eye_m: Array | None, gate_m: float
-) -> _NearestPoints:
-    """Return the points near a shape and the nearest of faces towards the camera."""
+) -> tuple[Index, Index, Array]:
+    """Return indices (k,) of the points near a shape, and face (k,) and barycentric coordinates
+    (k, 3) of the nearest points of faces towards the camera.
+    """
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
     in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))
     facing = np.flatnonzero(surface.is_facing(x, eye_m))
     if not len(facing) or not len(in_box):
-        return _NearestPoints(in_box[:0], in_box[:0], barycentric=np.zeros((0, 3)))
-    faces, barycentric = surface.nearest_points(x, world[in_box], candidates=facing)
-    return _NearestPoints(in_box, faces, barycentric=barycentric)
+        return in_box[:0], in_box[:0], np.zeros((0, 3))
+    return in_box, *surface.nearest_points(x, world[in_box], candidates=facing)
