@@ -97,7 +97,7 @@ class EliminatedDofs:
         phi = complete.phi_columns.start - complete.nq + moving
         return cls(
             transcription,
-            transcription.offsets.position + dofs,
+            transcription.offsets.variable + dofs,
             rows=transcription.offsets.row + rows,
             phi=phi,
         )
@@ -109,7 +109,7 @@ class EliminatedDofs:
         transcription = self.transcription
         prescribed = self.transcription.prescribed_motion.evaluate_at(phi)
         time, dof = np.divmod(
-            self.variables - transcription.offsets.position, transcription.dof_count
+            self.variables - transcription.offsets.variable, transcription.dof_count
         )
         indices = time, np.searchsorted(prescribed.dofs, dof)
         return prescribed.positions_m[indices] / transcription.length_m, prescribed.by_phi[

@@ -50,7 +50,7 @@ from .association import Association
 from .experiment_iterate import ExperimentIterate
 from .linear_algebra.sparse_assembly import SparseAssembly
 from .measurement_models import belongs_to, first_association
-from .motion_transcription import RowWeights, SegmentOffsets, WeightedHistory
+from .motion_transcription import Offsets, RowWeights, WeightedHistory
 from .shared_nuisances import nuisance_indices, shared_associations
 from .transcription import Transcription
 
@@ -172,7 +172,7 @@ class Collocation:
                     huber=self.huber,
                     offsets=transcriptions[-1].next_offsets
                     if transcriptions
-                    else SegmentOffsets(self.nq, 0),
+                    else Offsets(self.nq, 0),
                     nuisance_indices=local,
                     association=association,
                 )
@@ -273,7 +273,7 @@ class Collocation:
     @property
     def phi_columns(self) -> slice:
         """Slice of the nuisance parameters in z."""
-        first = self.transcriptions[-1].next_offsets.position
+        first = self.transcriptions[-1].next_offsets.variable
         return slice(first, first + self.nphi)
 
     def iterates(self, z: Array) -> list[ExperimentIterate]:
@@ -637,7 +637,7 @@ class Collocation:
         for transcription in self.transcriptions:
             indptr.append(indptr[-1][-1] + transcription.hessian.indptr[1:])
             shift = np.where(
-                transcription.hessian.indices < self.nq, 0, transcription.offsets.position - self.nq
+                transcription.hessian.indices < self.nq, 0, transcription.offsets.variable - self.nq
             )
             indices.append(transcription.hessian.indices + shift)
             further += transcription.additional_hessian_entries(self.phi_columns.start)

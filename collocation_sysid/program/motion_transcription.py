@@ -53,11 +53,11 @@ WeightedHistory = tuple[AnyHistory, Array]
 
 
 @dataclass(frozen=True)
-class SegmentOffsets:
-    """Offsets of a transcription in the nonlinear program."""
+class Offsets:
+    """Offsets in the nonlinear program: of a transcription, or of a group of lifted variables."""
 
-    position: int  # index in z of its first position
-    row: int  # index in g of its first constraint
+    variable: int  # index in z of the first variable, of a transcription the first position
+    row: int  # index in g of the first constraint
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class MotionTranscription:
         pose of the body in its grasps is estimated.
     huber : float or None
         Threshold of Huber's loss in standard deviations; None means a quadratic loss.
-    offsets : SegmentOffsets
+    offsets : Offsets
         Offsets of its variables and constraints.
     nuisance_indices : NuisanceIndices
         Indices of its φ in p = (q, φ_1, φ_2, …).
@@ -104,7 +104,7 @@ class MotionTranscription:
     substeps: int
     has_grasp_constraints: bool
     huber: float | None
-    offsets: SegmentOffsets
+    offsets: Offsets
     nuisance_indices: NuisanceIndices
 
     def __getstate__(self) -> dict[str, Any]:
@@ -237,7 +237,7 @@ class MotionTranscription:
     @property
     def columns(self) -> slice:
         """Slice of its scaled positions in z, grid time by grid time."""
-        return slice(self.offsets.position, self.offsets.position + self.variable_count)
+        return slice(self.offsets.variable, self.offsets.variable + self.variable_count)
 
     @property
     def rows(self) -> slice:
@@ -249,9 +249,9 @@ class MotionTranscription:
         return np.concatenate([np.arange(self.nq), self.nuisance_indices.indices])
 
     @property
-    def next_offsets(self) -> SegmentOffsets:
+    def next_offsets(self) -> Offsets:
         """Offsets of the transcription that follows."""
-        return SegmentOffsets(self.columns.stop, self.rows.stop)
+        return Offsets(self.columns.stop, self.rows.stop)
 
     # Grasps and scales ------------------------------------------------------------------------
 
@@ -804,7 +804,7 @@ class MotionTranscription:
         first_phi : int
             Index in z where the nuisance parameters of all experiments begin.
         """
-        of_x = self.offsets.position + np.arange(self.variable_count)
+        of_x = self.offsets.variable + np.arange(self.variable_count)
         of_phi = first_phi - self.nq + self.nuisance_indices.indices
         moving = of_phi[self.nuisance.motion_indices]
         states = moving[self.state_dependent_nuisance - self.nq]

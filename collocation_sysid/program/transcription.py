@@ -345,7 +345,7 @@ class Transcription(MotionTranscription):
         first_phi : int
             Index in z where the nuisance parameters of all experiments begin.
         """
-        of_x = self.offsets.position + np.arange(self.variable_count)
+        of_x = self.offsets.variable + np.arange(self.variable_count)
         of_phi = first_phi - self.nq + self.nuisance_indices.indices
         in_z = np.concatenate([of_x, of_phi])
         rows, columns = self.local_loss.structure

@@ -16,7 +16,8 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.experiment_iterate import ExperimentIterate
 from collocation_sysid.program.lifted.expression_patterns import ExpressionPattern, PatternIndices
 from collocation_sysid.program.lifted.lifted_collocation import LiftedCollocation
-from collocation_sysid.program.lifted.lifted_variables import LiftedOffsets, LiftedVariables
+from collocation_sysid.program.lifted.lifted_variables import LiftedVariables
+from collocation_sysid.program.motion_transcription import Offsets
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])
 MODULUS_PA = 1e3
@@ -83,7 +84,7 @@ class Stretches(LiftedVariables):
 @pytest.fixture(scope="module")
 def program() -> Collocation:
     plain = Collocation([hung_cube(5)], GUESS)
-    last = LiftedOffsets(plain.variable_count, plain.constraint_count)
+    last = Offsets(plain.variable_count, plain.constraint_count)
     made = LiftedCollocation([hung_cube(5)], GUESS)
     vars(made)["lifted"] = (Stretches(made.transcriptions[0], 0, made.phi_columns.start, last),)
     return made

@@ -142,15 +142,6 @@ class Outline:
         )
 
 
-class _NearestEdges(NamedTuple):
-    """Edges nearest to P pixels that show nothing."""
-
-    edges: Array  # (P, 2): edges u, v, half a pixel from the middle of the nearest other pixel
-    # (P, 2): unit vectors from the edge to the pixel; (1, 0) or (1, 1) where there is no edge.
-    outwards: Array
-    exists: NDArray[np.bool_]  # (P,) of bool: whether there is such an edge
-
-
 class OutlineView(NamedTuple):
     """View of a camera at one image."""
 
@@ -392,10 +383,10 @@ def image_edges(
     edges = points.pixels + mean_offsets[:, None] * outwards
     is_beyond = ~has_edge & (shown_at(points.pixels) == EMPTY)
     if is_beyond.any():
-        nearest_edges = _nearest_edges(is_nothing(), points.pixels[is_beyond])
-        edges[is_beyond] = nearest_edges.edges
-        outwards[is_beyond] = nearest_edges.outwards
-        is_beyond[is_beyond] = nearest_edges.exists
+        nearest, ways, exists = _nearest_edges(is_nothing(), points.pixels[is_beyond])
+        edges[is_beyond] = nearest
+        outwards[is_beyond] = ways
+        is_beyond[is_beyond] = exists
     return edges, outwards, has_edge | is_beyond
 
 
@@ -437,10 +428,14 @@ def _classify_pixels(
     return shown
 
 
-def _nearest_edges(nothing: NDArray[np.bool_], pixels: Array) -> _NearestEdges:
-    """Return the edges nearest to pixels (P, 2)."""
+def _nearest_edges(
+    nothing: NDArray[np.bool_], pixels: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the edges (P, 2) nearest to pixels (P, 2) that show nothing, half a pixel from the
+    middle of the nearest other pixel, unit vectors to the pixels (P, 2), and whether they exist.
+    """
     if nothing.all():
-        return _NearestEdges(pixels, np.ones_like(pixels), exists=np.zeros(len(pixels), dtype=bool))
+        return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
     places: Array = np.asarray(
         distance_transform_edt(nothing, return_distances=False, return_indices=True)
     )
@@ -451,7 +446,7 @@ def _nearest_edges(nothing: NDArray[np.bool_], pixels: Array) -> _NearestEdges:
     has_edge = length > 0
     way[has_edge] /= length[has_edge, None]
     way[~has_edge] = [1.0, 0.0]
-    return _NearestEdges(nearest + 0.5 * way, way, exists=has_edge)
+    return nearest + 0.5 * way, way, has_edge
 
 
 def _planes(

@@ -97,13 +97,6 @@ class NewtonOptions:
     checks_stability: bool = True
 
 
-class _Chords(NamedTuple):
-    """Result of chord steps towards an equilibrium."""
-
-    x: Array  # (3n,): last state [m]
-    converged: bool  # whether the expected error of x is negligible
-
-
 class NewtonFailure(Exception):
     """Newton's method did not converge; its text is the reason.
 
@@ -244,10 +237,11 @@ class NewtonSolver:
             self.definite_factor = iterate.factor
             chords = self._static_chords(iterate, residual)
             if chords is not None:
-                if chords.converged and not self.options.checks_stability:
-                    return chords.x
+                x, converged = chords
+                if converged and not self.options.checks_stability:
+                    return x
                 try:
-                    iterate = self._iterate_at(chords.x, linearise, keep_definite=True)
+                    iterate = self._iterate_at(x, linearise, keep_definite=True)
                     continue
                 except NewtonFailure:
                     pass
@@ -338,12 +332,12 @@ class NewtonSolver:
             value = residual(x)
         step = self.step(factor, value)
         chords = self._static_chords(_Iterate(x, factor, step=step), residual)
-        return (x, False) if chords is None else (chords.x, chords.converged)
+        return (x, False) if chords is None else chords
 
-    def _static_chords(self, iterate: _Iterate, residual: Residual) -> _Chords | None:
-        """Return the state after chord steps from an iterate towards an equilibrium, as long as
-        they shrink by `SLOWEST_CHORD_RATE` each; None if the first one does not, or inverts an
-        element.
+    def _static_chords(self, iterate: _Iterate, residual: Residual) -> tuple[Array, bool] | None:
+        """Return the state (3n,) [m] after chord steps from an iterate towards an equilibrium, as
+        long as they shrink by `SLOWEST_CHORD_RATE` each, and whether its expected error is
+        negligible; None if the first one does not, or inverts an element.
         """
         goal_m = self.size_m * max(
             STATIC_CHORD_SHARE * self.options.tolerance, STATIC_CHORD_ROUNDING
@@ -371,8 +365,8 @@ class NewtonSolver:
             error_m = rate / (1 - min(rate, 0.9)) * np.abs(step).max(initial=0)
             if error_m <= goal_m or is_rounding:
                 x[self.free] += step
-                return _Chords(x, converged=True)
-        return _Chords(x, converged=False) if has_moved else None
+                return x, True
+        return (x, False) if has_moved else None
 
     def _simplified_newton(self, x: Array, iteration: ChordIteration) -> tuple[Array, bool]:
         """Iterate with few factorisations (simplified Newton method); the last factor is stored,

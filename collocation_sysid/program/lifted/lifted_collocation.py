@@ -18,14 +18,14 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ..collocation import Collocation
 from ..experiment_iterate import ExperimentIterate
-from ..motion_transcription import RowWeights, WeightedHistory
+from ..motion_transcription import Offsets, RowWeights, WeightedHistory
 from ..transcription import Transcription
 from .lifted_force_histories import LiftedForceHistory
 from .lifted_memory import LiftedMemory
 from .lifted_pressures import LiftedPressure
 from .lifted_reactions import LiftedReactions
 from .lifted_resultants import LiftedResultant
-from .lifted_variables import LiftedOffsets, LiftedVariables
+from .lifted_variables import LiftedVariables
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class LiftedCollocation(Collocation):
         return lift_variables(
             self.transcriptions,
             self.phi_columns.start,
-            offsets=LiftedOffsets(self.phi_columns.stop, self.transcriptions[-1].next_offsets.row),
+            offsets=Offsets(self.phi_columns.stop, self.transcriptions[-1].next_offsets.row),
         )
 
     @property
@@ -193,7 +193,7 @@ def lifted_nonzeros(collocation: Collocation) -> tuple[int, int]:
 
 
 def lift_variables(
-    transcriptions: Sequence[Transcription], first_phi: int, offsets: LiftedOffsets
+    transcriptions: Sequence[Transcription], first_phi: int, offsets: Offsets
 ) -> tuple[LiftedVariables, ...]:
     """Create the groups of lifted variables of all experiments.
 
@@ -207,7 +207,7 @@ def lift_variables(
         Transcriptions of the experiments.
     first_phi : int
         Index in z where the nuisance parameters of all experiments begin.
-    offsets : LiftedOffsets
+    offsets : Offsets
         Offsets of the first group.
 
     Returns

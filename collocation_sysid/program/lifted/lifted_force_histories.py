@@ -140,7 +140,7 @@ class LiftedForceHistory(LiftedVariables):
                 here = slice(int(used.argmax()), len(used))
                 k = times[here, None]
                 x = (
-                    self.transcription.offsets.position
+                    self.transcription.offsets.variable
                     + (k - lag) * self.transcription.dof_count
                     + self._points.nonzero_weights[2]
                 )

@@ -228,7 +228,7 @@ class LiftedMemory(LiftedVariables):
         times k − lag, for the evaluations k of a lag.
         """
         return [
-            self.transcription.offsets.position,
+            self.transcription.offsets.variable,
             (lag.select_evaluations() - lag.lag) * self.transcription.dof_count,
             dofs,
         ]

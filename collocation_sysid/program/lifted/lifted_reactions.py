@@ -108,7 +108,7 @@ class LiftedReactions(LiftedVariables):
         of_x = np.repeat(np.arange(transcription.variable_count), np.diff(band.indptr))
         of_p = transcription.dynamic_columns(self.first_phi)
         columns = [
-            transcription.offsets.position + of_x,
+            transcription.offsets.variable + of_x,
             np.arange(self.columns.start, self.columns.stop),
         ]
         rows = [self.offsets.row + band.indices, equations, np.repeat(equations, len(of_p))]

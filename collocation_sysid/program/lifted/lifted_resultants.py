@@ -164,7 +164,7 @@ class LiftedResultant(LiftedVariables):
         """Return the columns (n, d) in z of the positions of the grasp's dofs at n grid times."""
         dofs = self.reactions.transcription.sensed_dofs[self.observable.node_dofs]
         return (
-            self.transcription.offsets.position
+            self.transcription.offsets.variable
             + self.observable.known_rows[:, None] * self.transcription.dof_count
             + dofs
         )

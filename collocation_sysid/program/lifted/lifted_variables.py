@@ -19,17 +19,9 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
-from ..motion_transcription import RowWeights, WeightedHistory
+from ..motion_transcription import Offsets, RowWeights, WeightedHistory
 from ..transcription import Transcription
 from .expression_patterns import ExpressionPattern
-
-
-@dataclass(frozen=True)
-class LiftedOffsets:
-    """Offsets of a group of lifted variables in the program."""
-
-    variable: int  # index in z of its first variable
-    row: int  # index in g of its first equation
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +31,7 @@ class LiftedVariables(ABC):
     transcription: Transcription  # transcription of the experiment
     transcription_index: int  # index of the transcription
     first_phi: int  # index in z where the nuisance parameters of all experiments begin
-    offsets: LiftedOffsets  # offsets of the variables and equations
+    offsets: Offsets  # offsets of the variables and equations
     kind: ClassVar[str]  # kind of quantity
 
     @property
@@ -65,9 +57,9 @@ class LiftedVariables(ABC):
         return slice(self.offsets.row, self.offsets.row + self.count)
 
     @property
-    def next_offsets(self) -> LiftedOffsets:
+    def next_offsets(self) -> Offsets:
         """Offsets of the group that follows."""
-        return LiftedOffsets(self.columns.stop, self.rows.stop)
+        return Offsets(self.columns.stop, self.rows.stop)
 
     @property
     def phi_columns(self) -> Index:
