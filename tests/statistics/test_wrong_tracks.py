@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
 from collocation_sysid.features.image_tracks.track_feature import places_off_body, track_hypotheses
 from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
+from collocation_sysid.features.image_tracks.tracked_places import find_places
 
 TEMPLATE = Path(cs.__file__).parent / "problem/templates/video/problem.toml"
 Change = Callable[[cs.ImageTracks], cs.ImageTracks]
@@ -157,14 +159,36 @@ def test_points_near_the_grasp_move_as_it_does(mistake: str) -> None:
     assert words in found.message
 
 
+@cache
+def video_template() -> cs.Experiment:
+    """The swung bar of the template, filmed by one camera."""
+    return cs.Problem.read(TEMPLATE).experiments[0]
+
+
 def test_a_video_of_half_the_stated_rate_is_named_in_the_template() -> None:
-    experiment = cs.Problem.read(TEMPLATE).experiments[0]
+    experiment = video_template()
     (tracks,) = (each for each in experiment.readings if isinstance(each, cs.ImageTracks))
     assert [*hypotheses(experiment)] == []
     every_second = pixels_of(tracks)[::2].reshape(-1, 2 * len(tracks.names))
     half = tracks.with_samples(tracks.t_s[: len(every_second)], every_second)
     (found,) = hypotheses(replace(experiment, readings=[half]))
     assert "their rate is 0.5 times the stated one" in found.message
+
+
+def test_a_wrong_rate_is_named_where_four_points_far_from_the_grasp_determine_the_pose() -> None:
+    experiment = video_template()
+    (tracks,) = (each for each in experiment.readings if isinstance(each, cs.ImageTracks))
+    rigid = experiment.rigid_positions
+    found_m = find_places(experiment, lambda t_s: rigid(np.clip(t_s, *experiment.t_s[[0, -1]])))[2]
+    places_m = np.array([found_m[name] for name in tracks.names])
+    places_m[np.argsort(places_m[:, 2])[4:]] = np.nan
+    free = replace(tracks, places_m=places_m, has_known_pose=False)
+    assert [*hypotheses(replace(experiment, readings=[free]))] == []
+    slow_s = 1.2 * tracks.t_s
+    kept = slow_s <= experiment.t_s[-1]
+    slow = free.with_samples(slow_s[kept], pixels_of(tracks)[kept].reshape(kept.sum(), -1))
+    (found,) = hypotheses(replace(experiment, readings=[slow]))
+    assert "their rate is 1.2 times the stated one" in found.message
 
 
 def test_places_on_sides_that_the_camera_does_not_see_are_named() -> None:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
@@ -20,6 +19,9 @@ MOST_STEPS = 1000
 LEAST_STEP = 1e-3
 # Fewest points that determine the pose of a camera.
 FEWEST_POINTS = 4
+# Iterations within which a pose is fitted, and the change [rad, of depths] that ends them.
+MOST_ITERATIONS = 100
+LEAST_POSE_STEP = 1e-7
 # Difference of rotations [rad] below which two poses are the same.
 SAME_TURN_RAD = 1e-3
 
@@ -182,6 +184,54 @@ def is_behind(
     return hidden
 
 
+def _fitted_poses(
+    points_m: Array, seen: Array, turns: Array, shifts: Array, least_m: float
+) -> tuple[Array, Array, Array]:
+    """Return the rotations (m, 3, 3) and translations (m, 3) to which the method of Levenberg and
+    Marquardt converges from m of the k starts, and the RMS (m,) of the differences of points (P, 3)
+    at unit depth from the seen ones (P, 2); points are at least `least_m` in front of the camera.
+    """
+
+    def differences(turns: Array, shifts: Array) -> tuple[Array, Array, Array]:
+        turned = np.einsum("kij,pj->kpi", turns, points_m)
+        at = turned + shifts[:, None]
+        depth = np.maximum(at[..., 2:], least_m)
+        return turned, depth, at[..., :2] / depth - seen
+
+    damping, is_found = np.full(len(turns), 1e-3), np.zeros(len(turns), dtype=bool)
+    turned, depth, off = differences(turns, shifts)
+    for _ in range(MOST_ITERATIONS):
+        # By a small rotation after the present one, and by the translation.
+        moved = np.zeros((*turned.shape, 6))
+        moved[..., 0, 1], moved[..., 0, 2] = turned[..., 2], -turned[..., 1]
+        moved[..., 1, 0], moved[..., 1, 2] = -turned[..., 2], turned[..., 0]
+        moved[..., 2, 0], moved[..., 2, 1] = turned[..., 1], -turned[..., 0]
+        moved[..., 3:] = np.eye(3)
+        moved[..., 2, :] *= depth > least_m
+        slopes = moved[..., :2, :] - (off + seen)[..., None] * moved[..., 2:, :]
+        slopes = (slopes / depth[..., None]).reshape(len(turns), -1, 6)
+        squares = np.einsum("kri,krj->kij", slopes, slopes)
+        gradient = np.einsum("kri,kr->ki", slopes, off.reshape(len(turns), -1))
+        scale = np.einsum("kii->ki", squares)
+        damped = squares + np.eye(6) * (damping[:, None] * scale + 1e-15)[..., None]
+        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        next_turns = Rotation.from_rotvec(step[:, :3]).as_matrix() @ turns
+        trial = differences(next_turns, shifts + step[:, 3:])
+        gain = np.sum(off**2, axis=(1, 2)) - np.sum(trial[2] ** 2, axis=(1, 2))
+        is_better = gain > 0
+        damping = np.clip(np.where(is_better, damping / 5, damping * 4), 1e-12, 1e12)
+        turns = np.where(is_better[:, None, None], next_turns, turns)
+        shifts = np.where(is_better[:, None], shifts + step[:, 3:], shifts)
+        pairs = zip(trial, (turned, depth, off), strict=True)
+        turned, depth, off = (np.where(is_better[:, None, None], *pair) for pair in pairs)
+        size = np.concatenate([step[:, :3], step[:, 3:] / depth.mean(axis=1)], axis=1)
+        is_found |= np.abs(size).max(axis=1) < LEAST_POSE_STEP
+        if is_found.all():
+            break
+    errors = np.sqrt(np.mean(off**2, axis=(1, 2)))
+    return turns[is_found], shifts[is_found], errors[is_found]
+
+
 def poses_from_points(points_m: Array, rays: Array) -> list[tuple[Array, float]]:
     """Return the poses of a camera from which known points appear in known directions, best first.
 
@@ -209,21 +259,16 @@ def poses_from_points(points_m: Array, rays: Array) -> list[tuple[Array, float]]
     depth = np.sqrt(np.sum(centred**2) * 2 / 3) / max(spread, 1e-9)
     start = depth * np.append(seen.mean(axis=0), 1.0)
 
-    def differences(pose: Array) -> Array:
-        at = Rotation.from_rotvec(pose[:3]).apply(centred) + pose[3:]
-        front = np.maximum(at[:, 2:], 1e-3 * depth)
-        return (at[:, :2] / front - seen).ravel()
-
+    turns = Rotation.create_group("O").as_matrix()
+    shifts = np.tile(start, (len(turns), 1))
+    turns, shifts, errors = _fitted_poses(centred, seen, turns, shifts, 1e-3 * depth)
     found: list[tuple[Array, float]] = []
-    for turn in Rotation.create_group("O"):
-        fit = least_squares(differences, np.append(turn.as_rotvec(), start), x_scale="jac")
-        to_camera = Rotation.from_rotvec(fit.x[:3])
-        if (to_camera.apply(centred)[:, 2] + fit.x[5] <= 0).any():
+    for turn, shift, error in zip(turns, shifts, errors.tolist(), strict=True):
+        if (centred @ turn[2] + shift[2] <= 0).any():
             continue
         pose = np.eye(4)
-        pose[:3, :3] = to_camera.as_matrix().T
-        pose[:3, 3] = middle - pose[:3, :3] @ fit.x[3:]
-        error = float(np.sqrt(np.mean(fit.fun**2)))
+        pose[:3, :3] = turn.T
+        pose[:3, 3] = middle - turn.T @ shift
         same = [
             k
             for k, (other, _) in enumerate(found)

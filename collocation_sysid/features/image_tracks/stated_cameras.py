@@ -54,11 +54,13 @@ NEAR = 0.25
 MOST_NEAR = 4
 # Motion of these points [standard deviations of a pixel] from which on it is compared; deviation from
 # it, over the motion itself, that is suspicious; the factor by which a correction decreases it, and
-# what it leaves at most.
+# what it leaves at most; both also for a pose that is found from few points, which is less accurate.
 MOVING = 5.0
 UNLIKE = 0.6
-ALIKE = 2.0
-WELL_ALIKE = 0.25
+ALIKE, ALIKE_FOUND = 2.0, 2.5
+WELL_ALIKE, WELL_ALIKE_FOUND = 0.25, 0.4
+# Factor between the errors of two poses that may both be right.
+SIMILAR_POSES = 2.0
 # Factor between corrections that explain the tracks equally well, deviation of the motion below which
 # they do, and how many are named.
 SIMILAR = 1.3
@@ -155,7 +157,10 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
     if experiment.is_static or not unlike > UNLIKE:
         return
     tried = trial.without([*trial.mistakes(), *trial.wrong_times()], trial.unlike)
-    alike = [each for each in tried if each[0] < min(unlike / ALIKE, WELL_ALIKE)]
+    most = min(unlike / ALIKE, WELL_ALIKE)
+    if not trial.declared.has_known_pose:
+        most = min(unlike / ALIKE_FOUND, WELL_ALIKE_FOUND)
+    alike = [each for each in tried if each[0] < most]
     possible = [
         each
         for each in alike[:MOST_NEAR]
@@ -389,12 +394,19 @@ class _Trial:
 
     def with_fitted_pose(self, described: ImageTracks) -> ImageTracks:
         """Return the tracks with the pose, unless it is known, that shows the known points in one
-        image best.
+        image best; of those that do it nearly as well, that with which the motion is most alike.
         """
         if described.has_known_pose:
             return described
-        pose = poses_of_tracks(described, self.stated, self.rest, self._rigid_m)[0][0]
-        return replace(described, camera=replace(described.camera, pose=pose))
+        found = poses_of_tracks(described, self.stated, self.rest, self._rigid_m)
+        fitted = [
+            replace(described, camera=replace(described.camera, pose=pose))
+            for pose, error in found
+            if error <= SIMILAR_POSES * found[0][1]
+        ]
+        if len(fitted) == 1:
+            return fitted[0]
+        return min(fitted, key=lambda each: float(np.nan_to_num(self.unlike(each), nan=np.inf)))
 
     def _wrong_images(self) -> Iterator[Deviation]:
         stated = self.tracks

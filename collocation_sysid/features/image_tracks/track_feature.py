@@ -28,8 +28,6 @@ FEWEST_BESIDE = 3
 # Distance of an estimated place from the surface over the diagonal of the body, beyond which it is off
 # the body: wrong solutions of twins with unknown places had 0.06 to 0.2.
 OFF_BODY = 0.05
-# Ratio of the errors of two poses of a camera below which the second is nearly as good.
-SIMILAR_POSES = 2.0
 
 MESSAGES = stated_cameras.MESSAGES | {
     "description/image-track/exchanged": "the tracks {first} and {second} fit each other's places: "
@@ -183,7 +181,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
                 for row in reading.estimated_pose(part.phi).tolist()
             ]
             yield f"pose of '{tracks.name}' as found: pose = [{', '.join(rows)}]"
-        if places.mirror_ratio < SIMILAR_POSES:
+        if places.mirror_ratio < stated_cameras.SIMILAR_POSES:
             yield (
                 f"the pose of '{tracks.name}' was found from points that a mirrored pose explains "
                 f"nearly as well (error {places.mirror_ratio:.2g} times as large): state the places "
