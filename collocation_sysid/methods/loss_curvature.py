@@ -151,14 +151,12 @@ def tangent_directions(collocation: Collocation, by_p: Sequence[Array]) -> Array
     parameter along the linearised equations of motion, from the `sensitivities` of the positions.
     """
     moving = [s.list_parameter_indices()[s.dynamic_parameters] for s in collocation.transcriptions]
-    return np.column_stack(
-        [
-            Collocation.pack(
-                collocation, unit, [z @ unit[own] for z, own in zip(by_p, moving, strict=True)]
-            )
-            for unit in np.eye(collocation.nq + collocation.nphi)
-        ]
-    )
+    units = np.eye(collocation.nq + collocation.nphi)
+    scaled = [
+        (each @ units[own] / part.length_m).reshape(each.shape[0] * each.shape[1], len(units))
+        for each, own, part in zip(by_p, moving, collocation.transcriptions, strict=True)
+    ]
+    return np.concatenate([units[: collocation.nq], *scaled, units[collocation.nq :]])
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:
