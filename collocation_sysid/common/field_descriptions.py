@@ -7,7 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 T = TypeVar("T")
 _HEADING = "Attributes\n----------\n"
@@ -41,8 +41,13 @@ def documented(kind: type) -> dict[str, str]:
     }
 
 
-# Annotation, default, and type and description in the documentation of a field.
-FieldOfRow = tuple[Any, Any, str, str]
+class FieldOfRow(NamedTuple):
+    """Field of a class that has one for each row of a table."""
+
+    annotation: Any
+    default: Any
+    form: str  # type in the documentation
+    description: str  # description in the documentation
 
 
 def with_fields(rows: Mapping[str, FieldOfRow]) -> Callable[[type[T]], type[T]]:
@@ -53,15 +58,15 @@ def with_fields(rows: Mapping[str, FieldOfRow]) -> Callable[[type[T]], type[T]]:
     def with_rows(kind: type[T]) -> type[T]:
         summary, _, others = inspect.cleandoc(kind.__doc__ or "").partition(_HEADING)
         section = "".join(
-            f"{name} : {form}\n"
-            f"{textwrap.fill(description, 96, initial_indent=_IN, subsequent_indent=_IN)}\n"
-            for name, (_, _, form, description) in rows.items()
+            f"{name} : {row.form}\n"
+            f"{textwrap.fill(row.description, 96, initial_indent=_IN, subsequent_indent=_IN)}\n"
+            for name, row in rows.items()
         )
         kind.__doc__ = f"{summary.rstrip()}\n\n{_HEADING}{section}{others}"
-        annotations = {name: annotation for name, (annotation, *_) in rows.items()}
+        annotations = {name: row.annotation for name, row in rows.items()}
         kind.__annotations__ = annotations | inspect.get_annotations(kind)
-        for name, (_, default, *_) in rows.items():
-            setattr(kind, name, default)
+        for name, row in rows.items():
+            setattr(kind, name, row.default)
         return kind
 
     return with_rows

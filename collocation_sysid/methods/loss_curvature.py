@@ -151,12 +151,18 @@ def tangent_directions(collocation: Collocation, by_p: Sequence[Array]) -> Array
     parameter along the linearised equations of motion, from the `sensitivities` of the positions.
     """
     moving = [s.list_parameter_indices()[s.dynamic_parameters] for s in collocation.transcriptions]
-    units = np.eye(collocation.nq + collocation.nphi)
-    scaled = [
-        (each @ units[own] / part.length_m).reshape(each.shape[0] * each.shape[1], len(units))
-        for each, own, part in zip(by_p, moving, collocation.transcriptions, strict=True)
-    ]
-    return np.concatenate([units[: collocation.nq], *scaled, units[collocation.nq :]])
+    # The first column, of zeros, is there also where nothing is estimated.
+    units = np.eye(collocation.nq + collocation.nphi + 1)[:, 1:]
+    return np.column_stack(
+        [
+            Collocation.pack(
+                collocation,
+                unit,
+                [each @ unit[own] for each, own in zip(by_p, moving, strict=True)],
+            )
+            for unit in units
+        ]
+    )[:, 1:]
 
 
 def sensitivities(collocation: Collocation, z: Array) -> list[Array]:

@@ -785,7 +785,7 @@ def nuisances_called(word: str) -> list[Deviation]:
 
 def _field_of(row: Deviation) -> FieldOfRow:
     """Return the field of `Nuisance` for a row."""
-    return "float | None", row.sigma, "float or None", sentence(row.description)
+    return FieldOfRow("float | None", row.sigma, "float or None", sentence(row.description))
 
 
 @dataclass(frozen=True, kw_only=True)

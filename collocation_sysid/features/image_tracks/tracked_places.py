@@ -358,8 +358,8 @@ class TrackedPlaces(Correspondences):
         enterable = _enterable_faces(experiment, tracks.names, poses, shapes_at)
         faces = _nearest_faces(body, places, enterable)
         unknowns = tracks.camera_unknowns(experiment)
-        sigmas_of = dict(zip(POSE_UNKNOWNS, errors[tracks.name], strict=True))
-        start_pose = np.array([sigmas_of[n] / unknowns[n] for n in POSE_UNKNOWNS if n in unknowns])
+        found = dict(zip(POSE_UNKNOWNS, errors[tracks.name], strict=True))
+        start_pose = np.array([found[n] / unknowns[n] for n in POSE_UNKNOWNS if n in unknowns])
         correspondences = cls(
             tracks,
             surface_association(body, places, sigmas, faces),

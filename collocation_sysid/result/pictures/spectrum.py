@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.signal import periodogram
 
 from ...common.array_types import Array
 from ..figure_style import (
@@ -86,8 +87,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
     markers = np.flatnonzero(present.mean(axis=0) >= MIN_PRESENT_SHARE)
     padded = PADDING_FACTOR * len(tracks_m)
-    hertz = np.arange(padded // 2 + 1) * rate_hz / padded
     if not len(markers):
+        hertz = np.arange(padded // 2 + 1) * rate_hz / padded
         return hertz[1:], np.full(len(hertz) - 1, np.nan)
     t = np.arange(len(tracks_m))
     filled = np.zeros((len(t), len(markers), 3))
@@ -95,14 +96,8 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
         is_present = present[:, marker]
         for axis in range(3):
             filled[:, place, axis] = np.interp(t, t[is_present], tracks_m[is_present, marker, axis])
-    moved_mm = 1e3 * filled.reshape(len(t), -1)
-    line = np.vander(t, 2)
-    moved_mm -= line @ np.linalg.lstsq(line, moved_mm)[0]
-    # `scipy.signal` has this periodogram too, but takes a second to import.
-    window = 0.5 - 0.5 * np.cos(2 * np.pi * t / len(t))
-    power = np.abs(np.fft.rfft(window[:, None] * moved_mm, padded, axis=0)) ** 2
-    power[1:-1] *= 2
-    mean = power.sum(axis=1) / (rate_hz * (window @ window) * len(markers))
+    hertz, density = periodogram(1e3 * filled, rate_hz, "hann", padded, detrend="linear", axis=0)
+    mean = density.sum(axis=2).mean(axis=1)
     return hertz[1:], np.where(mean[1:] > 0, mean[1:], np.nan)
 
 
@@ -125,6 +120,8 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
 
 
 def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
-    """Return groups of indices of ascending values nearer than `gap`."""
+    """Return groups of indices of ascending values, in which neighbours are nearer to each other
+    than `gap`; every value is in one group.
+    """
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
     return [group for group in np.split(np.arange(len(ascending)), breaks) if len(group)]

@@ -10,6 +10,7 @@ by its relative size times its distance from the grasps: for an indentation of 1
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,46 +27,54 @@ from ...recording.obstacle import Obstacle
 ROWS_AT_ONCE = 64
 
 
-# Row, place in the row before and at the start, and normal of a first contact.
-_Touch = tuple[int, Array, Array, Array]
+@dataclass(frozen=True, eq=False)
+class FirstContact:
+    """First contact of an obstacle with a body, or its nearest approach."""
 
+    row: int  # index of the row in the grid, from 0
+    # (3,): mean of the points in contact, weighted by their pressure, in the row before and at the
+    # start [m].
+    place_m: Array
+    start_place_m: Array
+    normal: Array  # (3,): normal of the obstacle there, in the world
 
-def _first_contact(contact: Contact, x: Array) -> tuple[int, Array, Array, Array]:
-    """Return the row of the first contact in a motion x (N, 3n) [m], or of the nearest approach,
-    its place in the row before and at the start (3,) [m], and the normal of the obstacle (3,).
+    @classmethod
+    def from_motion(cls, contact: Contact, x: Array) -> FirstContact:
+        """Return the first contact in a motion x (N, 3n) [m], or the nearest approach if there is
+        none.
 
-    Contact begins where a gap is less than the width of the contact law. The place is the mean
-    of the points, weighted by their pressure; without pressure that of the smallest gap.
-    """
-    law = contact.law_of_contact
-    nearest_m = np.inf
-    row = 0
-    for first in range(0, len(x), ROWS_AT_ONCE):
-        gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE]))
-        touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
-        gaps_m = gaps_m.min(axis=1)
-        row_in_chunk = int(touching[0]) if len(touching) else int(gaps_m.argmin())
-        if gaps_m[row_in_chunk] < nearest_m:
-            nearest_m = float(gaps_m[row_in_chunk])
-            row = first + row_in_chunk
-        if len(touching):
-            break
-    y = contact.points.vectors(x[row : row + 1])
-    gaps_m, slopes = law.gaps_with_slopes(y)
-    gaps_m = gaps_m[0]
-    weights = law.surface.area_m2 * contact.scaled_pressures(x[row : row + 1])[0, 0]
-    if not weights.any():
-        weights = (gaps_m == gaps_m.min()).astype(float)
-    weights = weights / weights.sum()
-    normal = slopes[:3, 0] @ weights
-    # The row before has the surface as it is without contact.
-    place_m, start_place_m = (
-        x[k].reshape(-1, 3)[law.obstacle.nodes[0]]
-        + contact.points.vectors(x[k : k + 1])[:3, 0] @ weights
-        for k in (max(row - 1, 0), 0)
-    )
-    unit = normal / max(float(np.linalg.norm(normal)), 1e-9)
-    return row, place_m, start_place_m, unit
+        Contact begins where a gap is less than the width of the contact law. Without pressure in
+        that row, the point with the smallest gap counts.
+        """
+        law = contact.law_of_contact
+        nearest_m = np.inf
+        row = 0
+        for first in range(0, len(x), ROWS_AT_ONCE):
+            gaps_m = law.gaps(contact.points.vectors(x[first : first + ROWS_AT_ONCE]))
+            touching = np.flatnonzero((gaps_m < law.widths_m).any(axis=1))
+            gaps_m = gaps_m.min(axis=1)
+            row_in_chunk = int(touching[0]) if len(touching) else int(gaps_m.argmin())
+            if gaps_m[row_in_chunk] < nearest_m:
+                nearest_m = float(gaps_m[row_in_chunk])
+                row = first + row_in_chunk
+            if len(touching):
+                break
+        y = contact.points.vectors(x[row : row + 1])
+        gaps_m, slopes = law.gaps_with_slopes(y)
+        gaps_m = gaps_m[0]
+        weights = law.surface.area_m2 * contact.scaled_pressures(x[row : row + 1])[0, 0]
+        if not weights.any():
+            weights = (gaps_m == gaps_m.min()).astype(float)
+        weights = weights / weights.sum()
+        normal = slopes[:3, 0] @ weights
+        # The row before has the surface as it is without contact.
+        place_m, start_place_m = (
+            x[k].reshape(-1, 3)[law.obstacle.nodes[0]]
+            + contact.points.vectors(x[k : k + 1])[:3, 0] @ weights
+            for k in (max(row - 1, 0), 0)
+        )
+        unit = normal / max(float(np.linalg.norm(normal)), 1e-9)
+        return cls(row, place_m, start_place_m, normal=unit)
 
 
 def contact_changes_by_size_n(dynamics: Dynamics, x: Array) -> Iterator[Array]:
@@ -116,7 +125,9 @@ def rigid_contact_change_n(experiment: Experiment, dynamics: Dynamics, x: Array)
 
 
 def _contacts_with_energy(forces: Forces) -> list[Contact]:
-    """Return the contact forces with an energy, without those of complementarity."""
+    """Return the contact forces with an energy, without those of complementarity; empty without
+    obstacles.
+    """
     return [
         term
         for term in forces.external_terms
@@ -142,15 +153,14 @@ def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Ar
     if support is None:
         return
     free = _free_axes(experiment)
-    _, support_m, _, _ = support
-    for contact, (row, place_m, _, normal) in zip(contacts, first_contacts, strict=True):
+    for contact, each in zip(contacts, first_contacts, strict=True):
         obstacle = contact.law_of_contact.obstacle
-        turn, shift = (values[0] for values in experiment.rigid_motion(t_s[row]))
+        turn, shift = (values[0] for values in experiment.rigid_motion(t_s[each.row]))
         pivot_m = turn @ iterate.transcription.nuisance.grasp_pivot_m + shift
-        pivot_m = np.where(free, support_m, pivot_m)
-        way_m = normal * (normal @ (place_m - pivot_m))
+        pivot_m = np.where(free, support.place_m, pivot_m)
+        way_m = each.normal * (each.normal @ (each.place_m - pivot_m))
         rotations, _ = obstacle.poses.at(t_s)
-        yield obstacle, rotations @ (rotations[row].T @ way_m)
+        yield obstacle, rotations @ (rotations[each.row].T @ way_m)
 
 
 def scaled_start_m(iterate: ExperimentIterate) -> Array | None:
@@ -166,7 +176,7 @@ def scaled_start_m(iterate: ExperimentIterate) -> Array | None:
     pivot_m = turn @ iterate.transcription.nuisance.grasp_pivot_m + shift
     x_m = iterate.x[0].reshape(-1, 3)
     _, _, support = _first_contacts(iterate)
-    middle_m = x_m.mean(axis=0) if support is None else support[2]
+    middle_m = x_m.mean(axis=0) if support is None else support.start_place_m
     pivot_m = np.where(_free_axes(experiment), middle_m, pivot_m)
     arms_m = x_m - pivot_m
     for obstacle in experiment.obstacles:
@@ -182,16 +192,16 @@ def _free_axes(experiment: Experiment) -> NDArray[np.bool_]:
 
 def _first_contacts(
     iterate: ExperimentIterate,
-) -> tuple[list[Contact], list[_Touch], _Touch | None]:
+) -> tuple[list[Contact], list[FirstContact], FirstContact | None]:
     """Return the contacts, the first contact of each, and the one that supports the body: of those
     that touch first, that of the obstacle that moves least; None without obstacles.
     """
     forces = iterate.equations.dynamics.forces
     contacts = [term for term in forces.external_terms if isinstance(term, Contact)]
-    firsts = [_first_contact(contact, iterate.x) for contact in contacts]
+    firsts = [FirstContact.from_motion(contact, iterate.x) for contact in contacts]
     travels_m = [
         np.ptp(iterate.x[:, c.law_of_contact.obstacle.prescribed_dofs], axis=0).max()
         for c in contacts
     ]
-    order = sorted(range(len(contacts)), key=lambda k: (firsts[k][0], travels_m[k]))
+    order = sorted(range(len(contacts)), key=lambda k: (firsts[k].row, travels_m[k]))
     return contacts, firsts, firsts[order[0]] if order else None

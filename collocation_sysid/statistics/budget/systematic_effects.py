@@ -1238,8 +1238,8 @@ def _field_of(row: Deviation) -> FieldOfRow:
     text = sentence(f"{row.description} [{row.unit or 1}]")
     is_reported = row.alternative and row.considered is None and not row.redefines
     if row.by_origin or is_reported:
-        return annotation | None, None, f"{form}, optional", text
-    return annotation, default, form, text
+        return FieldOfRow(annotation | None, None, f"{form}, optional", text)
+    return FieldOfRow(annotation, default, form, text)
 
 
 @validated(kw_only=True)
