@@ -376,8 +376,6 @@ class _OneSensor:
         for row, handicap in self._mistakes():
             if (found := corrected_hypothesis(row, self.declared)) is not None:
                 yield replace(found, subject=subject, handicap=handicap)
-        free = self._with_tare(FREE_TARE)
-        yield Hypothesis("wrench-tare", subject, corrected=free)
 
     def _mistakes(self) -> Iterator[tuple[Deviation, float]]:
         """Yield each common mistake with the handicap of its hypothesis."""
@@ -434,6 +432,8 @@ class _OneSensor:
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
             data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
             yield mistake("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
+        tare = Deviation("wrench-tare", "σ", corrected=lambda *_: (self._with_tare(FREE_TARE), {}))
+        yield tare, 1.0
 
 
 def _without_tare(values: Array, tare: float) -> Array:

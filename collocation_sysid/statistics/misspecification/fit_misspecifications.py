@@ -26,6 +26,7 @@ from ...methods.starts.continuation import first_samples
 from ...methods.starts.initial_trajectories import associated_at_guess
 from ...program.collocation import ExperimentIterate
 from ...program.modes.modal_prediction import DeclaredMotion
+from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.hysteresis import branch_differences, loading_branch, unloading_difference
@@ -48,7 +49,14 @@ from ..thresholds import (
     REPRODUCED,
     SLIP,
 )
-from .misspecification_hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
+from .misspecification_hypothesis import (
+    Correction,
+    Hypothesis,
+    HypothesisTest,
+    clock_hypothesis,
+    corrected_hypotheses,
+    rank,
+)
 from .modal_misspecifications import (
     ModalComparison,
     find_misspecifications_by_modes,
@@ -57,7 +65,7 @@ from .modal_misspecifications import (
 from .model_misspecifications import (
     LinearCorrection,
     coarse_mesh_hypotheses,
-    mirror_images,
+    mirrored_meshes,
     screened_bodies,
 )
 from .sensor_misspecifications import sensor_hypotheses, sensor_misfits
@@ -208,24 +216,27 @@ def _refit_hypotheses(
     lags = [] if first.is_static else _clock_hypotheses(alone, first, stated=stated, of=of)
     comparison = ModalComparison.from_experiment(first, solution.parameters)
     turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
-    mirrored = [*mirror_images(first)] if discrepancy > MIRRORED else []
+    images = mirrored_meshes(first) if discrepancy > MIRRORED else ()
+    mirrored = [*corrected_hypotheses(images, first)]
     is_far = max(map(_pose_deviation, solution.parts)) > FAR
     if is_far and budget is None:  # mirror images come first, and leave the others their sweeps
         alone.sweeps += alone.each * len(mirrored)
     bodies = [*screened_bodies(solution, first, is_far=is_far)]
     alone.near_answer.update(each.corrected for each in bodies)
-    # The first samples may end before the unloading: the complete fit is what must improve.
+    # The first samples may end before the unloading: the complete fit is what must improve. The
+    # message is about all experiments.
     whole = replace(trial, misfit=discrepancy)
+    unloading = corrected_hypotheses([_unloading(solution)], experiment)
     tested = [
         *sensors,
-        *whole.accepted(_hysteresis_hypotheses(solution, experiment)),
+        *whole.accepted(replace(each, subject="") for each in unloading),
         *trial.accepted(
             [
                 # A body far from its stated pose: mirror images, before others use up the sweeps.
                 *(mirrored if is_far else ()),
                 *lags,
-                *_slip_hypotheses(first, fitted_m, of=of),
-                *_grasp_layer_hypotheses(first, of),  # few, before others use up the sweeps
+                # Few, before others use up the sweeps.
+                *corrected_hypotheses([_slip(fitted_m), *GRASP_LAYERS], first),
                 *turned,
                 *bodies,
                 *(() if is_far else mirrored),
@@ -302,48 +313,49 @@ def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> It
         yield replace(nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2))
 
 
-def _grasp_layer_hypotheses(declared: Experiment, of: str) -> Iterator[Hypothesis]:
-    """Yield all grasps one layer of elements deeper, and one less deep."""
-    for deeper, deep in ((True, "more"), (False, "fewer")):
-        if (layered := _with_shifted_grasps(declared, deeper)) is not None:
-            yield Hypothesis("grasp-layer", of, data={"deep": deep}, corrected=layered)
-
-
-def _hysteresis_hypotheses(solution: Solution, declared: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the material unloads below its loading curve, if the branches of
-    an experiment on a bench differ so; `corrected` is its loading branch.
-
-    The message has the differences of all experiments on a bench that are fitted.
+def _unloading(solution: Solution) -> Deviation:
+    """Return the row of a material that unloads below its loading curve on a bench; without it only
+    the loading branch is fitted. The message has the differences of all fitted experiments.
     """
-    branch = loading_branch(declared, MOST_SAMPLES)
-    if branch is not None and (unloading_difference(declared) or 0.0) < 0.0:
-        fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
-        sizes = branch_differences(each for each in fitted if not each.specimen)
-        yield Hypothesis("hysteresis", data={"sizes": sizes}, corrected=branch)
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        branch = loading_branch(experiment, MOST_SAMPLES)
+        if branch is None or (unloading_difference(experiment) or 0.0) >= 0.0:
+            return None
+        fitted = [each.experiment for each in solution.collocation.transcriptions]
+        return branch, {"sizes": branch_differences(each for each in fitted if not each.specimen)}
+
+    return Deviation("hysteresis", "1", corrected=corrected, is_whole=True)
 
 
-def _slip_hypotheses(declared: Experiment, fitted_m: Array, of: str) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the marker whose residuals change most abruptly slipped;
-    `corrected` is the experiment without it.
+def _slip(fitted_m: Array) -> Deviation:
+    """Return the row of a marker that slipped, that whose residuals change most abruptly; without
+    it the marker is not fitted. `fitted_m` (T, M, 3) are the fitted positions of markers [m].
 
-    Nothing is yielded if two means explain no marker's residuals better than one by the factor
-    `SLIP`, or for a single marker.
+    It is impossible if two means explain no marker's residuals better than one by the factor
+    `SLIP`, and for a single marker.
     """
-    residual = _residual(declared, fitted_m)
-    described = DeclaredMotion.from_experiment(declared)
-    if described is not None:
-        residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
-    if residual.shape[1] < 2:
-        return
-    clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
-    m = int(np.argmax([ratio for ratio, _ in clearest]))
-    if clearest[m][0] < SLIP:
-        return
-    tracks = np.array(declared.markers.positions_m)
-    tracks[:, m] = np.nan
-    data = {"marker": declared.markers.names[m], "t_s": declared.t_s[clearest[m][1]]}
-    without = replace(declared, markers=replace(declared.markers, positions_m=tracks))
-    yield Hypothesis("marker-slip", of, data=data, corrected=without)
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        residual = _residual(experiment, fitted_m)
+        described = DeclaredMotion.from_experiment(experiment)
+        if described is not None:
+            residual = np.einsum(
+                "tji,tmj->tmi", described.rotations, residual[: len(described.t_s)]
+            )
+        if residual.shape[1] < 2:
+            return None
+        clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
+        m = int(np.argmax([ratio for ratio, _ in clearest]))
+        if clearest[m][0] < SLIP:
+            return None
+        markers = experiment.markers
+        tracks = np.array(markers.positions_m)
+        tracks[:, m] = np.nan
+        data = {"marker": markers.names[m], "t_s": experiment.t_s[clearest[m][1]]}
+        return replace(experiment, markers=replace(markers, positions_m=tracks)), data
+
+    return Deviation("marker-slip", "m", corrected=corrected, is_whole=True)
 
 
 def _largest_step(residual: Array) -> tuple[float, int]:
@@ -548,30 +560,37 @@ def _lag_s(fitted: Solution) -> float:
     return lagged / max(moved, 1e-300)
 
 
-def _with_shifted_grasps(experiment: Experiment, deeper: bool) -> Experiment | None:
-    """Return the experiment with every grasp one layer of elements deeper or less deep; None if
-    that is impossible, or leaves a grasp fewer than three nodes or all nodes.
+def _other_layer(deeper: bool) -> Deviation:
+    """Return the row of grasps that hold one layer of elements more or less than stated.
 
     Deeper grasps hold all nodes of the elements that they touch; less deep ones leave out the nodes
-    of elements with a free node.
+    of elements with a free node. A grasp holds at least three nodes, and not all.
     """
-    cells = experiment.body.cells
-    n = len(experiment.body.nodes_m)
-    grasps = []
-    for grasp in experiment.grasps:
-        is_grasped = np.isin(np.arange(n), grasp.nodes)
-        # The layer that touches what is held, or of what is held that which touches the rest.
-        is_shifted = is_grasped if deeper else ~is_grasped
-        grown = np.zeros(n, dtype=bool)
-        grown[cells[is_shifted[cells].any(axis=1)]] = True
-        nodes = np.flatnonzero(grown if deeper else is_grasped & ~grown)
-        if len(nodes) < 3 or len(nodes) > n - 1:
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        cells = experiment.body.cells
+        n = len(experiment.body.nodes_m)
+        grasps = []
+        for grasp in experiment.grasps:
+            is_grasped = np.isin(np.arange(n), grasp.nodes)
+            # The layer that touches what is held, or of what is held that which touches the rest.
+            is_shifted = is_grasped if deeper else ~is_grasped
+            grown = np.zeros(n, dtype=bool)
+            grown[cells[is_shifted[cells].any(axis=1)]] = True
+            nodes = np.flatnonzero(grown if deeper else is_grasped & ~grown)
+            if len(nodes) < 3 or len(nodes) > n - 1:
+                return None
+            grasps.append(replace(grasp, nodes=nodes))
+        try:
+            other = replace(experiment, grasps=grasps)
+        except InputError:
             return None
-        grasps.append(replace(grasp, nodes=nodes))
-    try:
-        return replace(experiment, grasps=grasps)
-    except InputError:
-        return None
+        return other, {"deep": "more" if deeper else "fewer"}
+
+    return Deviation("grasp-layer", "1", corrected=corrected, is_whole=True)
+
+
+GRASP_LAYERS = (_other_layer(deeper=True), _other_layer(deeper=False))
 
 
 def _residual(experiment: Experiment, predicted_m: Array) -> Array:

@@ -122,6 +122,12 @@ def corrected_hypothesis(
     return Hypothesis(row.name, f"'{experiment.name}'", data=data, corrected=other, deviation=row)
 
 
+def corrected_hypotheses(rows: Iterable[Deviation], experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield the hypotheses of those likely mistakes that are possible, each as a whole."""
+    found = (corrected_hypothesis(row, experiment) for row in rows)
+    return (each for each in found if each is not None)
+
+
 def clock_hypothesis(
     subject: str, lag_s: float, corrected: Any, handicap: float = 1.0
 ) -> Hypothesis:

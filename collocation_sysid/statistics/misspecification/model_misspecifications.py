@@ -307,9 +307,9 @@ def linear_step(
     return float(-2 * amplitudes @ gram[own, 0] - amplitudes @ among @ amplitudes), amplitudes
 
 
-def mirror_images(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypotheses that the mesh is a mirror image along each axis about the middle of its
-    grasps, if that is another shape.
+def mirrored_meshes(experiment: Experiment) -> Iterator[Deviation]:
+    """Yield the rows of a mesh that is a mirror image along an axis about the middle of its grasps,
+    if that is another shape.
     """
     body = experiment.body
     if (
@@ -326,16 +326,20 @@ def mirror_images(experiment: Experiment) -> Iterator[Hypothesis]:
     tree = KDTree(surface)
     is_filmed = any(each.counts_pixels for each in experiment.measurements)
     code = "mesh-mirrored/or-images" if is_filmed else "mesh-mirrored"
-    for axis, name in enumerate(AXES):
-        factors = np.ones(3)
-        factors[axis] = -1.0
+    for axis, factors in enumerate(np.ones((3, 3)) - 2 * np.eye(3)):
         away_m = tree.query(middle_m + factors * (surface - middle_m))[0]
-        if away_m.max() < SAME_SHAPE * size_m:
-            continue
-        mirrored = with_shape(experiment, factors)
-        if mirrored is not None:
-            of = f"'{experiment.name}'"
-            yield Hypothesis(code, of, data={"axis": name}, corrected=mirrored)
+        if away_m.max() >= SAME_SHAPE * size_m:
+            yield _mirrored(axis, factors, code)
+
+
+def _mirrored(axis: int, factors: Array, code: str) -> Deviation:
+    """Return the row of a mesh that is mirrored along an axis: multiplied by factors (3,)."""
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        other = with_shape(experiment, factors)
+        return other and (other, {"axis": AXES[axis]})
+
+    return Deviation(code, "1", corrected=corrected, is_whole=True)
 
 
 def _middle_of_grasps_m(experiment: Experiment) -> Array:
