@@ -171,20 +171,25 @@ class SpecimenReader:
         )
 
     def _placeholders(self, arguments: Mapping[str, Array | None]) -> list[str]:
-        """Return the names of measurements that are all 0 although they cannot be, and note that
-        they are not used.
+        """Return the names of measurements that are all 0, or another constant in a test of several
+        strains, although they cannot be, and note that they are not used.
         """
         names = []
+        strain = arguments["strain"]
+        is_varied = strain is not None and np.ptp(strain) > 0
         for name, what, is_impossible in (
             ("second_stress_pa", "second stresses", self.section.test == "planar"),
             ("lateral_stretch", "lateral stretches", True),
         ):
             values = arguments[name]
             known = np.zeros(0) if values is None else values[np.isfinite(values)]
-            if is_impossible and known.size and not known.any():
+            # A lateral stretch of exactly one is that of cork, or a placeholder, which a fit shows.
+            is_constant = known.size > 2 and not np.ptp(known) and is_varied and known[0] != 1
+            if is_impossible and known.size and (is_constant or not known.any()):
                 names.append(name)
                 self._add_note(
-                    f"all {known.size} {what} in {self.section.file} are 0, which is impossible in a "
+                    f"all {known.size} {what} in {self.section.file} are {known[0]:g}, which is "
+                    f"impossible in a "
                     f"{self.section.test} test: they are taken as not measured"
                 )
         return names

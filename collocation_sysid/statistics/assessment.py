@@ -245,13 +245,18 @@ def _correlations(dependence: Dependence) -> tuple[bool, bool]:
     return abs(dependence.lag1) > max(PERSISTENT, limit), dependence.shared_p < RARE
 
 
-def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return a concern with the parameters on which recordings disagree, or nothing."""
+def _disagreements(uncertainty: Uncertainty) -> list[str]:
+    """Return the names of the parameters on which recordings disagree."""
     scatter = uncertainty.scatter
     disagreeing = [] if scatter is None else np.flatnonzero(scatter.find_disagreements()).tolist()
+    return [uncertainty.names[k] for k in disagreeing]
+
+
+def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
+    """Return a concern with the parameters on which recordings disagree, or nothing."""
     names = [
         display_name(name, is_scalar=name in uncertainty.estimates)
-        for name in (uncertainty.names[k] for k in disagreeing)
+        for name in _disagreements(uncertainty)
     ]
     return concern_if(bool(names), False, code="residuals/recordings", names=names)
 
@@ -306,6 +311,8 @@ def parameter_concerns(
         for name, estimate in estimates.items()
         if not estimate.at_bound and estimate.statistical_std_error is None
     ]
+    # Each recording alone may determine what they disagree on.
+    is_open = not set(undetermined) & set(_disagreements(uncertainty))
     several = len(bounded) > 1
     code = "information/bounds" if several else "information/bound"
     return [
@@ -313,7 +320,7 @@ def parameter_concerns(
         *concern_if(bool(liquid), False, code="information/liquid", names=liquid),
         *concern_if(bool(bounded), several, code=code, names=bounded),
         *concern_if(
-            bool(undetermined) and len(undetermined) == len(estimates),
+            bool(undetermined) and len(undetermined) == len(estimates) and is_open,
             True,
             code="information/none",
             names=undetermined,

@@ -203,6 +203,9 @@ TOPICS: dict[str, Topic] = {
             "axial_stretch: divide them by axial_stretch, or state the distance after it as length_m",
             "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
             "without it: leave the column out if this was not measured",
+            "specimen-area": "its stresses agree with those of the other specimens if they are "
+            "multiplied by {factor:.4g}, or the others divided by it, which is the factor of {mistake}: "
+            "check area and load of both",
             "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
             "is probably {unit}",
         },

@@ -151,9 +151,9 @@ def test_times_have_any_unit(file, name):
 
 
 def test_units_of_poses_that_are_not_known_are_refused_with_those_that_are(file):
-    text = POSES.replace("x_m,y_m,z_m", "x (ft),y (ft),z (ft)")
+    text = POSES.replace("x_m,y_m,z_m", "x (ell),y (ell),z (ell)")
     message = refusal(read_poses, file(text))
-    assert "column x (ft) has the unit ft; expected one of m, cm, mm" in message
+    assert "column x (ell) has the unit ell; expected one of m, cm, mm" in message
 
 
 def test_markers_asked_for_come_in_the_order_asked(file):

@@ -253,13 +253,16 @@ def test_mistakes_in_a_table_are_named(tmp_path, header, factors, keys, message)
     assert "problem.toml" in str(raised.value) or "pull.csv" in str(raised.value)
 
 
-def test_a_second_stress_of_zeros_is_not_used(tmp_path):
-    rows = np.column_stack([STRAIN, simulated("planar", STRAIN)["stress"], 0 * STRAIN])
+@pytest.mark.parametrize("value", [0, -1])
+def test_a_second_stress_that_is_constant_is_not_used(tmp_path, value):
+    second = np.full_like(STRAIN, value)
+    rows = np.column_stack([STRAIN, simulated("planar", STRAIN)["stress"], second])
     text = PROBLEM.replace("uniaxial", "planar")
     path = written(tmp_path, text, "strain (-),stress (Pa),second stress (Pa)", rows)
     problem = cs.Problem.read(path)
     assert [each.name for each in problem.experiments[0].readings] == ["stress"]
-    assert any("all 12 second stresses in pull.csv are 0" in note for note in problem.notes)
+    (note,) = (note for note in problem.notes if "second stresses" in note)
+    assert f"all 12 second stresses in pull.csv are {value}, which is impossible" in note
 
 
 @pytest.mark.parametrize(
@@ -390,6 +393,25 @@ def test_a_refit_finds_kilopascals_beside_pascals():
     assert [each.cause for each in run.causes][:1] == ["specimen-unit"]
     assert "'planar'" in run.causes[0].message
     assert "multiplied by 1000" in run.causes[0].message
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("factor", "named"), [(0.25, "diameter"), (1 / 9.80665, "newtons"), (1, "")]
+)
+def test_a_refit_finds_an_area_that_differs_from_that_of_the_other_specimens(factor, named):
+    rng = np.random.default_rng(5)
+    specimens = []
+    for test, of_test in (("uniaxial", 1.0), ("equibiaxial", factor)):
+        stress_pa = simulated(test, STRAIN)["stress"] + 500.0 * rng.normal(size=len(STRAIN))
+        twin = cs.Specimen(test, STRAIN, of_test * stress_pa, of_test * 500.0)
+        specimens.append(twin.experiment(name=test))
+    run = cs.run(cs.Problem(specimens, {**NEO_HOOKEAN, "young_pa": cs.Unknown()}))
+    assert [each.cause for each in run.causes][:1] == (["specimen-area"] if named else [])
+    assert (run.trust.verdict == "good") == (not named)
+    if named:
+        assert named in run.trust.reasons[0]
+        assert "information/none" not in [each.code for each in run.trust.concerns]
 
 
 # Beside other recordings --------------------------------------------------------------------------

@@ -132,10 +132,51 @@ def test_units_of_stress_of_real_files(unit, factor):
     [
         *(("gf", "force", 9.80665e-3), ("µN", "force", 1e-6), ("nN", "force", 1e-9)),
         *(("nm", "length", 1e-9), ("µm", "length", 1e-6), ("Nm", "torque", 1.0)),
+        *(("cN", "force", 1e-2), ("ozf", "force", 0.278014), ("mil", "length", 2.54e-5)),
+        *(("µε", "ratio", 1e-6), ("microstrain", "ratio", 1e-6), ("‰", "ratio", 1e-3)),
+        *(
+            ("N mm^-2", "pressure", 1e6),
+            ("N·mm⁻²", "pressure", 1e6),
+            ("Torr", "pressure", 133.32237),
+        ),
     ],
 )
 def test_small_units_of_real_files(unit, dimension, factor):
     assert si_factor(unit, dimension) == pytest.approx(factor, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "header", ["Strain %,Stress kPa", "strain/%,stress/kPa", "Strain / %,Stress N/cm²"]
+)
+def test_units_without_brackets_are_read(tmp_path, header):
+    path = tmp_path / "pull.csv"
+    path.write_text(f"{header}\n10,2\n20,3\n")
+    table = read_specimen(path, SpecimenLayout(test="uniaxial", columns={}))
+    np.testing.assert_allclose(table.strain, [0.1, 0.2])
+    np.testing.assert_allclose(table.stress_pa, [2e3, 3e3] if "kPa" in header else [2e4, 3e4])
+
+
+@pytest.mark.parametrize(
+    ("header", "strain"), [("ε (%),σ (kPa)", "ε (%)"), ("gamma (-),tau (kPa)", "gamma (-)")]
+)
+def test_a_strain_of_another_name_is_recognised_by_its_unit(tmp_path, header, strain):
+    path = tmp_path / "pull.csv"
+    path.write_text(f"{header}\n0.1,2\n0.2,3\n")
+    with pytest.raises(cs.InputError) as raised:
+        read_specimen(path, SpecimenLayout(**of_test({})))
+    (columns,) = statements(str(raised.value))
+    assert columns["strain"] == strain
+
+
+@pytest.mark.parametrize("code", [-9999, 99999])
+def test_codes_of_missing_values_are_refused(tmp_path, code):
+    path = tmp_path / "pull.csv"
+    path.write_text(f"stretch,stress (kPa)\n1.1,2\n1.2,{code}\n1.3,4\n")
+    layout = SpecimenLayout(test="uniaxial", columns={})
+    with pytest.raises(cs.InputError, match=r"line 3: .* a common code of missing values"):
+        read_specimen(path, layout)
+    path.write_text("stretch,stress (kPa)\n1.1,2\n1.2,\n1.3,4\n")
+    np.testing.assert_allclose(read_specimen(path, layout).stress_pa, [2e3, np.nan, 4e3])
 
 
 def test_an_unknown_unit_is_to_be_converted_not_renamed(tmp_path):

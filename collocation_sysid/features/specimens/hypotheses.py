@@ -81,6 +81,18 @@ DECIDING_SAMPLES = 60
 DECIDING_ITERATIONS = 30
 # Units that stresses are confused in: name of the factor that corrects the file.
 UNIT_FACTORS = {"kPa": 1e-3, "MPa": 1e3}
+# Factors on the stress of a specimen, or their inverses, that correct its area or load, by the mistake.
+LOAD_FACTORS = {
+    "a diameter that is taken for a radius": 4.0,
+    "a round section that is taken for a square one": 4 / np.pi,
+    "psi that are taken for kPa": 6.894757,
+    "kilograms-force that are taken for newtons": 9.80665,
+    "pounds that are taken for newtons": 4.448222,
+    "one of two loaded faces that is taken for both": 0.5,
+    "a length of the section that is off by ten": 10.0,
+}
+# Largest change of a ratio of initial slopes by nonlinear laws and zeros of the strain.
+SLOPE_RANGE = 1.5
 # Causes that show with any law.
 EVIDENT = ("specimen-unit", "specimen-placeholder")
 # Kinds of test that each kind is confused with, besides that of compression without free sides.
@@ -327,14 +339,16 @@ def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
 
 
 def _initial_slope(experiment: Experiment) -> float:
-    """Return the median |stress / strain| [Pa] of the smaller strains, or NaN."""
+    """Return Young's modulus [Pa] by the median |stress / strain| of the smaller strains, or NaN."""
     strain, _ = specimen_strains(experiment)
     stress_pa = experiment.readings[0].measured_values[:, 0]
     is_known = np.isfinite(stress_pa) & (strain != 0)
     if not is_known.any():
         return np.nan
     order = np.argsort(np.abs(strain[is_known]))[: len(strain) // 2 + 1]
-    return float(np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order])))
+    slope = float(np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order])))
+    ratio = 1.0 if experiment.specimen is None else experiment.specimen.young_ratio
+    return slope / (ratio if np.isfinite(ratio) else 1.0)
 
 
 def _misfit(parts: Sequence[ExperimentIterate]) -> float:
@@ -383,6 +397,10 @@ def likely_mistakes(
         decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
         if (decades > np.log(UNIT_LIKE)).any():
             yield _mistake("specimen-unit", partial(_of_unit, unit=unit))
+    for what, stated in LOAD_FACTORS.items():
+        for factor in (stated, 1 / stated):
+            if any(1 / SLOPE_RANGE < ratio / factor < SLOPE_RANGE for ratio in ratios):
+                yield _mistake("specimen-area", partial(_of_area, what=what, factor=factor))
 
 
 def _other_kinds(experiment: Experiment) -> Iterator[Deviation]:
@@ -426,6 +444,11 @@ def _of_unit(experiment: Experiment, unit: str) -> Correction:
     factor = UNIT_FACTORS[unit]
     other = _with_stress(experiment, np.full(len(experiment.t_s), factor))
     return other, {"unit": unit, "factor": factor}
+
+
+def _of_area(experiment: Experiment, what: str, factor: float) -> Correction:
+    other = _with_stress(experiment, np.full(len(experiment.t_s), factor))
+    return other, {"mistake": what, "factor": factor}
 
 
 def _of_another_kind(experiment: Experiment, test: str) -> Correction:

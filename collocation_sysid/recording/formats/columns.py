@@ -26,7 +26,7 @@ from .text import (
     read_table,
     times_in_column,
 )
-from .units import expected_units, si_factor
+from .units import UNITS, expected_units, si_factor
 
 
 @dataclass(frozen=True)
@@ -150,6 +150,8 @@ _NAMED = re.compile(
     r"(?P<name>.*?)\s*(?:[(\[](?P<bracketed>[^()\[\]]*)[)\]]"
     r"|(?:_|\s/\s*|\sin\s)(?P<behind>[^\s_]+))"
 )
+# A known unit behind a blank or a stroke, as in Strain % or stress/kPa.
+_BARE_UNIT = re.compile(r"(?P<name>[^/]*?[^/\s])(?:\s+|/)(?P<unit>[^\s\d][^\s]*)")
 # A unit with underscores, as in stress_kgf_cm2.
 _PER_AREA = re.compile(r"(?P<name>.+)_(?P<unit>[^\W_]+)_(?P<area>[^\W_]+)")
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
@@ -420,8 +422,8 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
     """Return the names of all columns that may hold a quantity although their names do not fit it,
     in their order.
 
-    These are columns of quantities with a dimension whose unit fits, as "s_mpa" for a stress, and
-    of `unitless` quantities those with one of its words and no unit but a number, as "lambda_2" for
+    These are columns of quantities whose unit, which is no number, fits, as "s_mpa" for a stress,
+    and of `unitless` quantities those with one of its words and no unit but a number, as "lambda_2" for
     a second stretch. Names that fit another known quantity are left out.
     """
     names = []
@@ -434,8 +436,8 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
             others = ()
         else:
             is_similar = (
-                quantity.dimension != "ratio"
-                and unit is not None
+                unit is not None
+                and not unit.isdigit()
                 and si_factor(unit, quantity.dimension) is not None
             )
             others = KNOWN_QUANTITIES
@@ -496,18 +498,22 @@ def _other_word(column: str) -> str:
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
-    """Return the parts of a column's name: ("Load", "kN") of "Load (kN)"; the unit is None without
-    one, or if the brackets are empty.
+    """Return the parts of a column's name: ("Load", "kN") of "Load (kN)", "Load kN" or "Load/kN";
+    the unit is None without one, or if the brackets are empty.
     """
     parts = _PER_AREA.fullmatch(column)
     if parts is not None:
         unit = f"{parts['unit']}/{parts['area']}"
         if si_factor(unit, STRESS.dimension) is not None:
             return parts["name"], unit
-    parts = _NAMED.fullmatch(column)
-    if parts is None or _key_of(column) in {quantity.key for quantity in KNOWN_QUANTITIES}:
+    if _key_of(column) in {quantity.key for quantity in KNOWN_QUANTITIES}:
         return column, None
-    return parts["name"], parts["bracketed"] or parts["behind"]
+    if (parts := _NAMED.fullmatch(column)) is not None:
+        return parts["name"], parts["bracketed"] or parts["behind"]
+    parts = _BARE_UNIT.fullmatch(column)
+    if parts is not None and any(si_factor(parts["unit"], each) for each in UNITS):
+        return parts["name"], parts["unit"]
+    return column, None
 
 
 def _key_of(name: str) -> str:

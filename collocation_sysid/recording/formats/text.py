@@ -30,6 +30,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 # Largest accepted number: no measurement is larger, and products of two such numbers are finite.
 LARGEST_NUMBER = 1e100
+# Numbers that stand for missing values in files of many programs, if they are larger than all others
+# by this factor.
+MISSING_CODES = (-999.0, -9999.0, -99999.0, -999999.0, 9999.0, 99999.0, 999999.0)
+CODE_RATIO = 10.0
 _ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
 _CONTROL = re.compile("[\x01-\x08\x0e-\x1f]")
 _SEPARATOR = re.compile("[,;\t]")
@@ -307,7 +311,25 @@ def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) 
                     f"column {name} holds '{excerpt(cell)}'; expected {expected}", i
                 )
             values[i, j] = value
+    for j, column in enumerate(columns):
+        _require_no_codes(grid, column, values[:, j], blank_allowed)
     return values
+
+
+def _require_no_codes(grid: TextTable, column: int, values: Array, blank_allowed: bool) -> None:
+    """Raise an `InputError` if values (rows,) of a column are codes of missing ones."""
+    is_code = np.isin(values, MISSING_CODES)
+    largest = float(np.nanmax(np.abs(values[~is_code]), initial=0.0))
+    is_code &= np.abs(values) > CODE_RATIO * largest
+    if is_code.any() and len(values) > 1:
+        row = int(is_code.argmax())
+        expected = "a blank cell" if blank_allowed else "no row"
+        raise grid.error_at(
+            f"column {grid.columns[column]} holds {values[row]:g} in {is_code.sum()} rows, a common "
+            f"code of missing values, and at most {largest:.4g} in the others; expected {expected} "
+            "where nothing was measured",
+            row,
+        )
 
 
 def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
