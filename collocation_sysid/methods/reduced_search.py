@@ -48,6 +48,9 @@ LONGEST_SWEPT = 2.0
 # search as converged, otherwise only if shorter steps are rejected, too: the stress of a nearly
 # incompressible body at small strain has few digits.
 INSIGNIFICANT = 1e-6
+# So does, with impacts, a rejection where a full step is below this share of each standard error:
+# ripples of the loss are larger than what such a step can gain.
+NEAR = 0.1
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -400,7 +403,7 @@ class ReducedSearch:
         # Points of little accuracy are not the result.
         is_rough = not self._is_final_accuracy(accuracy)
         while True:
-            step = self._next_step(point, curvature)
+            step = self._next_step(point, curvature, self.trust)
             length = self._step_length(step)
             # A step that the trust region shortens contains no information on the remaining
             # distance.
@@ -445,17 +448,18 @@ class ReducedSearch:
                 and is_full_step
                 and point.loss - point.predicted_loss(step) <= INSIGNIFICANT
             )
-            if (is_short or is_insignificant) and (
-                point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
+            is_within_noise = self.has_impacts and self._is_near(
+                point, self._full_step(point, curvature), NEAR
+            )
+            if ((is_short or is_insignificant) and self._is_feasible(point, NEARLY_FEASIBLE)) or (
+                is_within_noise and self._is_feasible(point, INFEASIBLE)
             ):
-                return Status.CONVERGED  # rounding keeps it from getting better
+                return Status.CONVERGED  # rounding, or ripples, keep it from getting better
             if self.has_unlabelled and length <= LEAST_DETERMINED_SHARE:
                 # The association changes the loss by more than such a step.
-                count = self.collocation.nq
-                distance = np.abs(self._full_step(point, curvature)[:count])
                 # The intervals contain the minima that other correspondences have so near.
-                is_near = distance <= point.fit.standard_errors[:count]
-                self.ended_by_association = not is_near.all()
+                is_near = self._is_near(point, self._full_step(point, curvature), 1.0)
+                self.ended_by_association = not is_near
                 return Status.CONVERGED
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
                 return self._status_without_progress(point, curvature)
@@ -473,13 +477,23 @@ class ReducedSearch:
         full step is predicted to decrease the loss by less than is significant.
         """
         remaining = point.loss - point.predicted_loss(self._full_step(point, curvature))
-        is_feasible = point.feasibility_m <= NEARLY_FEASIBLE * self.size_m
+        is_feasible = self._is_feasible(point, NEARLY_FEASIBLE)
         return Status.CONVERGED if is_feasible and remaining <= INSIGNIFICANT else Status.STALLED
 
+    def _is_feasible(self, point: Iterate, limit: float) -> bool:
+        """Return whether the infeasibility of a point is at most a share of the body's size."""
+        return point.feasibility_m <= limit * self.size_m
+
+    def _is_near(self, point: Iterate, step: Array, share: float) -> bool:
+        """Return whether a step (np,) changes each shared parameter by at most a share of its
+        standard error.
+        """
+        count = self.collocation.nq
+        return bool((np.abs(step[:count]) <= share * point.fit.standard_errors[:count]).all())
+
     def _full_step(self, point: Iterate, curvature: Array) -> Array:
-        """Return the next step (np,) within the largest trust region, which is set."""
-        self.trust = self.largest_trust
-        return self._next_step(point, curvature)
+        """Return the next step (np,) within the largest trust region."""
+        return self._next_step(point, curvature, self.largest_trust)
 
     def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
         """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
@@ -495,13 +509,13 @@ class ReducedSearch:
         """
         return float(np.abs(step / self.reach).max(initial=0.0))
 
-    def _next_step(self, point: Iterate, curvature: Array) -> Array:
+    def _next_step(self, point: Iterate, curvature: Array, trust: float) -> Array:
         """Return the step (np,) from `point` that minimises the quadratic model of the loss, with
         the neglected curvature (np, np) added as far as `with_curvature` allows, within bounds and
-        trust region; nothing is changed.
+        a trust region.
         """
-        low = np.maximum(self.lower - point.p, -self.trust * self.reach)
-        high = np.minimum(self.upper - point.p, self.trust * self.reach)
+        low = np.maximum(self.lower - point.p, -trust * self.reach)
+        high = np.minimum(self.upper - point.p, trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
         low = np.minimum(low, 0.0) - 1e-15
         high = np.maximum(high, 0.0) + 1e-15

@@ -122,6 +122,9 @@ class Deviation:
     is_ruler : bool
         Whether it is estimated by one linear step, instead of considered, where the data determine
         it much better than the budget does, see `uncertainty_budget`.
+    is_limited : bool
+        Whether data that determine it much better than the budget does limit its size, without
+        being corrected for it, because errors of the mesh resemble it.
     redefines : tuple of str
         Constants, without a region, that another answer would define differently. Their intervals
         do not contain the effect; the values under the alternative are reported instead.
@@ -193,6 +196,7 @@ class Deviation:
     of_specimens: bool = False
     is_one_sided: bool = False
     is_ruler: bool = False
+    is_limited: bool = False
     redefines: tuple[str, ...] = ()
     alternative: str = ""
     proportional_to: Callable[[str], bool] | None = None

@@ -353,6 +353,7 @@ OBSTACLE_TILT = Deviation(
     changes=("grasps",),
     by="length",
     considered=0.2 * DEGREE,
+    is_limited=True,
     applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     applies_to=_has_tilt,
     label="tilt of {which}, {axis}",

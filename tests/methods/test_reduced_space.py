@@ -30,6 +30,7 @@ from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
+from collocation_sysid.methods.reduced_search import ReducedSearch
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.starts.initial_trajectories import (
@@ -409,8 +410,8 @@ def test_nothing_is_printed(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.long
-def test_the_search_for_the_constants_of_a_falling_block_converges():
+def falling_block(guesses, noise_m):
+    """Problem of a block that falls on a plane, with measured tracks."""
     t_s = np.arange(26) / 120
     body = cs.Body(cs.box_mesh((0.1, 0.1, 0.1), (1, 1, 1)), density_kg_m3=1000.0)
     floor = cs.Obstacle(shape=cs.Plane((0, 0, 1), (0, 0, -0.05)), friction=0.3, name="floor")
@@ -426,16 +427,27 @@ def test_the_search_for_the_constants_of_a_falling_block_converges():
     )
     truth = {"young_pa": 2e5, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.1}
     tracks_m = cs.simulate(fall, truth, "bdf2", substeps=4).markers_m
-    tracks_m = tracks_m + 1e-3 * np.random.default_rng(1).normal(size=tracks_m.shape)
-    guesses = {
-        "young_pa": cs.Unknown(1e6),
-        "poisson": cs.Unknown(0.4),
-        "gamma_r_s": cs.Unknown(0.008),
-    }
-    problem = cs.Problem(
-        [cs.with_markers(fall, tracks_m)], truth | guesses, scheme="bdf2", substeps=4
-    )
-    found = cs.solve(problem)
+    tracks_m = tracks_m + noise_m * np.random.default_rng(1).normal(size=tracks_m.shape)
+    unknown = {name: cs.Unknown(guess) for name, guess in guesses.items()}
+    return cs.Problem([cs.with_markers(fall, tracks_m)], truth | unknown, scheme="bdf2", substeps=4)
+
+
+@pytest.mark.long
+def test_the_search_for_the_constants_of_a_falling_block_converges():
+    guesses = {"young_pa": 1e6, "poisson": 0.4, "gamma_r_s": 0.008}
+    found = cs.solve(falling_block(guesses, noise_m=1e-3))
     assert found.status is Status.CONVERGED
     assert found.iterations < 40
     assert abs(np.log10(found.parameters["young_pa"] / 2e5)) < 0.05
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("guess_pa", "status"), [(2.001e5, Status.CONVERGED), (3e5, Status.STALLED)]
+)
+def test_ripples_of_the_loss_of_an_impact_end_a_search_near_its_minimum(
+    monkeypatch, guess_pa, status
+):
+    monkeypatch.setattr(ReducedSearch, "_try", lambda *_, **__: None)
+    collocation = falling_block({"young_pa": guess_pa}, noise_m=0.0).collocation()
+    assert ReducedSpace(ladder=(1.0,))(collocation).status is status

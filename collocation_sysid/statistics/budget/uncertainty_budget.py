@@ -12,6 +12,10 @@ Rulers are not considered but estimated where the data determine them much bette
 of a body that falls and stops, gravity determines the scale of the cameras. With S their covariance
 and s their estimates by one linear step, the estimates change by C s, and have P + C S Cᵀ. This holds
 only if no motion is prescribed, which the same cameras may have measured.
+
+A body that lands on a tilted plane turns, which the data show. An error of the mesh resembles a
+tilt, so that estimates are not corrected for it. Given the data, they are then off by the mean
+square C (S + s sᵀ) Cᵀ, in place of C Cᵀ.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
+from ...recording.deviation import Deviation
 from ..distributions import student_ppf
 from ..estimates import Estimate, IntervalCoordinate
 from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step, least_squares_of_fit
@@ -194,7 +199,8 @@ class VarianceSources:
         known_deviations = deviations or {}
         budgeted = [k for k, row in enumerate(rows) if known_deviations.get(row, 1.0) is not None]
         considered = budgeted if has_rulers else []
-        rulers, values, joint = _determined_rulers(fit, assumed, columns=considered)
+        rulers, values, joint = _determined(fit, assumed, considered, _is_ruler)
+        limited, limits, beside = _determined(fit, assumed, considered, _is_ruler_or_limited)
         shift = moved[:, rulers] @ values
         ruler_errors = np.zeros(0)
         if rulers:
@@ -204,6 +210,13 @@ class VarianceSources:
             others = [k for k in budgeted if k not in rulers]
             moved[:, rulers] = moved[:, rulers] @ (axes * np.sqrt(widths)) @ axes.T
             moved[:, others] = estimate_changes(joint, assumed.blocks)[: fit.shared_count, others]
+        seen = [place for place, k in enumerate(limited) if k not in rulers]
+        if seen:
+            first = len(fit.names)
+            covariance = covariance_of_fit(beside)[first:, first:][np.ix_(seen, seen)]
+            widths, axes = np.linalg.eigh(covariance + np.outer(limits[seen], limits[seen]))
+            columns = [limited[place] for place in seen]
+            moved[:, columns] = moved[:, columns] @ (axes * np.sqrt(widths)) @ axes.T
         by_q = _estimate_derivatives(fit, parameters, q=q)
         scatter = uncertainty.scatter
         between = np.zeros((fit.shared_count, 0))
@@ -330,18 +343,28 @@ class VarianceSources:
         return counted and not is_definition(row, estimate)
 
 
-def _determined_rulers(
-    fit: LinearisedFit, assumed: ResidualChanges, columns: Sequence[int]
-) -> tuple[list[int], Array, LinearisedFit]:
-    """Return the columns of the rulers that the data determine, their values (r,) by one linear step
-    in the deviations of the budget, and the fit in which they are parameters; the fit itself without
-    any, or if a value is larger than the budget grants.
+def _is_ruler(row: Deviation) -> bool:
+    return row.is_ruler
 
-    `columns` are those of the budget: whether a ruler is determined is tested with all of them
-    relaxed.
+
+def _is_ruler_or_limited(row: Deviation) -> bool:
+    return row.is_ruler or row.is_limited
+
+
+def _determined(
+    fit: LinearisedFit,
+    assumed: ResidualChanges,
+    columns: Sequence[int],
+    is_sought: Callable[[Deviation], bool],
+) -> tuple[list[int], Array, LinearisedFit]:
+    """Return the columns of sought deviations that the data determine, their values (r,) by one
+    linear step in the deviations of the budget, and the fit in which they are parameters; the fit
+    itself without any, or if a value is larger than the budget grants.
+
+    `columns` are those of the budget: whether one is determined is tested with all of them relaxed.
     """
     nothing: tuple[list[int], Array, LinearisedFit] = [], np.zeros(0), fit
-    rulers = [k for k in columns if DEVIATIONS[assumed.names[k].partition(" ")[0]].is_ruler]
+    rulers = [k for k in columns if is_sought(DEVIATIONS[assumed.names[k].partition(" ")[0]])]
     if not rulers:
         return nothing
     first = len(fit.names)
