@@ -30,7 +30,6 @@ from collocation_sysid.fem.laws.moduli import engineering_constants
 from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
-from collocation_sysid.methods.reduced_search import ReducedSearch
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.starts.initial_trajectories import (
@@ -448,6 +447,18 @@ def test_the_search_for_the_constants_of_a_falling_block_converges():
 def test_ripples_of_the_loss_of_an_impact_end_a_search_near_its_minimum(
     monkeypatch, guess_pa, status
 ):
-    monkeypatch.setattr(ReducedSearch, "_try", lambda *_, **__: None)
+    simulate = Horizon.simulate
+
+    def simulate_without_guess(horizon, p, trajectories=None, guess=None):
+        """Fail for trials, which have a guess."""
+        if guess is not None:
+            return [], SimulationError("not simulated", 0.0)
+        return simulate(horizon, p, trajectories)
+
+    def fail(*_, **__):
+        raise SimulationError("no sweep", 0.0)
+
+    monkeypatch.setattr(Horizon, "simulate", simulate_without_guess)
+    monkeypatch.setattr(Horizon, "evaluate_step", fail)
     collocation = falling_block({"young_pa": guess_pa}, noise_m=0.0).collocation()
     assert ReducedSpace(ladder=(1.0,))(collocation).status is status
