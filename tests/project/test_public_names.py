@@ -53,6 +53,12 @@ def test_solving_does_not_import_scipys_statistics():
     assert run_python(code) == "False"
 
 
+def test_pictures_do_not_import_scipys_signal_processing():
+    """It takes half a second to import, a twentieth of a short solve."""
+    code = "import sys, collocation_sysid.result.pictures; print('scipy.signal' in sys.modules)"
+    assert run_python(code) == "False"
+
+
 @pytest.mark.long
 def test_pyright_knows_the_types_of_public_names_and_reports_misspelt_ones(tmp_path):
     if find_spec("pyright") is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.mlab import psd  # scipy.signal takes half a second to import
 from numpy.typing import NDArray
-from scipy.signal import periodogram
 
 from ...common.array_types import Array
 from ..figure_style import (
@@ -81,24 +81,23 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
     Returns
     -------
     hertz, density : (k,)
-        Frequencies above zero up to half the sampling rate. The density is NaN where it is zero, or
-        if no marker is present often enough.
+        Frequencies above zero and below half the sampling rate. The density is NaN where it is
+        zero, or if no marker is present often enough.
     """
     present = np.asarray(np.isfinite(tracks_m).all(axis=2))
     markers = np.flatnonzero(present.mean(axis=0) >= MIN_PRESENT_SHARE)
     padded = PADDING_FACTOR * len(tracks_m)
-    if not len(markers):
-        hertz = np.arange(padded // 2 + 1) * rate_hz / padded
-        return hertz[1:], np.full(len(hertz) - 1, np.nan)
+    hertz = np.arange(1, padded // 2) * rate_hz / padded
+    density = np.zeros(len(hertz))
     t = np.arange(len(tracks_m))
-    filled = np.zeros((len(t), len(markers), 3))
-    for place, marker in enumerate(markers):
-        is_present = present[:, marker]
-        for axis in range(3):
-            filled[:, place, axis] = np.interp(t, t[is_present], tracks_m[is_present, marker, axis])
-    hertz, density = periodogram(1e3 * filled, rate_hz, "hann", padded, detrend="linear", axis=0)
-    mean = density.sum(axis=2).mean(axis=1)
-    return hertz[1:], np.where(mean[1:] > 0, mean[1:], np.nan)
+    hann = np.hanning(len(t) + 1)[:-1]
+    for marker in markers:
+        known = np.flatnonzero(present[:, marker])
+        for moved_m in tracks_m[known, marker].T:
+            filled_mm = 1e3 * np.interp(t, known, moved_m)
+            powers, _ = psd(filled_mm, len(t), rate_hz, "linear", hann, pad_to=padded)
+            density += np.asarray(powers)[1:-1] / len(markers)
+    return hertz, np.where(density > 0, density, np.nan)
 
 
 def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
