@@ -62,6 +62,7 @@ from .statistics.budget.consider_analysis import (
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
 from .statistics.budget.systematic_effects import ASSUMPTIONS, DEVIATIONS
 from .statistics.budget.uncertainty_budget import VarianceSources
+from .statistics.curved_intervals import with_curved_intervals
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
 from .statistics.probes.budgeted_residuals import (
@@ -401,6 +402,7 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
         uncertainty = uncertainty_from_fit(
             fit, parameters, q=solution.q, error_model=problem.uncertainty
         )
+        uncertainty = with_curved_intervals(uncertainty, fit, solution.collocation, solution.z)
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.describe() for n in noises))

@@ -12,7 +12,8 @@ differ each has its own variance (see `noise_level`); intervals are then Student
 the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
 states which was used.
 
-Use `uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit is known.
+Use `curved_intervals.uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit
+is known.
 Estimated marker places have error bars too, see `marker_places`.
 """
 
@@ -31,7 +32,7 @@ from ..common.validated_classes import validated
 from ..errors import InputError
 from ..fem.laws.constants import constant_named, is_damping
 from ..model.parameters import Parameters
-from ..program.collocation import Collocation, ExperimentIterate
+from ..program.collocation import ExperimentIterate
 from ..program.linear_algebra.lapack import one_blas_thread
 from .distributions import normal_isf, student_ppf
 from .estimates import (
@@ -48,14 +49,7 @@ from .estimates import (
     user_estimates,
     without_long_term_moduli,
 )
-from .linearised import (
-    Information,
-    LinearisedFit,
-    factorise_information,
-    least_squares_of_fit,
-    linearise_fit,
-)
-from .pose_noise import with_pose_noise
+from .linearised import Information, LinearisedFit, factorise_information, least_squares_of_fit
 from .residuals.autocorrelation import (
     Dependence,
     analyse_dependence,
@@ -188,33 +182,6 @@ class Uncertainty(ErrorBasis):
         large as σ.
         """
         return self.chi_squared / max(1.0, self.degrees_of_freedom)
-
-
-def uncertainty_at(
-    collocation: Collocation, z: Array, error_model: ErrorModel = AUTO
-) -> Uncertainty:
-    """Return the uncertainty of the parameters at a solution, including noise of the poses.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        The program.
-    z : (variables,) array
-        The optimum, which satisfies the equations of motion.
-    error_model : ErrorModel
-        Assumptions about the errors.
-
-    Raises
-    ------
-    InputError
-        If the noise is to be estimated from fewer measurements than parameters.
-    SimulationError
-        If the equations of motion are singular.
-    """
-    fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z=z)
-    return uncertainty_from_fit(
-        fit, collocation.parameters, q=z[: collocation.nq], error_model=error_model
-    )
 
 
 @one_blas_thread()

@@ -28,7 +28,7 @@ from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.uncertainty import uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 
 PROBLEMS = Path(__file__).parents[2] / "problems"
 # Standard deviation of the noise that is added to the tracks [m]; foam_cylinder has noise already.

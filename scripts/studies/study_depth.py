@@ -31,7 +31,7 @@ import collocation_sysid as cs
 from collocation_sysid.program.depth.depth_comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
-from collocation_sysid.statistics.uncertainty import uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 # Camera matrix and image shape (rows, columns) [px].

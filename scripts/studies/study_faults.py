@@ -54,8 +54,9 @@ from collocation_sysid.statistics.budget.uncertainty_budget import (
     VarianceSources,
     budget,
 )
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
+from collocation_sysid.statistics.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator

@@ -23,7 +23,7 @@ from collocation_sysid.extras.live.sources import frames_of_recording
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
-from collocation_sysid.statistics.uncertainty import uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 
 # Number of samples at intervals of 10 ms.
 SAMPLES = 101

@@ -31,7 +31,8 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.uncertainty import ErrorModel
 
 Array = NDArray[np.float64]
 

@@ -39,7 +39,7 @@ import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording.grasp import Axes
-from collocation_sysid.statistics.uncertainty import uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 
 # Thickness of one layer of tetrahedra.
 THICKNESS = 0.05

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from collocation_sysid import Box, Nuisance, Problem, SimulationError, Solution, simulate, solve
 from collocation_sysid.recording import Experiment, PointMass
 from collocation_sysid.runs.warm_start import WarmStart
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.uncertainty import Uncertainty
 
 # Duration at the end of a recording over which the final travel is averaged [s]: two oscillations.
 FINAL_S = 0.25

@@ -26,7 +26,8 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.runs.numerical_error import finer_mesh, solve_refined
 from collocation_sysid.runs.warm_start import WarmStart
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.uncertainty import ErrorModel
 
 # Standard deviation of each marker coordinate [m]: so small that the numerical error is visible.
 NOISE_M = 5e-5

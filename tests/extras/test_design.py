@@ -43,8 +43,9 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Grasp, PoseSequence
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
+from collocation_sysid.statistics.uncertainty import ErrorModel
 
 AT = GUESS.with_guess(TRUTH)
 LIMITS = Limits.model_validate(

@@ -48,7 +48,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem.gripper_transforms import gripper_transforms
 from collocation_sysid.program import streaming_model, streaming_sweep
 from collocation_sysid.recording import Markers, Nuisance, PoseSequence, read_poses
-from collocation_sysid.statistics.uncertainty import uncertainty_at
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 
 TWENTY = 20 * "9"
 

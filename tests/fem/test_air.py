@@ -42,8 +42,8 @@ from collocation_sysid.statistics.budget.uncertainty_budget import (
     VarianceSources,
     budget,
 )
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 VOLUME_M3, DENSITY_KG_M3 = EDGE_M**3, 30.0
 STIFF = {"lambda_pa": 1e5, "mu_pa": 1e5, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.0}

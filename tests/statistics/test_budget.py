@@ -46,10 +46,10 @@ from collocation_sysid.statistics.budget.uncertainty_budget import (
     rescaled,
     source_label,
 )
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
-from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 NOTHING = {name: "none" for name in Assumptions().collect_deviations()}
 

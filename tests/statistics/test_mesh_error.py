@@ -22,9 +22,10 @@ from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.budget import mesh_error
 from collocation_sysid.statistics.budget.discretisation_error import Refinement, with_estimated_mesh
 from collocation_sysid.statistics.budget.mesh_error import mesh_change
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit, parameter_values
-from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_at
+from collocation_sysid.statistics.uncertainty import ErrorModel
 
 TRUTH = {"young_pa": 15e3, "poisson": 0.33, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 GUESS = TRUTH | {"young_pa": cs.Unknown(14e3), "poisson": cs.Unknown(0.3)}

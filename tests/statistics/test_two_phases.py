@@ -23,6 +23,7 @@ from collocation_sysid.runs.two_phases import (
     _two_phase_search,
     solve_two_phases,
 )
+from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.field_estimates import (
     FieldEstimate,
     field_estimates,
@@ -37,7 +38,6 @@ from collocation_sysid.statistics.phase_sampling import (
     sample_phases,
 )
 from collocation_sysid.statistics.potts_prior import PottsConstants, PottsHyperprior
-from collocation_sysid.statistics.uncertainty import uncertainty_at
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
 KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}

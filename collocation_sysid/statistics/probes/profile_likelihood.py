@@ -7,9 +7,8 @@ loss; where the loss never rises so far, the interval is open.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import root_scalar
@@ -20,10 +19,11 @@ from ...errors import InputError, SimulationError
 from ...fem.laws.constants import Scale
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
-from ...model.parameters import Parameter
+from ...model.parameters import Parameter, Parameters
+from ...program.collocation import Collocation
 from ..distributions import chi2_isf
 from ..estimates import relative_derivatives
-from ..linearised import LinearisedFit, least_squares_of_fit
+from ..linearised import LinearisedFit, least_squares_of_fit, parameter_values
 from ..uncertainty import Uncertainty
 
 SolveFixed = Callable[[str, float], float]
@@ -227,61 +227,67 @@ def profile_of_solution(
     value = solution.parameters[name]
     is_log = item.scale == "log"
 
-    changes = _conditional_changes(fit, free, k)
-    numbers = itertools.count(1)
-    fits = [solution]
-
-    def solve_fixed(_: str, trial: float) -> float:
-        """Return the loss with the parameter fixed at a value; the name is not used. The refit
-        starts where the linearised fit expects the others, from the nearest refit so far.
-        """
-        activity = f"profile likelihood of {name}, value {next(numbers)}"
-        at = item.to_coordinate(trial)
-        nearest = min(fits, key=lambda each: abs(item.to_coordinate(each.parameters[name]) - at))
-        start = dict(nearest.parameters)
-        distance = at - item.to_coordinate(start[name])
-        for other, change in zip(parameters.free, changes, strict=True):
-            if other.name in start and np.isfinite(change):
-                moved = other.to_coordinate(start[other.name]) + change * distance
-                start[other.name] = other.from_coordinate(moved)
-        with search_activity(activity):
-            refit = _refit_with_fixed(solution, item, value=trial, start=start)
-        if not refit.status.converged:
-            return float("inf")
-        fits.append(refit)
-        return _loss_of(refit) + _prior_loss(item, trial)
-
+    refits = Refits(solution.collocation, solution.z, fit, k)
     return compute_profile(
-        solve_fixed,
+        refits,
         name,
-        best=(value, _loss_of(solution)),
+        best=(value, refits.loss),
         bounds=(item.lower, item.upper),
         deviation=float(np.sqrt(variance)) * (1.0 if is_log else abs(value)),
-        noise_scale=_noise_scale(solution, fit, uncertainty=uncertainty, k=k),
+        noise_scale=noise_scale(parameters, solution.q, fit, uncertainty=uncertainty, k=k),
         scale=item.scale,
     )
 
 
-def _loss_of(solution: Solution) -> float:
-    """Return Σ ((ŷ − h(x)) / σ)², shortened by Huber's loss, with priors."""
-    return solution.collocation.objective(solution.z) / solution.collocation.loss_scale
-
-
-def _conditional_changes(fit: LinearisedFit, free: Sequence[str], k: int) -> Array:
-    """Return the change (nq,) of each parameter with parameter k; NaN if undetermined."""
-    covariance = least_squares_of_fit(fit).covariance()[: len(free), k]
-    return covariance / covariance[k]
-
-
-def _refit_with_fixed(
-    solution: Solution, item: Parameter, value: float, start: Mapping[str, float]
-) -> Solution:
-    """Return the fit by reduced space with one parameter fixed at a value, from given values of the
-    others. Short parts of the recording are not fitted before: they would leave the minimum.
+class Refits:
+    """Refits with one estimated parameter fixed, for `compute_profile`. Each starts where the
+    linearised fit expects its answer from that of the nearest refit so far.
     """
-    before = solution.collocation
-    fixed = before.parameters.with_estimates(start).with_fixed({item.name: value})
-    return ReducedSpace(ladder=(1.0,))(replace(before, parameters=fixed)).unless_interrupted()
+
+    def __init__(self, collocation: Collocation, z: Array, fit: LinearisedFit, k: int) -> None:
+        self.item = collocation.parameters.free[k]
+        self.loss = collocation.objective(z) / collocation.loss_scale  # at the optimum
+        self._k = k
+        covariance = least_squares_of_fit(fit).covariance()[:, k]
+        # Change (p,) of each parameter with this one; zero if undetermined.
+        changes = covariance / covariance[k]
+        self._changes = np.where(np.isfinite(changes) & ~fit.at_bound, changes, 0.0)
+        # Coordinate, program and variables of each refit, the last two without the parameter.
+        at = float(z[k])
+        self._known = [(at, self._fixed(collocation, at), np.delete(z, k))]
+
+    def __call__(self, _: str, value: float) -> float:
+        """Return the loss with the parameter fixed at a value, with its prior; infinite if the
+        refit does not converge.
+        """
+        at = self.item.to_coordinate(value)
+        before, near, z = self._nearest(at)
+        fixed = self._fixed(near, at)
+        p, positions = fixed.unpack(z)
+        p = p + np.delete(self._changes, self._k) * (at - before)
+        p = np.clip(p, *fixed.compute_parameter_bounds())
+        with search_activity(f"profile likelihood of {self.item.name}, value {len(self._known)}"):
+            # Short parts of the recording are not fitted before: they would leave the minimum.
+            refit = ReducedSpace(ladder=(1.0,))(fixed, start=fixed.pack(p, positions))
+        if not refit.unless_interrupted().status.converged:
+            return float("inf")
+        self._known.append((at, refit.collocation, refit.z))
+        loss = refit.collocation.objective(refit.z) / refit.collocation.loss_scale
+        return loss + _prior_loss(self.item, value)
+
+    def values_near(self, value: float) -> dict[str, float]:
+        """Return all parameters and derived moduli of the refit nearest to a value."""
+        _, collocation, z = self._nearest(self.item.to_coordinate(value))
+        return parameter_values(collocation, z[: collocation.nq])
+
+    def _nearest(self, at: float) -> tuple[float, Collocation, Array]:
+        return min(self._known, key=lambda each: abs(each[0] - at))
+
+    def _fixed(self, collocation: Collocation, at: float) -> Collocation:
+        value = self.item.from_coordinate(at)
+        return collocation.with_parameters(
+            collocation.parameters.with_fixed({self.item.name: value})
+        )
 
 
 def _prior_loss(item: Parameter, value: float) -> float:
@@ -293,9 +299,12 @@ def _prior_loss(item: Parameter, value: float) -> float:
     return float((departure / deviation) ** 2)
 
 
-def _noise_scale(solution: Solution, fit: LinearisedFit, uncertainty: Uncertainty, k: int) -> float:
+def noise_scale(
+    parameters: Parameters, q: Array, fit: LinearisedFit, uncertainty: Uncertainty, k: int
+) -> float:
     """Return parameter k's variance over that for independent errors of the stated σ."""
-    size = relative_derivatives(solution.collocation.parameters, solution.q)[k]
-    standard_error = size * least_squares_of_fit(fit).standard_errors[k]
+    standard_error = (
+        relative_derivatives(parameters, q)[k] * least_squares_of_fit(fit).standard_errors[k]
+    )
     scale = float(uncertainty.covariance[k, k] / standard_error**2)
     return scale if np.isfinite(scale) else 1.0
