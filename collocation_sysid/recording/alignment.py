@@ -16,6 +16,9 @@ from .marker_files import MarkerTable
 from .poses import PoseSequence
 from .sample_times import STEP_TOLERANCE, printed_rounding_s, unrounded_s
 
+# Units of times, over a second, and relative difference of durations that are the same.
+UNITS_OF_TIMES = {1e3: "ms", 1e6: "us"}
+SAME_DURATION = 0.2
 # Fewest samples of a motion: an acceleration needs three.
 _FEWEST_SAMPLES = 3
 
@@ -273,9 +276,18 @@ def _rate_hz(t_s: Array) -> float:
 
 
 def _clock_remedy(pose_times_s: Array, marker_times_s: Array) -> str:
-    """Return the end of a message on poses and markers without a common time: the difference of
-    their starts, for clocks with different zero points; "" if they overlap.
+    """Return the end of a message on poses and markers without a common time: the unit of the times
+    if that explains how long they last, else the difference of their starts, for clocks with
+    different zero points; "" if they overlap.
     """
+    ratio = np.ptp(marker_times_s) / max(np.ptp(pose_times_s), 1e-300)
+    for factor, unit in UNITS_OF_TIMES.items():
+        for of, other, size in (("markers", "poses", ratio), ("poses", "markers", 1 / ratio)):
+            if abs(size / factor - 1) < SAME_DURATION:
+                return (
+                    f"; the times of the {of} last about {factor:g} times as long as those of the "
+                    f"{other}, as if they were in {unit}: call their column t_{unit}"
+                )
     overlap_s = min(pose_times_s[-1], marker_times_s[-1]) - max(pose_times_s[0], marker_times_s[0])
     if overlap_s > 0:
         return ""

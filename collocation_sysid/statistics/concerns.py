@@ -154,6 +154,9 @@ TOPICS: dict[str, Topic] = {
             "measured-twice": "the values of {first} and {second} are exactly the same, which those of "
             "two measurements are not: one is a copy of the other; correct the file or its columns, or "
             "omit one of them",
+            "marker-held": "marker {marker} is exactly at one place in {count} samples, from t = "
+            "{t_s:.4g} s on, while another moves by {by_mm:.2g} mm: they are no measurements but a "
+            "gap that was filled; leave their cells blank",
             "marker-slip": "marker {marker} slips at about t = {t_s:.4g} s: give it "
             "markers.weights = 0, or end window_s before",
             "marker-slip/alone": "marker {marker} slips by {by_mm:.2g} mm at t = {t_s:.4g} s, the "

@@ -200,6 +200,18 @@ def test_clocks_without_a_common_time_are_named_with_their_difference(later_s, r
         align([moving_poses(t + later_s)], moving_table(t))
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us")])
+def test_times_in_another_unit_are_named_by_their_duration(factor, unit):
+    t = 0.01 * np.arange(20)
+    remedy = (
+        f"times of the markers last about .* as if they were in {unit}: call their column t_{unit}"
+    )
+    with pytest.raises(InputError, match=remedy):
+        align([moving_poses(t)], moving_table(factor * t))
+    with pytest.raises(InputError, match="times of the poses last about"):
+        align([moving_poses(factor * (t + 1.0))], moving_table(t))
+
+
 def test_faster_poses_keep_their_samples_in_between():
     t = 0.02 * np.arange(10)
     found = align([moving_poses(0.005 * np.arange(-8, 80), "hold")], moving_table(t))

@@ -286,6 +286,25 @@ def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rn
     assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
 
 
+@pytest.mark.parametrize("filled", ["last", "zeros", None])
+def test_gaps_that_were_filled_are_no_slips(filled):
+    (experiment,) = soft("bar").experiments
+    tracks_m = np.array(experiment.markers.positions_m)
+    tracks_m[20:30, 1] = {"last": tracks_m[20, 1], "zeros": 0.0, None: np.nan}[filled]
+    found = [*step_hypotheses(with_markers(experiment, tracks_m))]
+    assert [each.cause for each in found] == (["marker-held"] if filled else [])
+    if filled:
+        assert "in 10 samples" in found[0].message
+        assert "leave their cells blank" in found[0].message
+
+
+def test_coordinates_with_few_digits_are_no_filled_gaps():
+    (experiment,) = soft("bar").experiments
+    tracks_m = np.array(experiment.markers.positions_m)
+    tracks_m[:, 1] = 0.05 * np.round(tracks_m[:, 1] / 0.05)
+    assert not [e for e in step_hypotheses(with_markers(experiment, tracks_m)) if "held" in e.code]
+
+
 def test_steps_within_a_fast_motion_are_no_slips():
     """Of a motion with few samples the second differences are large, and may turn round."""
     experiment = hung_cube(36)

@@ -325,9 +325,9 @@ def _require_no_codes(grid: TextTable, column: int, values: Array, blank_allowed
         row = int(is_code.argmax())
         expected = "a blank cell" if blank_allowed else "no row"
         raise grid.error_at(
-            f"column {grid.columns[column]} holds {values[row]:g} in {is_code.sum()} rows, a common "
-            f"code of missing values, and at most {largest:.4g} in the others; expected {expected} "
-            "where nothing was measured",
+            f"column {grid.columns[column]} holds {values[row]:g}, a common code of missing "
+            f"values, in {is_code.sum()} of {len(values)} rows, and at most {largest:.4g} elsewhere; "
+            f"expected {expected} where nothing was measured",
             row,
         )
 

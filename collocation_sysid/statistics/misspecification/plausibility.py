@@ -14,7 +14,7 @@ long.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -226,12 +226,16 @@ LIVELY = 0.9
 WITHIN_MOTION = 0.5
 # Fewest samples in which steps are searched.
 FEWEST = 8
+# Fewest samples at exactly one place that fill a gap, and share of the others that may be exactly
+# those before, as coordinates with few digits are.
+FEWEST_HELD = 5
+REPEATED = 0.1
 
 
 def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield hypotheses of poses that jump, of all markers that jump, and of single markers that
-    slip; nothing for fewer than `FEWEST` samples. Poses are tested only if a single grasp
-    carries the body.
+    are held at one place, or slip; nothing for fewer than `FEWEST` samples. Poses are tested only if
+    a single grasp carries the body.
     """
     if len(experiment.markers.positions_m) < FEWEST:
         return
@@ -239,7 +243,38 @@ def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
         moved_m = grasp.poses.moved_positions(_marker_box_m(experiment), experiment.t_s)
         yield from _pose_jump_hypotheses(experiment, moved_m)
         yield from _common_jump(experiment, moved_m)
-    yield from _slip_hypotheses(experiment)
+    held = [*_held_hypotheses(experiment)]
+    yield from held
+    yield from _slip_hypotheses(experiment, {each.data["marker"] for each in held})
+
+
+def _held_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield a hypothesis for each marker that is exactly at one place for some samples, as in a gap
+    that was filled with the last position or with zeros, while another one moves.
+    """
+    markers = experiment.markers
+    tracks_m = markers.positions_at_samples_m
+    repeats = (np.diff(tracks_m, axis=0) == 0).all(axis=2)
+    for m, name in enumerate(markers.names):
+        edges = np.flatnonzero(np.diff(np.r_[False, repeats[:, m], False]))
+        runs = [(k, end) for k, end in edges.reshape(-1, 2).tolist() if end - k >= FEWEST_HELD - 1]
+        count = sum(end - k for k, end in runs)
+        rest = np.isfinite(tracks_m[:, m, 0]).sum() - 1 - count
+        if not runs or repeats[:, m].sum() - count > REPEATED * rest:
+            continue
+        first, end = max(runs, key=lambda run: run[1] - run[0])
+        others_m = np.delete(tracks_m[first : end + 1], m, axis=1)
+        extents_m = np.linalg.norm(np.ptp(others_m, axis=0), axis=1)
+        moved_m = float(np.max(extents_m, initial=0.0, where=np.isfinite(extents_m)))
+        moving = moved_m / (STILL_SIGMAS * float(np.median(markers.sigma_m)))
+        if moving > 1:
+            data = {
+                "marker": name,
+                "count": count + len(runs),
+                "t_s": experiment.t_s[first],
+                "by_mm": 1e3 * moved_m,
+            }
+            yield Hypothesis("marker-held", f"'{experiment.name}'", data=data, strength=moving)
 
 
 def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
@@ -360,13 +395,13 @@ def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hy
         )
 
 
-def _slip_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each marker that steps alone and stays displaced."""
+def _slip_hypotheses(experiment: Experiment, held: Container[str]) -> Iterator[Hypothesis]:
+    """Yield a hypothesis for each marker that steps alone and stays displaced, unless it is `held`."""
     markers = experiment.markers
     tracks_m = markers.positions_at_samples_m
     sizes = step_sizes(tracks_m)
     for m, name in enumerate(markers.names):
-        if not np.isfinite(sizes[:, m]).any():
+        if name in held or not np.isfinite(sizes[:, m]).any():
             continue
         k = int(np.nanargmax(sizes[:, m]))
         others = np.delete(sizes[k], m)
