@@ -25,6 +25,7 @@ from ..program.simulation import simulate
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
+from ..recording.measurement_selection import with_some_samples
 from ..recording.obstacle import Obstacle
 from ..recording.poses import PoseSequence
 from ..recording.specimen import Specimen, cell_of_other_test
@@ -48,6 +49,7 @@ from ..statistics.combinations import (
 from ..statistics.estimates import relative_derivatives
 from ..statistics.linearised import LinearisedFit, linearise_fit
 from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
+from .coarse_start import sample_distance
 
 # Noise of an added instrument over its largest value.
 NOISE = 0.01
@@ -221,7 +223,8 @@ def with_measurements(
 ) -> tuple[Combination, ...]:
     """Return the combinations with the added sensor or test that would determine their constants
     best as the first of their `fixes`; unchanged where none would. Of specimens, the first test
-    that determines all of them well (`NARROW`) is taken.
+    that determines all of them well (`NARROW`) is taken. Of motions that are sampled much faster
+    than they change, every n-th sample serves, with the noise of the mean of n.
 
     Parameters
     ----------
@@ -241,6 +244,8 @@ def with_measurements(
     few = {n: s if n in (*dominant, CORRELATION_KEY) else None for n, s in deviations.items()}
     # Rulers that the data determine may reduce the effects of other assumptions.
     has_bound = bool(dominant) and not prescribes_no_motion(collocation)
+    distance = min(sample_distance(each.experiment) for each in collocation.transcriptions)
+    some, z = _with_some_samples(collocation, z, distance)
 
     def effects(what: str, expected: ExpectedPrecision) -> dict[int, Fix]:
         covariance = expected.covariance + (noise - 1) * expected.statistical
@@ -250,9 +255,9 @@ def with_measurements(
             if {*(members := each.determined.names)} <= {*expected.names}
         }
 
-    for what, added in added_measurements(collocation, z):
+    for what, added in added_measurements(some, z, NOISE / np.sqrt(distance)):
         try:
-            wide, at = _extended(collocation, z, added)
+            wide, at = _extended(some, z, added)
             exact = _exact_fit(wide, at)
             if has_bound:
                 least = effects(what, expected_precision(wide, at, few, exact))
@@ -272,15 +277,32 @@ def with_measurements(
     )
 
 
+def _with_some_samples(
+    collocation: Collocation, z: Array, distance: int
+) -> tuple[Collocation, Array]:
+    """Return the program with every n-th sample, n being `distance`, and the noise of their mean."""
+    if distance == 1:
+        return collocation, z
+    experiments = []
+    for transcription in collocation.transcriptions:
+        few = with_some_samples(transcription.experiment, distance)
+        markers = replace(few.markers, sigma_m=few.markers.sigma_m / np.sqrt(distance))
+        experiments.append(few.with_measurements([markers]))
+    some = replace(collocation, experiments=experiments)
+    p, positions = collocation.unpack(z)
+    pairs = zip(some.transcriptions, positions, strict=True)
+    return some, some.pack(p, [x[::distance][: each.grid_times] for each, x in pairs])
+
+
 def added_measurements(
-    collocation: Collocation, z: Array
+    collocation: Collocation, z: Array, noise: float = NOISE
 ) -> Iterator[tuple[str, Sequence[Experiment]]]:
     """Yield measurements that may be added to a problem, as phrases with all experiments.
 
     For specimens these are other tests of the same strains with the same relative noise and errors
     of area and zero. A body with a mesh, of which no force is measured, gets a force sensor at its
-    grasp, and a recorded motion a second recording after which it is held as long again. A test
-    that the law or the body does not allow is left out.
+    grasp, with `noise` over the largest force, and a recorded motion a second recording after which
+    it is held as long again. A test that the law or the body does not allow is left out.
     """
     experiments = [each.experiment for each in collocation.transcriptions]
     values = collocation.parameters.values(z[: collocation.nq])
@@ -289,7 +311,7 @@ def added_measurements(
         if experiment.specimen is None:
             if not experiment.wrenches and experiment.grasps:
                 which = "" if len(experiments) == 1 else f" of '{experiment.name}'"
-                sensed = _with_force_sensor(collocation, z, k)
+                sensed = _with_force_sensor(collocation, z, k, noise)
                 yield (
                     f"a force sensor at the grasp{which} (noise {NOISE:.0%} of the largest force)",
                     [*experiments[:k], sensed, *experiments[k + 1 :]],
@@ -360,7 +382,7 @@ def _held_longer(experiment: Experiment) -> Experiment | None:
     )
 
 
-def _with_force_sensor(collocation: Collocation, z: Array, number: int) -> Experiment:
+def _with_force_sensor(collocation: Collocation, z: Array, number: int, noise: float) -> Experiment:
     """Return a fitted experiment with a force sensor at its first grasp."""
     experiments = [each.experiment for each in collocation.transcriptions]
     experiment = experiments[number]
@@ -378,7 +400,7 @@ def _with_force_sensor(collocation: Collocation, z: Array, number: int) -> Exper
         each for of, each in zip(measurements, predicted, strict=True) if isinstance(of, Wrench)
     )
     largest_n = float(np.nanmax(np.abs(np.asarray(forces_n)[:, :3])))
-    return sensed(replace(blank, sigma_n=NOISE * largest_n))
+    return sensed(replace(blank, sigma_n=noise * largest_n))
 
 
 def _extended(

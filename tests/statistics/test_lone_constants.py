@@ -125,6 +125,29 @@ def test_other_assumptions_do_not_count_where_the_dominant_one_leaves_all_undete
 
 
 @pytest.mark.long
+def test_some_samples_of_a_smooth_motion_promise_what_all_of_them_do(monkeypatch):
+    swing = short_swing("swing", np.random.default_rng(0), count=4)
+    t_s = np.linspace(0.0, 0.9, 240)
+    grasp = cs.Grasp(swing.grasps[0].nodes, smooth_poses(t_s, turn_rad=(0.2, -0.15, 0.3)))
+    markers = replace(swing.markers, t_s=t_s, positions_m=np.zeros((240, 4, 3)))
+    fine = replace(swing, t_s=t_s, grasps=[grasp], markers=markers)
+    exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
+    problem = cs.Problem([fine], TRUTH | UNKNOWN, uncertainty=exact)
+    collocation = problem.collocation()
+    variables, _ = initial_variables(collocation)
+    covariance = np.diag([0.01, 0.8]) ** 2
+    found = lone_constants(NAMES, VALUES, covariance, covariance, {"gamma_m_1_s"}, ())
+
+    def promised(distance):
+        monkeypatch.setattr(expected_precision, "sample_distance", lambda _: distance)
+        arguments = (found, collocation, variables, problem.assumed_deviations)
+        (each,) = expected_precision.with_measurements(*arguments)
+        return np.log(each.fixes[0].factor)
+
+    assert promised(4) == pytest.approx(promised(1), rel=0.02)
+
+
+@pytest.mark.long
 def test_a_longer_recording_determines_what_it_promises(monkeypatch):
     rng = np.random.default_rng(2)
     run = run_of([short_swing("first", rng)])
