@@ -19,7 +19,7 @@ from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import BOUND_TOLERANCE, Collocation, convert_variables
 from ..program.lifted.lifted_collocation import lifted_count, with_lifted_variables
-from .loss_curvature import sensitivities, tangent_directions
+from .loss_curvature import reduced_hessian, sensitivities, tangent_directions
 from .starts.initial_point import adjoint_multipliers
 
 # Eigenvalues of the reduced Hessian below this share of the largest are rounding.
@@ -100,9 +100,8 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
         rows = program.jacobian(variables)[-added:].tocsc()
         of_lifted = np.asarray(spla.spsolve(rows[:, -added:], -rows[:, :-added] @ basis))
         basis = np.concatenate([basis, of_lifted.reshape(added, -1)])
-    hessian = program.hessian(variables, 1.0, multipliers=of_constraints)
-    reduced = basis.T @ (hessian @ basis)
-    curvatures = np.asarray(np.linalg.eigvalsh((reduced + reduced.T) / 2), dtype=float)
+    reduced = reduced_hessian(program, variables, of_constraints, basis)
+    curvatures = np.asarray(np.linalg.eigvalsh(reduced), dtype=float)
 
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     complementarity = np.abs(slope[parameters] * distance[parameters])[~is_free]

@@ -328,7 +328,6 @@ class _DampedHessian:
         self.options = options
         self._last_p = np.full(collocation.nq + collocation.nphi, np.inf)
         self._damping = 1.0
-        self._of_q, self._of_x = collocation.hessian_diagonals
 
     def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
         """Write the upper triangle of the Hessian at z to `values`: the exact one, or that of
@@ -342,11 +341,12 @@ class _DampedHessian:
         self.collocation.hessian_values(
             z, weight, multipliers=multipliers if is_exact else None, out=values
         )
-        values[self._of_x] += self.options.proximal
+        of_q, of_x = self.collocation.hessian_diagonals
+        values[of_x] += self.options.proximal
         if not is_settled:
             # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
             largest = self.collocation.objective(z) / (2 * STEP_LIMIT**2)
-            values[self._of_q] += weight * self._damping * largest
+            values[of_q] += weight * self._damping * largest
 
     def _ends_warm_up(self, p: Array) -> bool:
         """Return whether the exact Hessian may be used at p (np,): the step from the previous p is

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.linalg import solve_triangular
 
 from ..common.array_types import Array
@@ -141,9 +142,19 @@ def exact_curvature(
     z = collocation.pack(iterate.p, projected)
     multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
     directions = tangent_directions(collocation, [each.by_p for each in iterate.trajectories])
-    hessian = collocation.hessian(z, 1.0, multipliers=multipliers)
-    reduced = directions.T @ (hessian @ directions) / (2 * collocation.loss_scale)
-    return (reduced + reduced.T) / 2 - iterate.fit.compute_information()
+    reduced = reduced_hessian(collocation, z, multipliers, directions)
+    return reduced / (2 * collocation.loss_scale) - iterate.fit.compute_information()
+
+
+def reduced_hessian(
+    collocation: Collocation, z: Array, multipliers: Array, directions: Array
+) -> Array:
+    """Return Wᵀ ∇²(L + yᵀ g) W (c, c), symmetric, for multipliers y and c `directions` W."""
+    indptr, indices = collocation.hessian_structure
+    values = collocation.hessian_values(z, 1.0, multipliers=multipliers)
+    upper = sp.csc_array((values, indices, indptr), shape=(len(z), len(z)))
+    half = directions.T @ (upper @ directions)
+    return half + half.T - directions.T @ (upper.diagonal()[:, None] * directions)
 
 
 def tangent_directions(collocation: Collocation, by_p: Sequence[Array]) -> Array:
