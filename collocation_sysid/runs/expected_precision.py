@@ -19,9 +19,10 @@ from ..common.time_dependence import values_over_time
 from ..errors import InputError, SimulationError
 from ..fem.laws.constants import symbol_of
 from ..program.collocation import Collocation
-from ..program.forward.scheme_simulation import simulate_scheme
+from ..program.forward.scheme_simulation import continue_simulation
 from ..program.measured_motion import fitted_values
 from ..program.simulation import simulate
+from ..program.transcription import Transcription
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
@@ -61,6 +62,8 @@ ADDED_TESTS = {
     "confined": "a confined test",
     "uniaxial": "a uniaxial test",
 }
+# Beginning of the name of a recording that is held longer than the fitted one of the other name.
+LONGER = "longer "
 # Half width of an interval, as a factor, below which no other measurement is tried.
 NARROW = 1.25
 
@@ -316,7 +319,7 @@ def added_measurements(
                     f"a force sensor at the grasp{which} (noise {NOISE:.0%} of the largest force)",
                     [*experiments[:k], sensed, *experiments[k + 1 :]],
                 )
-            if (longer := _held_longer(experiment)) is not None:
+            if (longer := _held_longer(collocation.transcriptions[k])) is not None:
                 yield (
                     f"another recording of '{experiment.name}', held as long again at its end",
                     [*experiments, longer],
@@ -348,10 +351,11 @@ def _other_test(experiment: Experiment, test: str, values: Mapping[str, float]) 
     return specimen.experiment(body=body, name=f"added {test}")
 
 
-def _held_longer(experiment: Experiment) -> Experiment | None:
+def _held_longer(transcription: Transcription) -> Experiment | None:
     """Return a recorded motion with its grasps held at their last poses for as long again; None
     unless only markers are measured and nothing else acts on the body.
     """
+    experiment = transcription.experiment
     more = (experiment.tendons, experiment.pressures, experiment.readings, experiment.depths)
     loads = (experiment.forces, experiment.masses, experiment.wrenches)
     if experiment.is_static or any(map(len, (*more, *loads))) or not experiment.grasps:
@@ -359,14 +363,18 @@ def _held_longer(experiment: Experiment) -> Experiment | None:
     times_s, markers = experiment.t_s, experiment.markers
     later_s = times_s[-1] + experiment.timestep_s * np.arange(1, len(times_s))
     rows = np.r_[np.arange(len(times_s)), np.full(len(later_s), len(times_s) - 1)]
+    grid_s = transcription.dynamics.t_s
     grasps = []
     for grasp in experiment.grasps:
         if isinstance(grasp, Obstacle) or np.isfinite([grasp.from_s, grasp.until_s]).any():
             return None
-        rotations, places_m = grasp.poses.at(times_s)
+        rotations, places_m = grasp.poses.at(grid_s)
         quaternions = Rotation.from_matrix(rotations).as_quat()
         poses = PoseSequence(
-            np.r_[times_s, later_s], places_m[rows], quaternions[rows], interpolation="linear"
+            np.append(grid_s, later_s[-1]),
+            np.append(places_m, places_m[-1:], axis=0),
+            np.append(quaternions, quaternions[-1:], axis=0),
+            interpolation="linear",
         )
         grasps.append(replace(grasp, poses=poses))
     values = values_over_time(markers)
@@ -378,7 +386,7 @@ def _held_longer(experiment: Experiment) -> Experiment | None:
         t_s=np.r_[times_s, later_s],
         grasps=grasps,
         markers=replace(markers, t_s=np.r_[times_s, later_s], **longer),
-        name=f"longer {experiment.name}",
+        name=LONGER + experiment.name,
     )
 
 
@@ -407,7 +415,8 @@ def _extended(
     collocation: Collocation, z: Array, experiments: Sequence[Experiment]
 ) -> tuple[Collocation, Array]:
     """Return the program of fitted experiments of which some are changed or new, and its variables:
-    new nuisance parameters are zero, and new experiments are simulated.
+    new nuisance parameters are zero, and new experiments are simulated, longer ones from the end of
+    the fitted motion on.
     """
     wide = replace(collocation, experiments=[*experiments])
     p, positions = collocation.unpack(z)
@@ -421,6 +430,9 @@ def _extended(
     for each in wide.transcriptions:
         if (motion := known.get(each.experiment.name)) is None:
             dynamics = each.dynamics.with_theta(each.constants.theta(z[: each.nq]))
-            motion = simulate_scheme(each.experiment, dynamics)
+            fitted = known.get(each.experiment.name.removeprefix(LONGER))
+            motion, failure = continue_simulation(each.experiment, dynamics, fitted)
+            if failure is not None:
+                raise failure
         motions.append(motion)
     return wide, wide.pack(np.fromiter(of_names, dtype=float), motions)

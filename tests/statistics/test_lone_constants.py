@@ -13,6 +13,7 @@ from kit.problems import smooth_poses, times
 
 import collocation_sysid as cs
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.result.run_summary import effect_of_remedy
 from collocation_sysid.runs import expected_precision
 from collocation_sysid.runs.expected_precision import added_measurements
@@ -95,6 +96,25 @@ def test_a_swing_may_be_recorded_again_and_held_longer():
     np.testing.assert_allclose(longer.t_s, 0.01 * np.arange(9))
     rotations, _ = longer.grasps[0].poses.at(longer.t_s)
     np.testing.assert_allclose(rotations[4:], np.broadcast_to(rotations[4], (5, 3, 3)))
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_a_swing_that_is_held_longer_begins_with_the_fitted_motion(substeps):
+    first = short_swing("first", np.random.default_rng(0), count=4)
+    collocation = cs.Problem([first], TRUTH | UNKNOWN, substeps=substeps).collocation()
+    variables, _ = initial_variables(collocation)
+    phrases = dict(added_measurements(collocation, variables))
+    both = phrases["another recording of 'first', held as long again at its end"]
+    wide, at = expected_precision._extended(collocation, variables, both)
+    _, (fitted, longer) = wide.unpack(at)
+    assert np.array_equal(longer[: len(fitted)], fitted)
+    whole = simulate_scheme(
+        both[1],
+        wide.transcriptions[1].dynamics.with_theta(
+            wide.transcriptions[1].constants.theta(at[: wide.nq])
+        ),
+    )
+    np.testing.assert_allclose(longer, whole, atol=1e-9)
 
 
 @pytest.mark.parametrize(("wide", "evaluated"), [("scale", 1), ("drift", 2)])
