@@ -251,7 +251,7 @@ def test_the_pose_of_an_anipose_camera_is_that_of_opencv(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "name", "message"),
     [
-        ("just words", None, r"cam.dat: found neither YAML, JSON, TOML nor cameras.txt"),
+        ("just words", None, r"cam.dat: found neither YAML, JSON, XML, TOML nor cameras.txt"),
         ("a: 1", None, r"cam.dat: found the keys a; expected the matrix of a camera"),
         ("K: [1, 2, 3]", None, r"cam.dat: K: found 3 numbers; expected the nine"),
         ("K: [1, x, 3]", None, r"cam.dat: K: found \[1, 'x', 3\]; expected numbers"),

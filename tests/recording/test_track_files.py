@@ -110,6 +110,75 @@ def test_analysis_files_of_sleap_are_read(tmp_path: Path) -> None:
     require_same(read_tracks(tmp_path / "analysis.h5"))
 
 
+def sleap_table(animals: tuple[str, ...]) -> str:
+    """Return the analysis table of SLEAP, in which each animal has its own row in an image."""
+    lines = ["track,frame_idx,instance.score," + ",".join(f"{n}.x,{n}.y,{n}.score" for n in NAMES)]
+    for k in range(5):
+        for animal in reversed(animals):
+            cells = zip(PIXELS[k], SCORES[k], strict=True)
+            points = ",".join(f"{u},{v},{s}" for (u, v), s in cells)
+            lines.append(f"{animal},{k + 3},0.9,{points}")
+    return "\n".join(lines) + "\n"
+
+
+def test_tables_of_sleap_and_of_x_and_y_are_read(tmp_path: Path) -> None:
+    alone = read_tracks(write(tmp_path, "a.csv", sleap_table(("",))))
+    require_same(alone)
+    assert alone.frames.tolist() == [3, 4, 5, 6, 7]
+    several = read_tracks(write(tmp_path, "b.csv", sleap_table(("ant", "bee"))))
+    assert several.names == ("bee_tip", "bee_hook", "ant_tip", "ant_hook")
+    np.testing.assert_allclose(several.pixels, np.concatenate([PIXELS, PIXELS], axis=1))
+    other = wide().replace("_u", "_x").replace("_v", "_y").replace("likelihood", "confidence")
+    require_same(read_tracks(write(tmp_path, "c.csv", other)), has_times=True)
+    other = long().replace("frame,point,u,v,likelihood", "frame,point_id,x,y,score")
+    read = read_tracks(write(tmp_path, "d.csv", other))
+    assert read.names == ("hook", "tip")
+    np.testing.assert_allclose(read.pixels[:, ::-1], PIXELS)
+    assert read.likelihood is not None
+    np.testing.assert_allclose(read.likelihood[:, ::-1], SCORES)
+
+
+def test_positions_in_space_are_no_pixels(tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match="NAME_u and NAME_v"):
+        read_tracks(write(tmp_path, "e.csv", "t_s,tip_x,tip_y,tip_z\n0,1,2,3\n0.1,1,2,3\n"))
+    twice = sleap_table(("ant", "bee")).replace("bee", "ant")
+    with pytest.raises(cs.InputError, match="'ant' appears twice in this image"):
+        read_tracks(write(tmp_path, "f.csv", twice))
+
+
+XML = """<?xml version="1.0"?>
+<opencv_storage>
+<!-- a calibration -->
+<image_width>640</image_width><image_height>480</image_height>
+<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+<data>900. 0. 320. 0. 905. 240. 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix"><rows>1</rows><cols>5</cols><dt>d</dt>
+<data>-0.1 2.0e-02 0. 0. 0.</data></distortion_coefficients>
+</opencv_storage>
+"""
+
+
+def test_calibrations_of_opencv_are_read_from_xml_and_from_archives(tmp_path: Path) -> None:
+    matrix, distortion = [[900, 0, 320], [0, 905, 240], [0, 0, 1]], [-0.1, 0.02, 0, 0, 0]
+    np.savez(tmp_path / "b.npz", mtx=matrix, dist=[distortion], rvecs=np.zeros((4, 3, 1)))
+    for file in (write(tmp_path, "a.xml", XML), tmp_path / "b.npz"):
+        found = read_calibration(file)
+        assert found.matrix.tolist() == matrix
+        assert found.distortion.tolist() == distortion
+        assert found.size_px == ((640, 480) if file.suffix == ".xml" else None)
+    np.savez(tmp_path / "c.npz", tracks=np.zeros(3))
+    with pytest.raises(cs.InputError, match=r"c\.npz: found the keys tracks; expected the matrix"):
+        read_calibration(tmp_path / "c.npz")
+
+
+@pytest.mark.parametrize(
+    "text", [XML[:300], '<!DOCTYPE a [<!ENTITY b "c">]>' + XML, "<html></html>"]
+)
+def test_other_xml_files_are_no_calibrations(text: str, tmp_path: Path) -> None:
+    with pytest.raises(cs.InputError, match=r"a\.xml: found neither YAML, JSON, XML"):
+        read_calibration(write(tmp_path, "a.xml", text))
+
+
 @pytest.mark.parametrize("version", [1.0, 1.3])
 def test_labels_of_sleap_are_read(version: float, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")

@@ -4,13 +4,15 @@
 |---|---|---|
 | any | .csv, wide | `t_s` (`t_ms`, …) or `frame`; `NAME_u`, `NAME_v`, perhaps `NAME_likelihood` by point |
 | any | .csv, long | `t_s` or `frame`, `point`, `u`, `v` and perhaps `likelihood` |
+| SLEAP | analysis .csv | `track`, `frame_idx`; `NODE.x`, `NODE.y`, `NODE.score` of each node |
 | DeepLabCut | .csv, .h5 | rows scorer, (individuals,) bodyparts, coords; frame, then x, y, likelihood |
 | SLEAP | analysis .h5 | `tracks` (tracks, 2, nodes, frames), `node_names`, `point_scores` |
 | SLEAP | .slp | `frames`, `instances`, `points`, `pred_points`, and names in `metadata` |
 | CoTracker | .npz | `pred_tracks` (1, T, N, 2), `pred_visibility` (1, T, N) |
 | TAPIR | .npz | `tracks` (N, T, 2), `visibles` (N, T) |
 
-Only tables with a column of times, and archives with `t_s` or `fps`, state times.
+In tables, `x` and `y` are pixels, too, unless there is a `z`. Only tables with a column of times,
+and archives with `t_s` or `fps`, state times.
 """
 
 from __future__ import annotations
@@ -18,10 +20,11 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +50,11 @@ from ...recording.formats.text import (
 )
 
 # Names of the columns of long tables.
-POINT_COLUMNS = ("point", "name", "bodypart", "track", "keypoint")
+POINT_COLUMNS = ("point", "name", "bodypart", "track", "keypoint", "point_id", "track_id")
 FRAME_COLUMNS = ("frame", "frame_index", "frame_idx")
+# Other names of the coordinates in a table, and of the likelihood.
+COORDINATES = {"x": "u", "y": "v"}
+LIKELIHOODS = ("score", "confidence", "visibility", "visible")
 # First bytes of an HDF5 file.
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # Names of arrays in archives: tracks by time, tracks by point, visibility.
@@ -107,6 +113,7 @@ def _read_text(text: str) -> TrackFile:
     if rows[0].cells[0].lower() == "scorer":
         return _deeplabcut_table(rows)
     grid = read_table(text)
+    grid = replace(grid, columns=_usual_columns(grid.columns))
     t_s, frames = _times_of(grid)
     wide = [name[:-2] for name in grid.columns if name.endswith("_u")]
     if wide:
@@ -116,6 +123,20 @@ def _read_text(text: str) -> TrackFile:
         return _long_table(grid, grid.columns.index(point), t_s, frames)
     shown = ", ".join(grid.columns[:8])
     raise grid.error_at(f"found the columns {shown}; expected {EXPECTED}")
+
+
+def _usual_columns(columns: Sequence[str]) -> list[str]:
+    """Return the names of columns with coordinates called u and v, and a likelihood."""
+    usual = {name: "likelihood" for name in LIKELIHOODS}
+    parts = [re.fullmatch(r"(?:(.+)[._])?([a-z]+)", name) for name in columns]
+    if not any(part and part[2] == "z" for part in parts):
+        usual |= COORDINATES
+    names = []
+    for name, part in zip(columns, parts, strict=True):
+        other = usual.get(part[2]) if part else None
+        names.append("_".join(filter(None, (part[1], other))) if part and other else name)
+    # Where a table has both, the usual names count.
+    return [old if new in columns else new for old, new in zip(columns, names, strict=True)]
 
 
 def _times_of(grid: TextTable) -> tuple[Array | None, Array]:
@@ -155,7 +176,34 @@ def _wide_table(grid: TextTable, names: list[str], t_s: Array | None, frames: Ar
         for k, name in enumerate(scores):
             if name in grid.columns:
                 likelihood[:, k] = _numbers(grid, [name])[:, 0]
-    return TrackFile(tuple(names), pixels.reshape(len(pixels), -1, 2), likelihood, t_s, frames)
+    pixels = pixels.reshape(len(pixels), -1, 2)
+    if "track" in grid.columns:
+        return _by_animal(grid, names, pixels, likelihood, frames)
+    return TrackFile(tuple(names), pixels, likelihood, t_s, frames)
+
+
+def _by_animal(
+    grid: TextTable, names: list[str], pixels: Array, likelihood: Array | None, frames: Array
+) -> TrackFile:
+    """Return the tracks of a table of SLEAP, with one row for each animal in an image."""
+    labels = [row.cells[grid.columns.index("track")] for row in grid.rows]
+    animals = tuple(dict.fromkeys(labels))
+    numbers, image = np.unique(frames, return_inverse=True)
+    animal = np.array([animals.index(label) for label in labels])
+    pairs = image * len(animals) + animal
+    twice = np.flatnonzero(~np.isin(np.arange(len(pairs)), np.unique(pairs, return_index=True)[1]))
+    if len(twice):
+        k = int(twice[0])
+        raise grid.error_at(f"track {labels[k]!r} appears twice in this image; expected once", k)
+    shape = len(numbers), len(animals), len(names)
+    placed, scores = np.full((*shape, 2), np.nan), np.zeros(shape)
+    placed[image, animal] = pixels
+    scores[image, animal] = 1.0 if likelihood is None else likelihood
+    if len(animals) > 1:
+        names = [f"{label or k + 1}_{name}" for k, label in enumerate(animals) for name in names]
+    flat = len(numbers), -1
+    score = None if likelihood is None else scores.reshape(flat)
+    return TrackFile(tuple(names), placed.reshape(*flat, 2), score, None, numbers)
 
 
 def _long_table(grid: TextTable, point: int, t_s: Array | None, frames: Array) -> TrackFile:

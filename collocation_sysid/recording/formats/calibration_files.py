@@ -2,7 +2,8 @@
 
 | program | form | keys |
 |---|---|---|
-| OpenCV | YAML with `%YAML:1.0`, JSON | `camera_matrix`, `distortion_coefficients`, `image_width` |
+| OpenCV | YAML with `%YAML:1.0`, XML, JSON | `camera_matrix`, `distortion_coefficients`, `image_width` |
+| OpenCV in Python | .npz | `mtx` and `dist`, or `K` and `D` |
 | ROS `camera_info` | YAML | `camera_matrix`, `distortion_model`; messages `k`, `d`, `width` |
 | a log | `LOG#TOPIC` | messages `k`, `d`, `width` of CameraInfo or Foxglove's CameraCalibration |
 | Kalibr | YAML | `cam0`: `intrinsics`, `distortion_model`, `resolution` |
@@ -18,15 +19,19 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+import xml.etree.ElementTree as ElementTree
+import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import ParseError
 
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from ...common.array_files import load_arrays
 from ...common.array_types import Array
 from ...common.files import DAMAGE, require_size
 from ...errors import InputError, listed, located
@@ -110,6 +115,8 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
     if (address := TopicAddress.from_path(path)) is not None:
         return _camera_of_topic(address, file)
     require_size(file, LARGEST_BYTES)
+    if zipfile.is_zipfile(file):
+        return _opencv_camera(_archive(file), file)
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -146,6 +153,19 @@ def _camera_of_topic(address: TopicAddress, file: Path) -> Calibration:
     return _opencv_camera(content, file)
 
 
+def _archive(file: Path) -> Mapping[str, Any]:
+    """Return the arrays of an archive of NumPy as lists."""
+    try:
+        return {name: array.tolist() for name, array in load_arrays(file).items()}
+    except InputError as error:
+        raise error.located(where=str(file)) from error
+    except (*DAMAGE, OSError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"this archive cannot be read ({error}); expected arrays, such as mtx and dist",
+            where=str(file),
+        ) from error
+
+
 def _cameras_of(text: str, file: Path) -> list[Calibration]:
     if _is_colmap(text):
         return _colmap_cameras(text, file)
@@ -166,19 +186,48 @@ def _parsed(text: str, file: Path) -> Mapping[str, Any]:
     """Return the table of a TOML, JSON or YAML file."""
     # OpenCV writes a directive and tags that other readers of YAML refuse.
     plain = re.sub(r"^%YAML[: ][^\n]*\n", "", text.lstrip("\ufeff")).replace("!!opencv-matrix", "")
-    readers: tuple[Callable[[str], Any], ...] = (json.loads, tomllib.loads, yaml.safe_load)
+    readers: tuple[Callable[[str], Any], ...] = (
+        json.loads,
+        tomllib.loads,
+        _opencv_xml,
+        yaml.safe_load,
+    )
     for read in readers:
         try:
             content = read(plain)
-        except (*DAMAGE, yaml.YAMLError):  # readers of YAML raise anything for wrong tags
+        except (
+            *DAMAGE,
+            ParseError,
+            yaml.YAMLError,
+        ):  # readers of YAML raise anything for wrong tags
             continue
         if isinstance(content, Mapping):
             return content
     raise InputError(
-        "found neither YAML, JSON, TOML nor cameras.txt; expected a calibration of OpenCV, ROS, "
+        "found neither YAML, JSON, XML, TOML nor cameras.txt; expected a calibration of OpenCV, ROS, "
         "Kalibr, Anipose or COLMAP",
         where=str(file),
     )
+
+
+def _opencv_xml(text: str) -> Any:
+    """Return the table of an XML file of OpenCV; None for any other."""
+    if not text.lstrip().startswith("<") or "<!" in re.sub(
+        r"<!--.*?-->", "", text, flags=re.DOTALL
+    ):
+        return None
+    root = ElementTree.fromstring(text)
+    if root.tag != "opencv_storage":
+        return None
+    content: dict[str, Any] = {}
+    for each in root:
+        data = each.find("data")
+        words = ((each if data is None else data).text or "").split()
+        if data is None and len(words) == 1:
+            content[each.tag] = yaml.safe_load(words[0])
+        else:
+            content[each.tag] = words
+    return content
 
 
 def _numbers(value: Any, file: Path, key: str) -> Array:
