@@ -291,6 +291,26 @@ def test_progress_with_automatic_steps_never_decreases():
 # Large steps
 
 
+def test_newmark_evaluates_loads_and_poses_of_all_steps_at_once(monkeypatch):
+    made, posed = [], []
+    from_experiment, at = Forces.from_experiment.__func__, PoseSequence.at
+
+    def forces(*arguments, **by_name):
+        made.append(arguments)
+        return from_experiment(*arguments, **by_name)
+
+    monkeypatch.setattr(Forces, "from_experiment", classmethod(forces))
+    monkeypatch.setattr(PoseSequence, "at", lambda *given: posed.append(given) or at(*given))
+
+    def counts(samples):
+        made.clear()
+        posed.clear()
+        simulate(hung_cube(samples), TRUTH, "newmark", substeps=2)
+        return len(made), len(posed)
+
+    assert counts(8) == counts(4)
+
+
 def test_newmark_halves_steps_that_are_too_large():
     cube = jerked_cube(0.35, timestep_s=0.04)
     motion = simulate(cube, TRUTH, timestep_s=0.04)

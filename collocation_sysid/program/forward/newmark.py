@@ -12,12 +12,13 @@ The accelerations a = M⁻¹ F of states are therefore those without local force
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
+from ...common.time_dependence import PARTS_OVER_TIME, at_times, over_time
 from ...model.force_term import States
 from ...model.forces import Forces
 from ...model.internal_variables import (
@@ -28,6 +29,7 @@ from ...model.internal_variables import (
 )
 from ...model.weight import Weight
 from ...recording.experiment import Experiment
+from ...recording.grasp import prescribed_dofs
 from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
 from .condensed_steps import StepEquations
@@ -66,6 +68,16 @@ class _State:
     # acceleration at the start of their steps [m], and the length of these steps [s].
     corrections_m: Array | None = None
     step_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Loads:
+    """Forces and prescribed motion of T steps."""
+
+    forces: Forces = field(metadata=PARTS_OVER_TIME)  # at their ends; local ones averaged
+    # (3, T, p): positions [m], velocities [m/s] and accelerations [m/s²] at the ends of all dofs that
+    # are prescribed at some time.
+    motion: Array = field(metadata=over_time(axis=1))
 
 
 @one_blas_thread()
@@ -116,10 +128,13 @@ def simulate_newmark(
     means_n = np.zeros_like(reactions_and_positions[0])
     if state.local_n is not None:
         means_n[0] = state.local_n[sensed]
+    ends_s = times[:-1, None] + step * np.arange(1, steps_per_sample + 1)
+    loads = stepper.loads(ends_s.ravel(), ends_s.ravel(), step)
     for k in range(1, len(times)):
         for j in range(1, steps_per_sample + 1):
-            state = stepper.advance(state, float(times[k - 1] + j * step))
             row = (k - 1) * steps_per_sample + j
+            now = at_times(loads, slice(row - 1, row))
+            state = stepper.advance(state, float(ends_s[k - 1, j - 1]), now)
             reactions_and_positions[:, row] = stepper.reactions_and_positions(state, sensed)
             if state.local_n is not None:
                 means_n[row] = state.local_n[sensed]
@@ -259,6 +274,7 @@ class _Stepper:
         self.body = experiment.body
         self.options = options or NewtonOptions()
         self.solvers = NewtonSolvers(experiment, options)
+        self._prescribed_dofs = prescribed_dofs(experiment.grasps)
 
     def initial_state(self) -> _State:
         """Return the initial state of the experiment, with accelerations in balance with the
@@ -277,12 +293,12 @@ class _Stepper:
         )
         state = _State(time_s, x, v=v, a=np.zeros_like(x), previous_histories=previous_histories)
         if self._forces(time_s).has_local_forces:
-            state = replace(state, local_n=self._local_n(x, v, load_s=time_s))
+            state = replace(state, local_n=self._local_n(self._forces(time_s), x, v))
         return self._balanced(state, time_s, dofs=solver.free)
 
-    def advance(self, state: _State, target_s: float) -> _State:
-        """Return the state at `target_s` [s]; where Newton's method fails, in steps that are
-        halved.
+    def advance(self, state: _State, target_s: float, loads: _Loads) -> _State:
+        """Return the state at `target_s` [s] under the `loads` of the step to there; where Newton's
+        method fails, in steps that are halved.
 
         Loads and holding grasps are those of `target_s` throughout.
 
@@ -291,14 +307,18 @@ class _Stepper:
         SimulationError
             If a step fails after `max_halvings` halvings.
         """
-        step = target_s - state.t_s
+        whole = step = target_s - state.t_s
         smallest = step * 0.5**self.options.max_halvings
         state = self._after_release(state, target_s)
         while target_s - state.t_s > 0.5 * smallest:
             solver = self._solver(target_s)
             try:
                 end_s = target_s if step >= target_s - state.t_s else state.t_s + step
-                state = self._step(solver, state, end_s=end_s, load_s=target_s)
+                if step < whole:
+                    loads = self.loads(
+                        np.array([end_s]), np.array([target_s]), step_s=end_s - state.t_s
+                    )
+                state = self._step(solver, state, end_s, loads)
             except NewtonFailure as failure:
                 step /= 2
                 if step < smallest:
@@ -321,16 +341,12 @@ class _Stepper:
             forces = each.insert_at_same_time(forces)
         return forces.without_local_forces().total(state.x, state.v)[0]
 
-    def _forces(self, load_s: float, step_s: float = 0.0) -> Forces:
-        """Return forces at `load_s`; local ones averaged over `step_s` unless zero."""
-        return Forces.from_experiment(self.experiment, load_s, theta=self.theta, step_s=step_s)
+    def _forces(self, load_s: float) -> Forces:
+        """Return the forces at `load_s`, local ones at each state."""
+        return Forces.from_experiment(self.experiment, load_s, theta=self.theta)
 
-    def _local_n(self, x: Array, v: Array, load_s: float, step_s: float = 0.0) -> Array:
-        """Return the sum of the local forces (3n,) [N] at positions x and velocities v, (3n,) each,
-        under the loads at the time `load_s`; averaged over a step of `step_s` [s] about this state,
-        unless that is zero.
-        """
-        forces = self._forces(load_s, step_s)
+    def _local_n(self, forces: Forces, x: Array, v: Array) -> Array:
+        """Return the sum of the local forces (3n,) [N] at positions x and velocities v, (3n,)."""
         total_n = np.zeros_like(x)
         for term in forces.external_terms:
             if term.is_local:
@@ -363,20 +379,17 @@ class _Stepper:
         acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
         return replace(state, a=acceleration)
 
-    def _step(self, solver: NewtonSolver, state: _State, end_s: float, load_s: float) -> _State:
-        """Return the state after one step to `end_s` [s], with loads and grasps of the time
-        `load_s`.
-        """
+    def _step(self, solver: NewtonSolver, state: _State, end_s: float, loads: _Loads) -> _State:
+        """Return the state after one step to `end_s` [s]."""
         h = end_s - state.t_s
-        forces = insert_previous_states(
-            self._forces(load_s, step_s=h), state.previous_histories, interval_s=h
-        )
+        forces = insert_previous_states(loads.forces, state.previous_histories, interval_s=h)
+        held = np.searchsorted(self._prescribed_dofs, solver.is_prescribed)
         equations = _NewmarkEquations(
             state,
             h,
             forces=forces,
             prescribed_dofs=solver.is_prescribed,
-            prescribed=self._prescribed_motion(solver, end_s, step_s=h, holding_s=load_s),
+            prescribed=loads.motion[:, 0, held],
         )
         extrapolated = equations.extrapolation()
         known = state.corrections_m if abs(h - state.step_s) <= SAME_STEP * h else None
@@ -392,7 +405,7 @@ class _Stepper:
         if equations.local.has_forces:
             mass = equations.mass_kg
             xi, nu = equations.states(x)
-            local_n = self._local_n(xi[0], nu[0], load_s=load_s, step_s=h)
+            local_n = self._local_n(loads.forces, xi[0], nu[0])
             # Prescribed dofs have the acceleration of the grasp.
             free = solver.free
             a[free] -= 2 * local_n[free] / np.where(mass[free] > 0, mass[free], 1.0)
@@ -410,32 +423,31 @@ class _Stepper:
             step_s=h,
         )
 
-    def _prescribed_motion(
-        self, solver: NewtonSolver, time_s: float, step_s: float, holding_s: float
-    ) -> Array:
-        """Return positions [m], velocities [m/s] and accelerations [m/s²] (3, p) of the solver's
-        prescribed dofs at `time_s`, by central differences over `step_s` [s]; grasps are those that
-        hold at `holding_s`.
+    def loads(self, end_s: Array, load_s: Array, step_s: float) -> _Loads:
+        """Return the loads at the times `load_s` (T,) [s], over which local forces are averaged, and
+        the motion at `end_s` (T,), by central differences over `step_s` [s], of the dofs that are
+        prescribed at `load_s`.
 
         At the ends of a grasp's time, differences are one-sided and the acceleration is zero if
         there is no later pose.
         """
         experiment = self.experiment
-        nodes_m = self.experiment.body.nodes_m
-        motion = np.zeros((3, *nodes_m.shape))
+        motion = np.zeros((3, len(end_s), len(self._prescribed_dofs)))
         for grasp in experiment.grasps:
-            if not grasp.is_active(holding_s):
+            rows = np.flatnonzero(grasp.is_active(load_s))
+            if not len(rows):
                 continue
             # Its poses before it holds and after it has let go do not matter.
             first = max(grasp.from_s, float(experiment.t_s[0]))
             last = min(grasp.until_s, float(experiment.t_s[-1]))
-            times = np.clip([time_s - step_s, time_s, time_s + step_s], first, last)
-            before, now, after = grasp.positions_at(nodes_m, times)[..., grasp.axis_indices]
-            velocity = (after - before) / (times[2] - times[0])
-            is_central = times[2] - times[1] > 0.5 * step_s
-            acceleration = (
-                (after - 2 * now + before) / step_s**2 if is_central else np.zeros_like(now)
-            )
-            place = np.ix_(grasp.nodes, grasp.axis_indices)
-            motion[:, *place] = now, velocity, acceleration
-        return motion.reshape(3, -1)[:, solver.is_prescribed]
+            times = np.clip(np.add.outer([-step_s, 0.0, step_s], end_s[rows]), first, last)
+            positions_m = grasp.positions_at(experiment.body.nodes_m, times.ravel())
+            held_m = positions_m[..., grasp.axis_indices]
+            before, now, after = held_m.reshape(3, len(rows), len(grasp.prescribed_dofs))
+            velocity = (after - before) / (times[2] - times[0])[:, None]
+            is_central = (times[2] - times[1] > 0.5 * step_s)[:, None]
+            acceleration = np.where(is_central, (after - 2 * now + before) / step_s**2, 0.0)
+            dofs = np.searchsorted(self._prescribed_dofs, grasp.prescribed_dofs)
+            motion[:, rows[:, None], dofs] = now, velocity, acceleration
+        forces = Forces.from_experiment(experiment, load_s, theta=self.theta, step_s=step_s)
+        return _Loads(forces, motion)
