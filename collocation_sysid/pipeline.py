@@ -239,13 +239,13 @@ def run(
                 )
             answer = _with_problem_notes(answer)
             if answer.uncertainty is not None and fit is not None:
-                known = answer.uncertainty
+                changes = _changes(answer, say)
+                sources = _sources(answer, fit, known=answer.uncertainty, changes=changes)
+                answer = replace(answer, systematic_effects=sources)
+                answer = _with_curved_intervals(answer, fit)
                 if not problem.uncertainty.numerical:
                     answer = _with_mesh_error(answer, fit, say=say)
-                profiles = profile_likelihoods(answer, fit, say=say)
-                changes = _changes(answer, say)
-                sources = _sources(answer, fit, known=known, changes=changes)
-                answer = replace(answer, profiles=profiles, systematic_effects=sources)
+                answer = replace(answer, profiles=profile_likelihoods(answer, fit, say=say))
                 answer = replace(answer, notes=(*answer.notes, *_ruler_notes(problem, sources)))
                 answer = _with_added_measurements(answer, say)
                 solved_fit = _solved_fit(answer, fit, changes)
@@ -313,6 +313,23 @@ def _with_problem_notes(answer: Run) -> Run:
     if problem.substeps == "auto" and problem.choose_first_substeps() > 1:
         impacts = (IMPACT_NOTE.format(substeps),)
     return replace(answer, notes=(*coarse, *impacts, *tests, *answer.notes))
+
+
+def _with_curved_intervals(answer: Run, fit: LinearisedFit) -> Run:
+    """Return the run with statistical intervals that follow the loss, and the effect of the step on
+    them, see `with_curved_intervals`.
+    """
+    solution, known = answer.solution, answer.uncertainty
+    assert known is not None
+    combined = {name: each.combined_std_error for name, each in answer.estimates.items()}
+    curved = with_curved_intervals(known, fit, solution.collocation, solution.z, combined)
+    if curved is known:
+        return answer
+    answer = replace(answer, uncertainty=curved)
+    error = step_error(
+        answer.problem, solution, fit=fit, rollouts=answer.rollouts, estimates=answer.optimum
+    )
+    return replace(answer, refinement=error)
 
 
 def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
@@ -402,7 +419,6 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
         uncertainty = uncertainty_from_fit(
             fit, parameters, q=solution.q, error_model=problem.uncertainty
         )
-        uncertainty = with_curved_intervals(uncertainty, fit, solution.collocation, solution.z)
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.describe() for n in noises))

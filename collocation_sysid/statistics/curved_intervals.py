@@ -12,6 +12,7 @@ change along the profile, the rest is added in quadrature.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,9 @@ from .uncertainty import AUTO, ErrorModel, Uncertainty, uncertainty_from_fit
 # Parameters of the compressibility, and the factor by which λ/μ has to change within the interval.
 COMPRESSIBILITIES = ("poisson", "lambda_pa", "kappa_pa")
 LEAST_CHANGE = 1.25
+# Least share of an estimate's combined standard uncertainty that is statistical: 0.7 is half of the
+# variance. Below it refits, which cost as much as several solves, hardly change what is published.
+LARGER_PART = 0.7
 # An end of the profile's interval that is closer than this to the linear one, over its distance
 # from the estimate, changes nothing.
 ALIKE = 0.15
@@ -39,25 +43,32 @@ LOWER = 0.02
 
 
 def with_curved_intervals(
-    uncertainty: Uncertainty, fit: LinearisedFit, collocation: Collocation, z: Array
+    uncertainty: Uncertainty,
+    fit: LinearisedFit,
+    collocation: Collocation,
+    z: Array,
+    combined: Mapping[str, float | None] | None = None,
 ) -> Uncertainty:
     """Return the uncertainty of a fit at z with statistical intervals that follow the loss along
     the compressibility; the same where this is not estimated, not determined, or the loss nearly
-    quadratic. Covariances are not changed.
+    quadratic, or where most of the `combined` standard uncertainty, by name, is not statistical.
+    Covariances are not changed.
     """
     for k, item in enumerate(collocation.parameters.free):
-        if _may_be_curved(uncertainty, item.name):
+        whole = (combined or {}).get(item.name)
+        own = uncertainty.estimates.get(item.name)
+        if own is not None and _may_be_curved(item.name, own, whole):
             uncertainty = _along_profile(uncertainty, fit, collocation, z, k)
     return uncertainty
 
 
-def _may_be_curved(uncertainty: Uncertainty, name: str) -> bool:
-    estimate = uncertainty.estimates.get(name)
+def _may_be_curved(name: str, estimate: Estimate, whole: float | None) -> bool:
+    statistical = estimate.statistical_std_error
     if (
         without_region(name) not in COMPRESSIBILITIES
-        or estimate is None
         or estimate.statistical95 is None
-        or estimate.statistical_std_error is None
+        or statistical is None
+        or (whole is not None and statistical < LARGER_PART * whole)
     ):
         return False
     low, high = estimate.statistical95

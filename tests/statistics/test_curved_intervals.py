@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
-from collocation_sysid.statistics.uncertainty import ErrorModel
+from collocation_sysid.statistics import curved_intervals
+from collocation_sysid.statistics.curved_intervals import uncertainty_at, with_curved_intervals
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 T_S = 0.01 * np.arange(31)
 GIVEN = ErrorModel(noise="given", errors="independent")
@@ -55,3 +57,22 @@ def test_intervals_towards_incompressibility_end_where_the_loss_has_risen():
         assert np.sqrt(loss) == pytest.approx(1.96, rel=0.05)
         moved = np.log(fixed.parameters["young_pa"] / 1.5e5)
         assert np.log(other / 1.5e5) == pytest.approx(moved, rel=0.06)
+
+
+def test_nothing_is_fitted_again_where_most_of_an_uncertainty_is_systematic(monkeypatch):
+    seen, truth = swung_bar(0.46)
+    best = fit(seen, truth | {"young_pa": cs.Unknown(1.5e5), "poisson": cs.Unknown(0.455)})
+    linear = linearise_fit(best.collocation, best.z)
+    known = uncertainty_from_fit(linear, best.collocation.parameters, best.q, GIVEN)
+    error = known.estimates["poisson"].statistical_std_error
+    assert error
+
+    def refits(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(curved_intervals, "Refits", refits)
+    for combined in (None, {"poisson": error}):
+        with pytest.raises(AssertionError):
+            with_curved_intervals(known, linear, best.collocation, best.z, combined)
+    same = with_curved_intervals(known, linear, best.collocation, best.z, {"poisson": 2 * error})
+    assert same is known
