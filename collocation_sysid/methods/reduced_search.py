@@ -49,8 +49,8 @@ LONGEST_SWEPT = 2.0
 # incompressible body at small strain has few digits.
 INSIGNIFICANT = 1e-6
 # So does, with impacts, a rejection where a full step is below this share of each standard error:
-# ripples of the loss are larger than what such a step can gain.
-NEAR = 0.1
+# ripples of the loss, about one of χ², are larger than what such a step can gain.
+NEAR = 0.3
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -474,11 +474,16 @@ class ReducedSearch:
 
     def _status_without_progress(self, point: Iterate, curvature: Array) -> Status:
         """Return the status after rejections of ever shorter steps: that of convergence if even a
-        full step is predicted to decrease the loss by less than is significant.
+        full step is predicted to decrease the loss by less than is significant, or with impacts if
+        intervals contain its end.
         """
-        remaining = point.loss - point.predicted_loss(self._full_step(point, curvature))
-        is_feasible = self._is_feasible(point, NEARLY_FEASIBLE)
-        return Status.CONVERGED if is_feasible and remaining <= INSIGNIFICANT else Status.STALLED
+        full_step = self._full_step(point, curvature)
+        if self.has_impacts and self._is_near(point, full_step, 1.0):
+            is_converged = self._is_feasible(point, INFEASIBLE)
+        else:
+            remaining = point.loss - point.predicted_loss(full_step)
+            is_converged = self._is_feasible(point, NEARLY_FEASIBLE) and remaining <= INSIGNIFICANT
+        return Status.CONVERGED if is_converged else Status.STALLED
 
     def _is_feasible(self, point: Iterate, limit: float) -> bool:
         """Return whether the infeasibility of a point is at most a share of the body's size."""

@@ -45,6 +45,7 @@ from .formats.columns import (
     Quantity,
     QuantityTable,
     column_statement,
+    deformed_column_names,
     fitting_column_names,
     name_and_unit,
     names_compression,
@@ -421,11 +422,17 @@ def _one_of(
         present = " and ".join(quantity.key for quantity in there)
         expected = ", ".join(quantity.column for quantity in quantities)
         if STRESS in quantities and TRUE_STRESS not in quantities and not there:
-            true = fitting_column_names(table.grid, TRUE_STRESS)
-            if true and "true" in true[0].lower():
+            for column in deformed_column_names(table.grid, STRESS):
                 raise table.grid.error_at(
-                    f"column {true[0]} holds a true stress, force over deformed area; expected an "
+                    f"column {column} holds a true stress, force over deformed area; expected an "
                     'engineering stress, or stress = "true"'
+                )
+        if STRAIN in quantities and not there:
+            for column in deformed_column_names(table.grid, STRAIN):
+                raise table.grid.error_at(
+                    f"column {column} holds a true strain, the logarithm of the stretch; expected an "
+                    "engineering strain, or the stretch, which is the exponential of the true strain: "
+                    "convert its values, then call it stretch"
                 )
         raise table.grid.error_at(
             f"the columns are {', '.join(table.grid.columns)}; found "

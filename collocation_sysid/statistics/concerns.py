@@ -192,6 +192,9 @@ TOPICS: dict[str, Topic] = {
             'area): set stress = "true", or divide the forces by the undeformed area',
             "specimen-compression": "its strains and stresses fit as those of a compression test: "
             "set strain_sign = -1 and stress_sign = -1",
+            "specimen-compression/widening": "its strains and stresses fit as those of a compression "
+            "test whose lateral strains are positive where the specimen becomes wider: set strain_sign "
+            "= -1 and stress_sign = -1, and multiply the lateral strains in the file by -1",
             "specimen-percent": "its strains fit as percent: name the unit in the column, "
             '"strain (%)"',
             "specimen-kind": "its curve fits as that of a {test} test, with the same law: check the "

@@ -231,3 +231,18 @@ def test_units_per_area_are_read_with_underscores(column, factor):
     assert unit is not None
     assert name == column.split("stress")[0] + "stress"
     assert si_factor(unit, "pressure") == factor
+
+
+@pytest.mark.parametrize(
+    "header", ["true strain (%)", "Hencky strain (-)", "log. strain [%]", "logarithmic strain (1)"]
+)
+def test_a_logarithmic_strain_is_no_engineering_strain(tmp_path, header):
+    text = message(tmp_path, f"{header},a (mm),b (mm),stress (kPa)")
+    assert f"column {header} holds a true strain" in text
+    assert "then call it stretch" in text
+
+
+def test_a_cauchy_stress_is_a_true_stress(tmp_path):
+    text = message(tmp_path, "strain (-),a (N m),b (N m),Cauchy stress (kPa)")
+    assert "holds a true stress" in text
+    assert 'stress = "true"' in text

@@ -34,4 +34,11 @@ def test_foams_are_compared_with_laws_of_foams(material, power):
 @pytest.mark.parametrize("power", [None, -0.48])
 def test_rubbers_are_compared_with_laws_of_rubbers(power):
     message = advised("neo-hookean", power)
-    assert "--materials neo-hookean,mooney-rivlin,yeoh,ogden-2" in message
+    assert "--materials neo-hookean,mooney-rivlin,yeoh,gent,ogden-2" in message
+
+
+@pytest.mark.parametrize(
+    ("law", "richer"), [("ogden-2", "ogden-3"), ("hyperfoam-2", "hyperfoam-3")]
+)
+def test_a_law_of_several_terms_is_compared_with_one_of_more_terms(law, richer):
+    assert richer in advised(law)

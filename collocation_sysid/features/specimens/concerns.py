@@ -26,7 +26,7 @@ SPECIMEN_CODES: Mapping[str, str] = {
     "information/none": "specimen/none",
 }
 # Laws of rubber to compare, in the order of their number of constants.
-COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "ogden-2")
+COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "gent", "ogden-2")
 # Laws to compare for foams, whose volume changes.
 FOAM_LAWS = ("neo-hookean", "hyperfoam-1", "hyperfoam-2")
 # Largest change of the logarithm of a volume, relative to that of the stretch, in rubber.
@@ -72,7 +72,8 @@ def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
     is_foam = any(law.startswith("hyperfoam-") for law in laws)
     is_foam |= any(_changes_volume(each) for each in experiments)
     compared = FOAM_LAWS if is_foam else COMPARED_LAWS
-    others = [*laws, *(law for law in compared if law not in laws)]
+    richer = [law.replace(f"-{n}", f"-{n + 1}") for law in laws for n in (2, 3) if f"-{n}" in law]
+    others = [*dict.fromkeys((*laws, *richer, *compared))]
     return {"laws": laws, "range": " and ".join(_ranges(experiments)), "others": ",".join(others)}
 
 

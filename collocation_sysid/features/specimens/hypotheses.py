@@ -386,7 +386,8 @@ def likely_mistakes(
 ) -> Iterator[Deviation]:
     """Yield the likely mistakes about a specimen. The name of a row is the code of its hypothesis."""
     yield _mistake("specimen-true-stress", _of_engineering_stress)
-    yield _mistake("specimen-compression", _compressed)
+    for code, is_widening in (("", False), ("/widening", True)):
+        yield _mistake(f"specimen-compression{code}", partial(_compressed, is_widening=is_widening))
     yield _mistake("specimen-gap", _of_undeformed_gap)
     yield _mistake("specimen-percent", _of_ratios)
     for gauge in experiment.readings[1:]:
@@ -550,9 +551,10 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
     return replace(experiment, grasps=[scaled(grasp) for grasp in experiment.grasps])
 
 
-def _compressed(experiment: Experiment) -> Correction:
+def _compressed(experiment: Experiment, is_widening: bool) -> Correction:
     """Return a copy of the experiment with strains and stresses of the opposite sign, and lateral
-    strains, if the file has these and not stretches, on which no sign acts.
+    strains, if the file has these and not stretches, on which no sign acts; unless `is_widening`:
+    if they are positive in the file where the specimen becomes wider.
     """
     deformation = experiment.specimen
     assert deformation is not None
@@ -566,9 +568,11 @@ def _compressed(experiment: Experiment) -> Correction:
         return None
     reversed_stress = _with_stress(experiment, np.full(len(experiment.t_s), -1.0))
     is_reversed = "lateral_strain" in deformation.columns
+    if is_widening and not is_reversed:
+        return None
     readings = [
         replace(gauge, values=2.0 - gauge.measured_values)
-        if gauge.name == LATERAL_NAME and is_reversed
+        if gauge.name == LATERAL_NAME and is_reversed and not is_widening
         else gauge
         for gauge in reversed_stress.readings
     ]

@@ -155,7 +155,7 @@ _BARE_UNIT = re.compile(r"(?P<name>[^/]*?[^/\s])(?:\s+|/)(?P<unit>[^\s\d][^\s]*)
 # A unit with underscores, as in stress_kgf_cm2.
 _PER_AREA = re.compile(r"(?P<name>.+)_(?P<unit>[^\W_]+)_(?P<area>[^\W_]+)")
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
-_DEFORMED = {"true", "wahre", "cauchy", "logarithmic"}
+_DEFORMED = {"true", "wahre", "cauchy", "logarithmic", "logarithmische", "log", "hencky", "natural"}
 # German compounds end with what they are: Druckspannung, Prüfkraft, Kolbenweg.
 _COMPOUND = re.compile(
     r"(?P<first>\w+)(?P<last>zeit|weg|kraft|last|spannung|dehnung|stauchung|streckung|druck)"
@@ -444,10 +444,20 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
         if (
             is_similar
             and not _other_word(column)
+            and not _words(name) & _DEFORMED
             and not any(_name_fits(column, each) for each in others)
         ):
             names.append(column)
     return names
+
+
+def deformed_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
+    """Return the names of all columns that hold a quantity of the deformed specimen, such as a true
+    stress or a logarithmic strain, in their order.
+    """
+    words = set(quantity.words.split())
+    named = ((column, _words(name_and_unit(column)[0])) for column in grid.columns)
+    return [column for column, own in named if own & words and own & _DEFORMED]
 
 
 def column_statement(names: Mapping[str, str]) -> str:
