@@ -58,6 +58,8 @@ from .formats.units import si_factor
 from .homogeneous_deformation import AXES, CELL_SIZE_M, DEFORMATIONS, transverse_stretch
 from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME
 
+# Name of a column that no column of a table fits.
+MISSING = "…"
 # Most statements of columns that a message lists: more are not read.
 MOST_STATEMENTS = 4
 Sign = Literal[1, -1]
@@ -326,14 +328,20 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
         names: dict[str, str] = {}
         for quantity in (FREQUENCY, STORAGE, LOSS):
             found = _column_choices(grid, (quantity,), layout.columns, taken=names.values())
+            if quantity == LOSS and found[0] == {LOSS.key: MISSING}:
+                found = _column_choices(grid, (LOSS_FACTOR, LOSS), layout.columns, names.values())
             names |= found[0]
         return column_statement(names)
     deformations = _column_choices(grid, layout.list_deformations(), stated=layout.columns)
     groups = [deformations]
     if second := layout.list_second_deformations():
-        groups.append(
-            _column_choices(grid, second, stated=layout.columns, taken=_names_of(deformations))
-        )
+        of_second = _column_choices(grid, second, layout.columns, taken=_names_of(deformations))
+        keys = [key for each in deformations for key in each]
+        if MISSING in _names_of(of_second) and keys in ([STRETCH.key] * 2, [STRAIN.key] * 2):
+            # Two of unknown axes: the first column is taken for the first axis.
+            of_second = [{f"second_{keys[0]}": deformations[1][keys[0]]}]
+            groups = [deformations[:1]]
+        groups.append(of_second)
     groups.append(_column_choices(grid, layout.loads, stated=layout.columns))
     required = {*layout.list_deformations(), *layout.list_second_deformations()}
     required |= {*layout.loads}
@@ -404,7 +412,7 @@ def _column_choices(
                 if name not in taken
             ]
     if not choices and not is_optional:
-        return [{quantities[-1].key: "…"} if quantities else {}]
+        return [{quantities[-1].key: MISSING} if quantities else {}]
     return choices
 
 
@@ -438,7 +446,7 @@ def _one_of(
             f"the columns are {', '.join(table.grid.columns)}; found "
             f"{present or 'no column'} of the {what}, "
             f"expected exactly one of {expected}, in these or other units"
-            f"{other_columns_text(table.grid, quantities)}. State "
+            f"{other_columns_text(table.grid, layout.list_quantities())}. State "
             f"{column_advice(table.grid, layout)}"
         )
     return there[0]

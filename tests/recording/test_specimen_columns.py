@@ -246,3 +246,31 @@ def test_a_cauchy_stress_is_a_true_stress(tmp_path):
     text = message(tmp_path, "strain (-),a (N m),b (N m),Cauchy stress (kPa)")
     assert "holds a true stress" in text
     assert 'stress = "true"' in text
+
+
+@pytest.mark.parametrize(
+    ("header", "layout"),
+    [
+        ("lambda 1,lambda 2,stress difference (kPa)", {"test": "biaxial-difference"}),
+        ("t [min],E(t) [kPa]", {"test": "uniaxial", "modulus": "relaxation"}),
+        ("f [Hz],Storage (kPa),tan delta", {"test": "uniaxial", "modulus": "harmonic"}),
+        ("f (Hz),E' (kPa),E'' (kPa)", {"test": "uniaxial", "modulus": "harmonic"}),
+    ],
+)
+def test_a_followed_statement_of_columns_is_read(tmp_path, header, layout):
+    path = tmp_path / "table.csv"
+    width = header.count(",") + 1
+    path.write_text("\n".join([header, *(",".join([f"1.{k}"] * width) for k in (1, 2, 3))]) + "\n")
+    with pytest.raises(cs.InputError) as raised:
+        read_specimen(path, SpecimenLayout(columns={}, **layout))
+    stated = statements(str(raised.value))[0]
+    assert "makes it another quantity" not in str(raised.value)
+    table = read_specimen(path, SpecimenLayout(columns=stated, **layout))
+    assert len(table.stress_pa) == 3
+
+
+def test_differences_of_true_stresses_are_read(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("stretch,second stretch,difference of true stresses (kPa)\n1.1,1,2\n1.2,1,3\n")
+    layout = SpecimenLayout(test="biaxial-difference", columns={})
+    assert read_specimen(path, layout).is_incompressible

@@ -118,7 +118,10 @@ MODULUS = Quantity(
     qualifier="modulus",
 )
 FREQUENCY = Quantity(
-    "frequency", "frequency", unit="hz", words="frequency frequenz fréquence frecuencia frequenza"
+    "frequency",
+    "frequency",
+    unit="hz",
+    words="frequency freq omega ω frequenz fréquence frecuencia frequenza",
 )
 STORAGE = Quantity(
     "storage", "pressure", unit="pa", words="storage stor speichermodul", qualifier="storage"
@@ -492,7 +495,8 @@ def other_columns_text(grid: TextTable, quantities: Sequence[Quantity] = ()) -> 
     others = {
         column: word
         for column in grid.columns
-        if (word := _other_word(column)) and not any(_name_fits(column, q) for q in quantities)
+        if (word := _other_word(column, {q.qualifier for q in quantities}))
+        and not any(_name_fits(column, q) for q in quantities)
     }
     return "".join(
         f"; {column} is not read, because the word {word!r} makes it another quantity"
@@ -500,11 +504,14 @@ def other_columns_text(grid: TextTable, quantities: Sequence[Quantity] = ()) -> 
     )
 
 
-def _other_word(column: str) -> str:
-    """Return the word that makes a column another quantity than any that is read, or ""."""
-    keys = ("other", "difference", "storage", "loss", "modulus")
+def _other_word(column: str, own: Collection[str] = ()) -> str:
+    """Return the word that makes a column another quantity than any that is read, or "": a word of
+    other qualifiers than those of the quantities that are read, by their keys.
+    """
+    keys = ("other", "difference", "storage", "loss", "modulus", *(("deformed",) if own else ()))
     words = _words(name_and_unit(column)[0])
-    return next((word for key in keys for word in sorted(words & QUALIFIERS[key])), "")
+    others = (words & QUALIFIERS[key] for key in keys if key not in own)
+    return next((word for found in others for word in sorted(found)), "")
 
 
 def name_and_unit(column: str) -> tuple[str, str | None]:
@@ -536,10 +543,11 @@ def names_compression(column: str) -> bool:
 
 
 def _words(name: str) -> set[str]:
-    """Return the words of a name in lower case, its longest sequences of letters, and of a compound
-    also its last part and a qualifier that is its first.
+    """Return the words of a name in lower case, its longest sequences of letters, also without the
+    ending of a plural, and of a compound also its last part and a qualifier that is its first.
     """
     words = set(re.findall(r"[^\W\d_]+", name.lower()))
+    words |= {word[: -len(end)] for word in words for end in ("s", "es") if word.endswith(end)}
     compounds = [*filter(None, map(_COMPOUND.fullmatch, words))]
     firsts = {c["first"] for c in compounds} & _ALL_QUALIFIERS
     return words | {c["last"] for c in compounds} | firsts
