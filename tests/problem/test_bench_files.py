@@ -30,8 +30,9 @@ from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.result.synthesis import write_data
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    _hysteresis_hypotheses,
+from collocation_sysid.statistics.misspecification.fit_misspecifications import _unloading
+from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+    corrected_hypothesis,
 )
 from collocation_sysid.statistics.misspecification.modal_misspecifications import (
     find_misspecifications_by_modes,
@@ -382,7 +383,7 @@ def test_only_a_softer_unloading_is_hysteresis(tmp_path):
     assert unloading_difference(experiment) == pytest.approx(0.1, abs=0.01)
     collocation = Problem.read(tmp_path / "problem.toml").collocation()
     solution = SimpleNamespace(collocation=collocation)
-    assert not [*_hysteresis_hypotheses(cast(Any, solution), experiment)]
+    assert corrected_hypothesis(_unloading(cast(Any, solution)), experiment) is None
 
 
 def test_the_loading_branch_has_the_peak_and_at_most_as_many_samples(tmp_path):
