@@ -362,6 +362,19 @@ def test_points_off_the_body_are_excluded() -> None:
     assert not residual.is_compared[:, 0].any()
 
 
+def test_poses_from_inexact_points_near_a_line_are_found():
+    """The steps of the search decrease slowly, because depth and turn nearly compensate."""
+    x_m, z_m = [6.6, 14.5, 5.4, 6.6, 10.8], [85.9, 1.6, 22.9, 3.3, 104.0]
+    points_m = 1e-3 * np.stack([x_m, np.zeros(5), z_m], axis=1)
+    u, v = [-0.0227, 0.005, -0.0315, -0.0237, -0.0037], [-0.1353, 0.1882, 0.1119, 0.1817, -0.196]
+    (pose, error), *_ = poses_from_points(points_m, np.stack([u, v, np.ones(5)], axis=1))
+    own_m = (points_m - pose[:3, 3]) @ pose[:3, :3]
+    assert own_m[:, 2].min() > 0.1
+    off = own_m[:, :2] / own_m[:, 2:] - np.stack([u, v], axis=1)
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(error)
+    assert error < 0.0025
+
+
 @pytest.mark.parametrize("flat", [True, False])
 def test_poses_are_found_from_points(flat: bool) -> None:
     rng = np.random.default_rng(6)

@@ -19,9 +19,11 @@ MOST_STEPS = 1000
 LEAST_STEP = 1e-3
 # Fewest points that determine the pose of a camera.
 FEWEST_POINTS = 4
-# Iterations within which a pose is fitted, and the change [rad, of depths] that ends them.
+# Iterations within which a pose is fitted, the change [rad, of depths] that ends them, and the
+# relative change of the squared errors by the last of them with which the best pose counts as found.
 MOST_ITERATIONS = 100
 LEAST_POSE_STEP = 1e-7
+LEAST_GAIN = 1e-4
 # Difference of rotations [rad] below which two poses are the same.
 SAME_TURN_RAD = 1e-3
 
@@ -188,8 +190,9 @@ def _fitted_poses(
     points_m: Array, seen: Array, turns: Array, shifts: Array, least_m: float
 ) -> tuple[Array, Array, Array]:
     """Return the rotations (m, 3, 3) and translations (m, 3) to which the method of Levenberg and
-    Marquardt converges from m of the k starts, and the RMS (m,) of the differences of points (P, 3)
-    at unit depth from the seen ones (P, 2); points are at least `least_m` in front of the camera.
+    Marquardt converges from m of the k starts (the best, if none converges), and the RMS (m,) of the
+    differences of points (P, 3) at unit depth from the seen ones (P, 2); points are at least
+    `least_m` in front of the camera.
     """
     # All starts at once: SciPy's `least_squares` from one after the other takes nine times as long.
 
@@ -218,7 +221,8 @@ def _fitted_poses(
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
         next_turns = Rotation.from_rotvec(step[:, :3]).as_matrix() @ turns
         trial = differences(next_turns, shifts + step[:, 3:])
-        gain = np.sum(off**2, axis=(1, 2)) - np.sum(trial[2] ** 2, axis=(1, 2))
+        squared = np.sum(off**2, axis=(1, 2))
+        gain = squared - np.sum(trial[2] ** 2, axis=(1, 2))
         is_better = gain > 0
         damping = np.clip(np.where(is_better, damping / 5, damping * 4), 1e-12, 1e12)
         turns = np.where(is_better[:, None, None], next_turns, turns)
@@ -230,6 +234,11 @@ def _fitted_poses(
         if is_found.all():
             break
     errors = np.sqrt(np.mean(off**2, axis=(1, 2)))
+    if not is_found.any():
+        # Of inexact points near a line the steps decrease slowly, although nothing is gained.
+        is_settled = np.abs(gain) <= LEAST_GAIN * squared
+        best = int(np.argmin(np.where(is_settled, errors, np.inf)))
+        is_found[best] = is_settled[best]
     return turns[is_found], shifts[is_found], errors[is_found]
 
 
