@@ -10,7 +10,7 @@ import re
 import secrets
 import stat
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -293,6 +293,16 @@ def reason(error: BaseException) -> str:
     """Return type and message of an error on one line of at most `LONGEST_REASON` characters."""
     text = " ".join(f"{type(error).__name__}: {error}".split())
     return text if len(text) <= LONGEST_REASON else f"{text[: LONGEST_REASON - 1]}…"
+
+
+def in_counting_order(files: Iterable[Path]) -> list[Path]:
+    """Return files in the order of their names, with numbers by their value: 2.png before 10.png."""
+
+    def key(file: Path) -> list[tuple[bool, int, str]]:
+        parts = re.split(r"([0-9]+)", file.name)
+        return [(not p.isdecimal(), int(p) if p.isdecimal() else 0, p) for p in parts if p]
+
+    return sorted(files, key=key)
 
 
 def run_name(problem: Path) -> str:

@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from collocation_sysid.common.files import in_counting_order
+
 # Window of the method [pixels], levels of its pyramid, and iterations of each level.
 WINDOW_PX = 21
 LEVELS = 3
@@ -68,7 +70,7 @@ def images_of(source: Path, rate_hz: float | None) -> Iterator[tuple[float, np.n
     """
     cv2 = opencv()
     if source.is_dir():
-        files = sorted(f for f in source.iterdir() if f.suffix.lower() in IMAGE_ENDINGS)
+        files = in_counting_order(f for f in source.iterdir() if f.suffix.lower() in IMAGE_ENDINGS)
         if not files or not rate_hz:
             sys.exit(f"{source}: found {len(files)} images; expected images, and --rate-hz")
         for k, file in enumerate(files):

@@ -239,6 +239,14 @@ def test_masks_of_a_problem_file_are_read_in_all_formats(tmp_path: Path) -> None
         np.testing.assert_array_equal(film.all_masks[0], photograph())
 
 
+def test_masks_of_a_folder_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (10, 1, 2):
+        mask = np.zeros((4, 12), dtype=np.uint8)
+        mask[1:3, 1 : 1 + number] = 255
+        Image.fromarray(mask).save(tmp_path / f"frame_{number}.png")
+    assert [int(mask.sum()) // 2 for mask in read_masks(tmp_path)] == [1, 2, 10]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

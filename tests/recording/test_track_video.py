@@ -39,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
     frames = tmp_path / "frames"
     frames.mkdir()
     for k, image in enumerate(images()):
-        cv2.imwrite(str(frames / f"{k:03d}.png"), image)
+        cv2.imwrite(str(frames / f"frame_{k}.png"), image)
     return frames
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...common.files import reason
+from ...common.files import in_counting_order, reason
 from ...errors import InputError
 
 Mask = NDArray[np.bool_]
@@ -44,7 +44,7 @@ def read_masks(path: Path) -> list[Mask]:
         If the file has no masks.
     """
     if path.is_dir():
-        files = sorted(path.glob("*.png"))
+        files = in_counting_order(path.glob("*.png"))
         if not files:
             raise InputError(f"the folder has no .png; {EXPECTED}", path)
         return [_read_png(file) for file in files]

@@ -18,7 +18,7 @@ import numpy as np
 from ...common.array_files import load_array, load_arrays
 from ...common.array_types import Array
 from ...common.checked_arrays import float_array
-from ...common.files import reason, require_regular, require_size
+from ...common.files import in_counting_order, reason, require_regular, require_size
 from ...errors import InputError, located
 from . import ply
 from .camera_messages import (
@@ -187,7 +187,8 @@ def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
 
 def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFileContent:
     """Read all depth files of a folder, in the order of their names."""
-    files = sorted(each for each in path.iterdir() if each.suffix.lower() in (*IMAGES, *CLOUDS))
+    kinds = (*IMAGES, *CLOUDS)
+    files = in_counting_order(each for each in path.iterdir() if each.suffix.lower() in kinds)
     if not files:
         raise InputError(
             f"the folder contains no files {', '.join((*IMAGES, *CLOUDS))}; expected depth images "
