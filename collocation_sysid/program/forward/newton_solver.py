@@ -439,9 +439,9 @@ class NewtonSolver:
 
         A step is acceptable when the next one, computed with the same factor, is shorter
         (Deuflhard's natural monotonicity test), and no element is inverted. With mean stresses
-        `stress` a whole step is also acceptable if the next one with its own factor is shorter: the
-        volumes of a nearly incompressible body are wrong after a long step, and only that factor
-        removes the errors without further displacements.
+        `stress` a whole step is also acceptable if the next one with its own factor is as much
+        shorter: the volumes of a nearly incompressible body are wrong after a long step, and only
+        that factor removes the errors without further displacements.
         """
         x = iterate.x
         factor = iterate.factor
@@ -458,7 +458,8 @@ class NewtonSolver:
                     at = linearise(trial) if share == 1 else None
                     value = residual(trial) if at is None else at.residual
                 next_step = self.step(factor, value)
-                is_shorter = _length(next_step) <= (1 - share / 4) * length
+                longest = (1 - share / 4) * length
+                is_shorter = _length(next_step) <= longest
                 if is_shorter and not keep_definite and self._is_last(next_step, OLD_FACTOR_SHARE):
                     return _Iterate(trial, factor, step=next_step)
                 if is_shorter or (stress is not None and share == 1):
@@ -469,7 +470,7 @@ class NewtonSolver:
                     try:
                         own = self.factorise(at, trial, keep_definite=keep_definite)
                         own_step = self.step(own, at.residual)
-                        if is_shorter or _length(own_step) <= length:
+                        if is_shorter or _length(own_step) <= longest:
                             return _Iterate(trial, own, step=own_step)
                     except NewtonFailure:
                         pass
