@@ -216,7 +216,9 @@ def test_faults_are_as_large_as_they_are_called():
 
 @pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
 def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.FaultOutcome(True, *(np.ones(6) for _ in range(5)), correlated=False, redrawn=0)
+    outcome = study_faults.FaultOutcome(
+        True, *(np.ones(6) for _ in range(5)), correlated=False, redrawn=0
+    )
     missed = replace(outcome, contains_truth=np.zeros(6))
     row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
     assert cells(f"a\nb\n{row}")[0][1] == shown
