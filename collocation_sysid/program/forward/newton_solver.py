@@ -248,7 +248,7 @@ class NewtonSolver:
             iterate = self._backtrack(iterate, residual, linearise=linearise, keep_definite=True)
         raise self._iteration_failure(iterate)
 
-    def solve_step(self, x: Array, equations: StepEquations, patience: int = 1) -> Array:
+    def solve_step(self, x: Array, equations: StepEquations) -> Array:
         """Solve one implicit time step for the free dofs.
 
         Local forces are condensed to the dofs on which they act, with the factor of the body
@@ -261,8 +261,6 @@ class NewtonSolver:
         ----------
         x : (3n,) array
             First guess [m]; not modified. Prescribed dofs keep their values.
-        patience : int
-            Factor on the largest number of iterations of Newton's method.
 
         Returns
         -------
@@ -275,12 +273,12 @@ class NewtonSolver:
             If no method converges, or an element is inverted at the start.
         """
         require_time()
-        solution = self._solve_step(x, equations, patience * self.options.max_iterations)
+        solution = self._solve_step(x, equations)
         self._last_step = equations.stress, solution
         return solution
 
-    def _solve_step(self, x: Array, equations: StepEquations, iterations: int) -> Array:
-        """Return the solution of `solve_step` within so many iterations of Newton's method."""
+    def _solve_step(self, x: Array, equations: StepEquations) -> Array:
+        """Return the solution of `solve_step`."""
         if equations.local.has_forces and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(x, _CondensedIteration(self, equations))
             if done:
@@ -295,7 +293,7 @@ class NewtonSolver:
             stress, before = self._last_step
             linearise = equations.stress.expecting(stress.at(before), linearise)
         iterate = self._iterate_at(x.copy(), linearise, keep_definite=False)
-        for _ in range(iterations):
+        for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
                 self.last_factor = iterate.factor
                 iterate.x[self.free] += iterate.step

@@ -31,9 +31,6 @@ from .newton_solver import (
     simulation_error,
 )
 
-# Factor on the iterations of a last attempt at a time step: where points strike, stick and slip in
-# one step, Newton's method may need some hundred.
-PATIENCE = 10
 # Called with the share of the work that is done, between 0 and 1.
 Progress = Callable[[float], None]
 
@@ -339,8 +336,7 @@ def solve_row(
     solver: NewtonSolver, row: RowEquations, guess: Array, previous: Array, prescribed_m: Array
 ) -> Array:
     """Return the solution x_t (3n,) [m] of one row; where Newton's method fails, the grasps'
-    displacement (and a static load) is applied in smaller increments, and a last attempt at a time
-    step has `PATIENCE` times as many iterations.
+    displacement (and a static load) is applied in smaller increments.
 
     Static rows stay on the branch of stable equilibria.
 
@@ -377,13 +373,8 @@ def solve_row(
                 start[solver.is_prescribed] = goal
                 solution = solver.solve_step(start, equations)
         except NewtonFailure:
-            if path.shorten():
-                continue
-            if row.dynamics.is_static:
+            if not path.shorten():
                 raise
-            start = guess.copy()
-            start[solver.is_prescribed] = prescribed_m
-            return solver.solve_step(start, row, patience=PATIENCE)
         else:
             path.accept(solution)
     return path.x
