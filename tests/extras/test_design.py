@@ -43,9 +43,8 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Grasp, PoseSequence
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.uncertainty import ErrorModel
+from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 AT = GUESS.with_guess(TRUTH)
 LIMITS = Limits.model_validate(
@@ -270,9 +269,10 @@ def errors_at(collocation, z) -> PredictedErrors:
     return PredictedErrors.from_information(information, AT, ThetaMap(AT, body), AT.guess_q)
 
 
-def test_error_bars_are_those_that_a_run_reports():
+def test_error_bars_are_those_of_the_linearised_fit_of_a_run():
     collocation, z = at_answer([hung_cube(8)])
-    run = uncertainty_at(collocation, z, ErrorModel("given", "independent"))
+    given = ErrorModel("given", "independent")
+    run = uncertainty_from_fit(linearise_fit(collocation, z), AT, AT.guess_q, given)
     found = errors_at(collocation, z)
     known = {
         n: e
