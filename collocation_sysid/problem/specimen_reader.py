@@ -189,8 +189,7 @@ class SpecimenReader:
                 names.append(name)
                 self._add_note(
                     f"all {known.size} {what} in {self.section.file} are {known[0]:g}, which is "
-                    f"impossible in a "
-                    f"{self.section.test} test: they are taken as not measured"
+                    f"impossible in a {self.section.test} test: they are taken as not measured"
                 )
         return names
 

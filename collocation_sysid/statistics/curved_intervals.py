@@ -25,7 +25,7 @@ from .distributions import normal_isf
 from .estimates import Estimate, IntervalCoordinate, relative_derivatives
 from .linearised import LinearisedFit, linearise_fit, parameter_values
 from .pose_noise import with_pose_noise
-from .probes.profile_likelihood import Refits, compute_profile, noise_scale
+from .probes.profile_likelihood import profile_and_refits
 from .uncertainty import AUTO, ErrorModel, Uncertainty, uncertainty_from_fit
 
 # Parameters of the compressibility, and the factor by which λ/μ has to change within the interval.
@@ -83,19 +83,10 @@ def _along_profile(
     """Return the uncertainty with intervals along the profile of free parameter k."""
     parameters, q = collocation.parameters, z[: collocation.nq]
     item, quantile = parameters.free[k], float(uncertainty.quantiles[k])
-    value = item.from_coordinate(float(q[k]))
-    refits = Refits(collocation, z, fit, k)
-    scale = noise_scale(parameters, q, fit, uncertainty, k) * (quantile / normal_isf(0.025)) ** 2
-    deviation = float(np.sqrt(uncertainty.covariance[k, k])) * quantile / 2
+    widening = (quantile / normal_isf(0.025)) ** 2
     try:
-        rises = compute_profile(
-            refits,
-            item.name,
-            (value, refits.loss),
-            (item.lower, item.upper),
-            deviation * (1.0 if item.scale == "log" else abs(value)),
-            scale,
-            item.scale,
+        rises, refits = profile_and_refits(
+            collocation, z, fit, uncertainty, k, first_step=quantile, widening=widening
         )
     except InputError:  # the estimate is beyond a bound by rounding
         return uncertainty
@@ -167,16 +158,8 @@ def _are_alike(before: Estimate, after: Estimate) -> bool:
 def uncertainty_at(
     collocation: Collocation, z: Array, error_model: ErrorModel = AUTO
 ) -> Uncertainty:
-    """Return the uncertainty of the parameters at a solution, including noise of the poses.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        The program.
-    z : (variables,) array
-        The optimum, which satisfies the equations of motion.
-    error_model : ErrorModel
-        Assumptions about the errors.
+    """Return the uncertainty of the parameters at the optimum z (variables,), with noise of the
+    poses and curved intervals.
 
     Raises
     ------

@@ -12,9 +12,8 @@ differ each has its own variance (see `noise_level`); intervals are then Student
 the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
 states which was used.
 
-Use `curved_intervals.uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised fit
-is known.
-Estimated marker places have error bars too, see `marker_places`.
+Use `curved_intervals.uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised
+fit is known. Estimated marker places have error bars too, see `marker_places`.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.statistics import curved_intervals
 from collocation_sysid.statistics.curved_intervals import uncertainty_at, with_curved_intervals
 from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.probes import profile_likelihood
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 T_S = 0.01 * np.arange(31)
@@ -70,7 +70,7 @@ def test_nothing_is_fitted_again_where_most_of_an_uncertainty_is_systematic(monk
     def refits(*_: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(curved_intervals, "Refits", refits)
+    monkeypatch.setattr(profile_likelihood, "Refits", refits)
     for combined in (None, {"poisson": error}):
         with pytest.raises(AssertionError):
             with_curved_intervals(known, linear, best.collocation, best.z, combined)

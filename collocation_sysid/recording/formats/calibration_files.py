@@ -25,7 +25,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import ParseError
 
 import numpy as np
 import yaml
@@ -195,11 +194,8 @@ def _parsed(text: str, file: Path) -> Mapping[str, Any]:
     for read in readers:
         try:
             content = read(plain)
-        except (
-            *DAMAGE,
-            ParseError,
-            yaml.YAMLError,
-        ):  # readers of YAML raise anything for wrong tags
+        # Readers of YAML raise anything for wrong tags.
+        except (*DAMAGE, ElementTree.ParseError, yaml.YAMLError):
             continue
         if isinstance(content, Mapping):
             return content

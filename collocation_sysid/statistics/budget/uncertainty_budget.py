@@ -28,7 +28,6 @@ import numpy as np
 from ...common.array_types import Array
 from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
-from ...recording.deviation import Deviation
 from ..distributions import student_ppf
 from ..estimates import Estimate, IntervalCoordinate
 from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step, least_squares_of_fit
@@ -199,8 +198,13 @@ class VarianceSources:
         known_deviations = deviations or {}
         budgeted = [k for k, row in enumerate(rows) if known_deviations.get(row, 1.0) is not None]
         considered = budgeted if has_rulers else []
-        rulers, values, joint = _determined(fit, assumed, considered, _is_ruler)
-        limited, limits, beside = _determined(fit, assumed, considered, _is_ruler_or_limited)
+        sought = [k for k in considered if DEVIATIONS[rows[k]].is_ruler]
+        rulers, values, joint = _determined(fit, assumed, considered, sought)
+        has_limited = any(DEVIATIONS[rows[k]].is_limited for k in considered)
+        beside_rulers = [k for k in considered if k in sought or DEVIATIONS[rows[k]].is_limited]
+        limited, limits, beside = _determined(
+            fit, assumed, considered, beside_rulers if has_limited else ()
+        )
         shift = moved[:, rulers] @ values
         ruler_errors = np.zeros(0)
         if rulers:
@@ -343,39 +347,27 @@ class VarianceSources:
         return counted and not is_definition(row, estimate)
 
 
-def _is_ruler(row: Deviation) -> bool:
-    return row.is_ruler
-
-
-def _is_ruler_or_limited(row: Deviation) -> bool:
-    return row.is_ruler or row.is_limited
-
-
 def _determined(
-    fit: LinearisedFit,
-    assumed: ResidualChanges,
-    columns: Sequence[int],
-    is_sought: Callable[[Deviation], bool],
+    fit: LinearisedFit, assumed: ResidualChanges, columns: Sequence[int], sought: Sequence[int]
 ) -> tuple[list[int], Array, LinearisedFit]:
-    """Return the columns of sought deviations that the data determine, their values (r,) by one
-    linear step in the deviations of the budget, and the fit in which they are parameters; the fit
-    itself without any, or if a value is larger than the budget grants.
+    """Return those of the sought columns that the data determine, their values (r,) by one linear
+    step in the deviations of the budget, and the fit in which they are parameters; the fit itself
+    without any, or if a value is larger than the budget grants.
 
     `columns` are those of the budget: whether one is determined is tested with all of them relaxed.
     """
     nothing: tuple[list[int], Array, LinearisedFit] = [], np.zeros(0), fit
-    rulers = [k for k in columns if is_sought(DEVIATIONS[assumed.names[k].partition(" ")[0]])]
-    if not rulers:
+    if not sought:
         return nothing
     first = len(fit.names)
     wide = with_relaxed_columns(fit, assumed, columns)
     errors = dict(zip(columns, np.sqrt(np.diag(covariance_of_fit(wide))[first:]), strict=True))
-    rulers = [k for k in rulers if errors[k] < DETERMINED]
-    if not rulers:
+    known = [k for k in sought if errors[k] < DETERMINED]
+    if not known:
         return nothing
-    joint = with_relaxed_columns(fit, assumed, rulers)
+    joint = with_relaxed_columns(fit, assumed, known)
     values = gauss_newton_step(joint)[first:]
-    return nothing if (np.abs(values) > GRANTED).any() else (rulers, values, joint)
+    return nothing if (np.abs(values) > GRANTED).any() else (known, values, joint)
 
 
 def rescaled(step: Array, parameters: Parameters, is_proportional: Callable[[str], bool]) -> Array:

@@ -221,22 +221,50 @@ def profile_of_solution(
             None,
             where="uncertainty.profile",
         )
-    k = free.index(name)
-    variance = float(uncertainty.covariance[k, k])
-    item = parameters.free[k]
-    value = solution.parameters[name]
-    is_log = item.scale == "log"
+    profile, _ = profile_and_refits(
+        solution.collocation, solution.z, fit, uncertainty, free.index(name)
+    )
+    return profile
 
-    refits = Refits(solution.collocation, solution.z, fit, k)
-    return compute_profile(
+
+def profile_and_refits(
+    collocation: Collocation,
+    z: Array,
+    fit: LinearisedFit,
+    uncertainty: Uncertainty,
+    k: int,
+    first_step: float = 2.0,
+    widening: float = 1.0,
+) -> tuple[Profile, Refits]:
+    """Return the profile likelihood of free parameter k at the optimum z, and its refits.
+
+    Parameters
+    ----------
+    first_step : float
+        First step of the search, in standard errors.
+    widening : float
+        Factor on the rise of the loss at the ends, beyond that of the noise.
+
+    Raises
+    ------
+    InputError
+        If the estimate is not within its bounds.
+    """
+    item = collocation.parameters.free[k]
+    value = item.from_coordinate(float(z[k]))
+    refits = Refits(collocation, z, fit, k)
+    deviation = float(np.sqrt(uncertainty.covariance[k, k])) * first_step / 2
+    profile = compute_profile(
         refits,
-        name,
+        item.name,
         best=(value, refits.loss),
         bounds=(item.lower, item.upper),
-        deviation=float(np.sqrt(variance)) * (1.0 if is_log else abs(value)),
-        noise_scale=noise_scale(parameters, solution.q, fit, uncertainty=uncertainty, k=k),
+        deviation=deviation * (1.0 if item.scale == "log" else abs(value)),
+        noise_scale=_noise_scale(collocation.parameters, z[: collocation.nq], fit, uncertainty, k)
+        * widening,
         scale=item.scale,
     )
+    return profile, refits
 
 
 class Refits:
@@ -299,7 +327,7 @@ def _prior_loss(item: Parameter, value: float) -> float:
     return float((departure / deviation) ** 2)
 
 
-def noise_scale(
+def _noise_scale(
     parameters: Parameters, q: Array, fit: LinearisedFit, uncertainty: Uncertainty, k: int
 ) -> float:
     """Return parameter k's variance over that for independent errors of the stated σ."""
