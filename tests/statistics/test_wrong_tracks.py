@@ -27,7 +27,11 @@ from kit.filmed import (
 
 import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
-from collocation_sysid.features.image_tracks.track_feature import places_off_body, track_hypotheses
+from collocation_sysid.features.image_tracks.track_feature import (
+    notes,
+    places_off_body,
+    track_hypotheses,
+)
 from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
 from collocation_sysid.features.image_tracks.tracked_places import find_places
 
@@ -220,6 +224,7 @@ def stuck(pixels: np.ndarray) -> np.ndarray:
 
 
 def jumping(pixels: np.ndarray) -> np.ndarray:
+    pixels[22:25, 3] = np.nan
     pixels[25:, 3] += [20.0, -8.0]
     return pixels
 
@@ -243,6 +248,21 @@ def test_lost_tracks_are_named(fault: str) -> None:
     found = [*track_hypotheses(residual, true, "'front'")]
     assert [each.code for each in found] == [f"image-track/{fault}"]
     assert words in found[0].message
+
+
+def test_samples_after_a_jump_are_left_out() -> None:
+    tracks = tracks_of(rng=np.random.default_rng(9))
+    pixels = pixels_of(tracks).copy()
+    pixels[25:, 3] += [20.0, -8.0]
+    experiment = swung([with_pixels(tracks, pixels)])
+    program = cs.Problem([experiment], parameters=unknown_young()).collocation()
+    (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
+    assert not residual.is_compared[25:, 3].any()
+    assert residual.is_compared[:25, 3, :2].all()
+    rigid_m = experiment.rigid_positions(residual.observable_s)
+    x = rigid_m.reshape(len(rigid_m), -1)
+    (note,) = notes(program.iterates_at(program.guess_p, [x])[0])
+    assert f"{len(T_S) - 25} samples of {NAMES[3]} in which the tracker has lost the point" in note
 
 
 def test_a_place_that_is_estimated_off_the_body_is_named() -> None:

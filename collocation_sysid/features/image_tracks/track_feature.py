@@ -170,6 +170,13 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
         hidden = tracks.is_seen & places.is_placed & ~places.is_visible
         if hidden.any():
             left.append(f"{hidden.sum()} samples of points that the body or an obstacle hides")
+        lost = np.isfinite(reading.measured[..., 0]) & ~tracks.is_followed
+        if lost.any():
+            names = [name for name, of in zip(tracks.names, lost.T, strict=True) if of.any()]
+            left.append(
+                f"{lost.sum()} samples of {', '.join(names)} in which the tracker has lost the point "
+                "(after a jump, at exactly one place, or in repeated images)"
+            )
         yield (
             f"experiment '{experiment.name}': {known.sum()} samples of {known.any(axis=0).sum()} "
             f"points of '{tracks.name}' deviate by {rms:.3g} pixels (RMS of a coordinate); left out: "

@@ -94,11 +94,11 @@ class ImageTrackResidual(CameraImagesResidual):
 
     def numbers(self, predicted: Array) -> Array:
         """Return predictions (S, N, 3) as pixels (S, 2N); NaN for measured ones that are not
-        compared, because the point is hidden or not on the body.
+        compared, because the point is hidden, lost or not on the body.
         """
         pixels = predicted[..., :2]
         if self.sensor.pixels is not None:
-            is_hidden = self.sensor.is_seen[..., None] & ~self.is_compared[..., :2]
+            is_hidden = np.isfinite(self.sensor.pixels) & ~self.is_compared[..., :2]
             pixels = np.where(is_hidden[: len(pixels)], np.nan, pixels)
         return pixels.reshape(len(pixels), -1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -17,6 +18,7 @@ from ...common.validated_types import NotNegative, Positive
 from ...errors import InputError
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
+from ...recording.lost_points import followed_samples
 from ...recording.nuisance import IMAGE_DRIFT, IMAGE_REACH, SURFACE_PLACE
 from .camera_images import CameraImages
 from .camera_images import PoseSigma as PoseSigma
@@ -167,12 +169,21 @@ class ImageTracks(CameraImages):
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
-        """Mask (S, N) of the images in which each point has both coordinates; all true before
-        pixels are simulated.
+        """Mask (S, N) of the images in which each point has both coordinates and is followed; all
+        true before pixels are simulated.
         """
         if self.pixels is None:
             return np.ones((len(self.t_s), len(self.names)), dtype=bool)
-        return np.asarray(np.isfinite(self.pixels).all(axis=2))
+        return np.asarray(np.isfinite(self.pixels).all(axis=2) & self.is_followed)
+
+    @cached_property
+    def is_followed(self) -> NDArray[np.bool_]:
+        """Mask (S, N) of the images in which the tracker has not lost the point, see
+        `followed_samples`; all true before pixels are simulated.
+        """
+        if self.pixels is None:
+            return np.ones((len(self.t_s), len(self.names)), dtype=bool)
+        return followed_samples(self.pixels, self.sigma_px)
 
     # Nuisance parameters ----------------------------------------------------------------------
 

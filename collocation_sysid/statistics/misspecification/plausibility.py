@@ -26,6 +26,7 @@ from ...fem.laws.moduli import engineering_constants
 from ...program.modes.modal_prediction import carrying_grasp
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
+from ...recording.lost_points import STILL_SIGMAS, held_tracks
 from ...recording.obstacle import Obstacle
 from ...recording.poses import Frame
 from ..concerns import Concern
@@ -226,10 +227,6 @@ LIVELY = 0.9
 WITHIN_MOTION = 0.5
 # Fewest samples in which steps are searched.
 FEWEST = 8
-# Fewest samples at exactly one place that fill a gap, and share of the others that may be exactly
-# those before, as coordinates with few digits are.
-FEWEST_HELD = 5
-REPEATED = 0.1
 
 
 def step_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -253,28 +250,16 @@ def _held_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     that was filled with the last position or with zeros, while another one moves.
     """
     markers = experiment.markers
-    tracks_m = markers.positions_at_samples_m
-    repeats = (np.diff(tracks_m, axis=0) == 0).all(axis=2)
-    for m, name in enumerate(markers.names):
-        edges = np.flatnonzero(np.diff(np.r_[False, repeats[:, m], False]))
-        runs = [(k, end) for k, end in edges.reshape(-1, 2).tolist() if end - k >= FEWEST_HELD - 1]
-        count = sum(end - k for k, end in runs)
-        rest = np.isfinite(tracks_m[:, m, 0]).sum() - 1 - count
-        if not runs or repeats[:, m].sum() - count > REPEATED * rest:
-            continue
-        first, end = max(runs, key=lambda run: run[1] - run[0])
-        others_m = np.delete(tracks_m[first : end + 1], m, axis=1)
-        extents_m = np.linalg.norm(np.ptp(others_m, axis=0), axis=1)
-        moved_m = float(np.max(extents_m, initial=0.0, where=np.isfinite(extents_m)))
-        moving = moved_m / (STILL_SIGMAS * float(np.median(markers.sigma_m)))
-        if moving > 1:
-            data = {
-                "marker": name,
-                "count": count + len(runs),
-                "t_s": experiment.t_s[first],
-                "by_mm": 1e3 * moved_m,
-            }
-            yield Hypothesis("marker-held", f"'{experiment.name}'", data=data, strength=moving)
+    sigma_m = float(np.median(markers.sigma_m))
+    for held in held_tracks(markers.positions_at_samples_m, sigma_m):
+        data = {
+            "marker": markers.names[held.track],
+            "count": held.count,
+            "t_s": experiment.t_s[held.longest[0]],
+            "by_mm": 1e3 * held.moved * sigma_m,
+        }
+        strength = held.moved / STILL_SIGMAS
+        yield Hypothesis("marker-held", f"'{experiment.name}'", data=data, strength=strength)
 
 
 def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
@@ -302,10 +287,8 @@ def _common_jump(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]
     )
 
 
-# Motion of markers that may be none, over the size of the body.
+# Motion of markers that may be none, over the size of the body, beside that of noise.
 STILL_OF_SIZE = 0.01
-# Additional motion that may be noise, over sigma_m.
-STILL_SIGMAS = 6.0
 
 
 def undriven_motion(experiment: Experiment) -> Iterator[Hypothesis]:
