@@ -295,6 +295,20 @@ def test_a_negative_factor_of_the_second_invariant_is_found():
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("alpha", [45.0, -38.0])
+def test_a_large_exponent_is_found_beyond_the_default_bound(alpha):
+    """Ogden's law of a soft tissue that stiffens within a tenth of its length."""
+    stretch = np.linspace(0.9, 1.12, 30)
+    mu_pa = 2e3 / alpha
+    stress_pa = mu_pa * (stretch ** (alpha - 1) - stretch ** (-alpha / 2 - 1))
+    unknown = {"mu_1_pa": cs.Unknown(), "alpha_1": cs.Unknown(), "poisson": 0.4999}
+    solution = fitted("ogden-1", {"uniaxial": (stretch - 1, stress_pa)}, unknown)
+    assert solution.status.converged
+    assert solution.parameters["alpha_1"] == pytest.approx(alpha, rel=0.02)
+    assert solution.parameters["mu_1_pa"] == pytest.approx(mu_pa, rel=0.05)
+
+
+@pytest.mark.long
 def test_a_negative_first_exponent_is_found_where_the_closed_forms_are_not():
     """Ogden's law of brain, with a branch of memory that is known."""
     stretch = 1 + STRAIN

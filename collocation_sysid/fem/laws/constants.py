@@ -189,7 +189,7 @@ CHAIN_STRETCH = Constant(
 # Most terms of a law in powers of the stretches, see `ogden`.
 MOST_TERMS = 4
 # Largest |α|, for which `power_traces` is accurate.
-LARGEST_EXPONENT = 30.0
+LARGEST_EXPONENT = 60.0
 _SUBSCRIPTS = "₁₂₃₄"
 # The first term gives the scale of the stiffness and is positive. Those after it may be negative,
 # as in Ogden's own constants of rubber.

@@ -24,7 +24,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from ...common.array_types import Array
 from ...fem.laws.constants import constant_named, symbol_of
 from ...fem.laws.ogden import is_power_law, term_numbers
-from ...model.parameters import Parameter, Parameters, Tied
+from ...model.parameters import Parameter, Parameters, Tied, with_widest_bounds
 from ...program.collocation import Collocation
 from ...recording.experiment import Experiment
 from ...recording.homogeneous_deformation import AXES
@@ -494,12 +494,12 @@ def _has_default_bounds(item: Parameter) -> bool:
 
 
 def _widened(item: Parameter) -> Parameter:
-    """Return the first exponent with bounds that admit both signs in place of its default bounds;
-    any other parameter itself.
+    """Return the first exponent with its widest bounds, which admit both signs, in place of its
+    default bounds; any other parameter itself.
     """
     if item.name != "alpha_1" or not _has_default_bounds(item):
         return item
-    return replace(item, lower=-item.upper)
+    return with_widest_bounds(item)
 
 
 def _with_factor(item: Parameter, value: float) -> Parameter:
