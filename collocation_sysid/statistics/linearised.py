@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
+from ..common.last_results import known_at_last
 from ..fem.kernels import map_experiments
 from ..model.parameters import ThetaMap
 from ..program.collocation import Collocation, ExperimentIterate
@@ -264,6 +265,7 @@ class LinearisedFit:
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
 
 
+@known_at_last
 def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
     """Linearise a fit at a solution.
 

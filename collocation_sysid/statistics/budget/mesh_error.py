@@ -26,7 +26,7 @@ have; as geometric stiffness they would make e arbitrary in a nearly incompressi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from ...common.array_types import Array, Index
+from ...common.last_results import known_at_last
 from ...errors import InputError
 from ...fem.body import Body
 from ...fem.meshes.refinement import refine_body
@@ -86,8 +87,15 @@ def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array
     SimulationError, numpy.linalg.LinAlgError
         If the equations are singular.
     """
-    changes = changed_residuals(collocation, z, assumptions=[(finer_mesh_row(collocation), 1.0)])
-    return estimate_changes(fit, changes.blocks)[: collocation.nq, 0]
+    return estimate_changes(fit, mesh_residual_changes(collocation, z))[: collocation.nq, 0]
+
+
+@known_at_last
+def mesh_residual_changes(collocation: Collocation, z: Array) -> Sequence[Array]:
+    """Return the changes (T, M, 3, 1) of the residuals of each block of a fit at z by a finer mesh,
+    see `mesh_change`.
+    """
+    return changed_residuals(collocation, z, [(finer_mesh_row(collocation), 1.0)]).blocks
 
 
 def finer_mesh_row(collocation: Collocation) -> Deviation:

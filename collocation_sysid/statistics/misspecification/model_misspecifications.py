@@ -28,7 +28,7 @@ from ...methods.solution import Solution
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ..budget.consider_analysis import changed_residuals
-from ..budget.mesh_error import LARGEST_NODE_COUNT, finer_mesh_row
+from ..budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
 from ..budget.shape_error import GRAVITY_M_S2, other_section, sag_m
 from ..budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect, shape_effect
 from ..linearised import LinearisedFit, linearise_fit
@@ -247,11 +247,10 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
     if max((len(body.nodes.points_m) for body in bodies), default=0) > LARGEST_NODE_COUNT:
         return
     try:
-        row = finer_mesh_row(collocation)
-        columns = changed_residuals(collocation, solution.z, [(row, 1.0)])
+        blocks = mesh_residual_changes(collocation, solution.z)
     except (InputError, SimulationError, np.linalg.LinAlgError):
         return
-    gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
+    gram = projected_gram(linearise_fit(collocation, solution.z), blocks)
     least, most = MESH_AMPLITUDES
     amplitude = min(most, float(linear_step(gram, [1])[1][0]))
     if amplitude < least:
