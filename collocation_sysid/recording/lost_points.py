@@ -27,6 +27,13 @@ FEWEST_BESIDE = 2
 FEWEST_TRACKS = 3
 # Distance from the track before all jumps over the largest jump, up to which the point is found again.
 FOUND_AGAIN = 0.5
+# Numbers of intervals that one may be if images are missing, and how far the ratio of the motions may
+# be from them; from the ratios of the others, which are 1 (median); part of the motion that may
+# differ from the mean of those before and after.
+MISSING = (2, 3)
+NEAR_MISSING = 0.2
+STEADY = 0.2
+UNLIKE = 0.25
 
 
 @dataclass(frozen=True)
@@ -114,3 +121,33 @@ def followed_samples(tracks: Array, sigma: float) -> NDArray[np.bool_]:
         if repeated.sum() <= REPEATED * len(repeated):
             followed[1:][repeated] = False
     return followed
+
+
+def missing_images(tracks: Array, t_s: Array, sigma: float) -> Iterator[tuple[int, int]]:
+    """Yield the samples before which images are missing, and how many: tracks (S, M, d) at the times
+    t_s (S,) move about twice or three times as far there as the mean of the steps before and after.
+    """
+    if len(t_s) < FEWEST_HELD:
+        return
+    speeds = np.diff(tracks, axis=0) / np.diff(t_s)[:, None, None]
+    still = STILL_SIGMAS * sigma / float(np.median(np.diff(t_s)))
+    ratios = np.full(len(speeds), np.nan)
+    alike = np.zeros(len(speeds), dtype=bool)
+    for k in range(1, len(speeds) - 1):
+        usual = (speeds[k - 1] + speeds[k + 1]) / 2
+        known = np.isfinite(usual + speeds[k]).all(axis=1)
+        if known.sum() < FEWEST_TRACKS:
+            continue
+        own, usual = speeds[k][known], usual[known]
+        change = np.sqrt(np.mean(np.sum((speeds[k + 1] - speeds[k - 1])[known] ** 2, axis=1)))
+        size = np.sqrt(np.mean(np.sum(usual**2, axis=1)))
+        if size > still:
+            ratios[k] = np.sum(own * usual) / np.sum(usual**2)
+            rest = np.sqrt(np.mean(np.sum((own - ratios[k] * usual) ** 2, axis=1)))
+            alike[k] = rest < UNLIKE * size * abs(ratios[k]) and change < size
+    known = np.isfinite(ratios)
+    if known.sum() < FEWEST_HELD or np.median(np.abs(ratios[known] - 1)) > STEADY:
+        return
+    for times in MISSING:
+        for k in np.flatnonzero(alike & (np.abs(ratios - times) < NEAR_MISSING)).tolist():
+            yield k + 1, times - 1

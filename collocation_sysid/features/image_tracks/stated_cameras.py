@@ -19,6 +19,7 @@ from ...common.array_types import Array, Index
 from ...recording.camera import Camera
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
+from ...recording.lost_points import missing_images
 from ...recording.measurement import Measurement
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from ...statistics.misspecification.misspecification_hypothesis import (
@@ -94,6 +95,9 @@ MESSAGES = {
     "pixels off, median), but {nearer:.2g} times nearer if {mistake}",
     "description/image-tracks/hidden": "{hidden} of {count} points with places_m are on sides of the "
     "body that the camera does not see{remedy}",
+    "description/image-tracks/missing": "images are missing ({count}, the first before {t_s:.4g} s): "
+    "there all points move two or three times as far as before and after; state the time of each "
+    "image in t_s, as the video has them, not a frame rate",
     "description/image-tracks/motion": "near the grasp the points do not move as the grasp does "
     "(deviation {unlike:.2g} of its motion), but {nearer:.2g} times more alike if {mistake}",
 }
@@ -110,6 +114,19 @@ def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     for tracks in experiment.readings:
         if isinstance(tracks, ImageTracks) and tracks.pixels is not None:
             yield from _camera_hypotheses(experiment, tracks)
+            yield from _missing_images(experiment, tracks)
+
+
+def _missing_images(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that images are missing, whose times were not left out."""
+    pixels = np.where(tracks.is_followed[..., None], np.asarray(tracks.pixels), np.nan)
+    t_s = tracks.sample_times_s
+    missing = dict(missing_images(pixels, t_s, tracks.sigma_px))
+    if missing:
+        first = min(missing)
+        data = {"count": sum(missing.values()), "t_s": float(t_s[first])}
+        of = f"'{tracks.name}' of '{experiment.name}'"
+        yield Hypothesis("image-tracks/missing", of, data=data, strength=1.0 + missing[first])
 
 
 def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
