@@ -94,8 +94,8 @@ def test_images_that_repeat_the_one_before_are_lost() -> None:
 
 
 def test_tracks_in_whole_pixels_are_followed_throughout() -> None:
-    assert followed_samples(np.round(swaying()), SIGMA_PX).all()
-    slow = np.round(tracks_of(np.linspace(0.0, 3.0, 60)))
+    assert followed_samples(swaying().round(), SIGMA_PX).all()
+    slow = tracks_of(np.linspace(0.0, 3.0, 60)).round()
     assert followed_samples(slow, SIGMA_PX).all()
 
 
