@@ -52,6 +52,8 @@ LATERAL_SIGMA = 5e-3
 RELAXED_STRAIN = 1e-4
 # Negative loss modulus over the storage modulus that may be noise about zero.
 LOSS_NOISE = 0.1
+# Tests that a table of a modulus may be of: of E and of G.
+MODULUS_TESTS = ("uniaxial", "simple-shear")
 STRESS_NAME = "stress"
 SECOND_STRESS_NAME = "second stress"
 LATERAL_NAME = "lateral stretch"
@@ -582,7 +584,7 @@ class LateralStretch:
 
 
 def _require_small_strain_test(test: str) -> None:
-    if test not in ("uniaxial", "simple-shear"):
+    if test not in MODULUS_TESTS:
         fault = f'found "{test}"; expected "uniaxial" for E or "simple-shear" for G'
         raise InputError(fault, None, where="test")
 

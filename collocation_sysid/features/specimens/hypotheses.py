@@ -39,6 +39,8 @@ from ...recording.homogeneous_deformation import DEFORMATIONS, HomogeneousDeform
 from ...recording.markers import Markers
 from ...recording.specimen import (
     LATERAL_NAME,
+    MODULUS_TESTS,
+    RELAXED_STRAIN,
     SECOND_STRESS_NAME,
     STRESS_NAME,
     STRESS_UNIT,
@@ -409,7 +411,9 @@ def _other_kinds(experiment: Experiment) -> Iterator[Deviation]:
     assert experiment.specimen is not None
     strain, _ = specimen_strains(experiment)
     kinds = CONFUSED_TESTS.get(experiment.specimen.test, ())
-    if experiment.specimen.test == "uniaxial" and (strain <= 0).all():
+    if np.abs(strain).max() <= RELAXED_STRAIN:
+        kinds = tuple(test for test in MODULUS_TESTS if test != experiment.specimen.test)
+    elif experiment.specimen.test == "uniaxial" and (strain <= 0).all():
         kinds = (*kinds, "confined")
     for test in kinds:
         yield _mistake("specimen-kind", partial(_of_another_kind, test=test))
