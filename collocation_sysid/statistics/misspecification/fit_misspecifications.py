@@ -193,6 +193,7 @@ def _refit_hypotheses(
     """
     first = first_samples(experiment, MOST_SAMPLES)
     alone = _Refitter(solution, first, sweeps=budget)
+    alone.near_answer.add(first)
     stated = alone.fit(first)
     if stated is None:
         return []
