@@ -23,12 +23,17 @@ from ..recording.markers import Markers
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement
 from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.specimen import STRESS_NAME, moduli_per_stress
+from ..recording.specimen_files import specimen_strains
 from ..statistics.instrument_misfit import InstrumentMisfit, misfit
 from .measurement_results import PredictionErrors, PredictionResiduals
 
 # Share of the samples below which a note says what is missing, and most names in it.
 LEAST_SHARE = 0.5
 MOST_SHOWN = 3
+
+# Factor of values that are shown as they are.
+ONE = np.ones((1, 1))
 
 Predictions = Sequence[Predicted | None]
 
@@ -112,10 +117,12 @@ def prediction_error(experiment: Experiment, predicted: Predictions) -> Predicti
         distances_m = markers.distances_m(values - markers.measured_values)
     wrenches = [values for _, values in _predicted_numbers(experiment, predicted, Wrench)]
     force_n, torque_nm = wrench_rms(experiment, wrenches) if wrenches else (None, None)
-    readings = {
-        gauge.name: float(np.sqrt(np.nanmean((values - gauge.measured_values) ** 2)))
-        for gauge, values in _predicted_numbers(experiment, predicted, CustomSensor)
-    }
+    readings = {}
+    for gauge, values in _predicted_numbers(experiment, predicted, CustomSensor):
+        for name, factor in _shown_as(experiment, gauge).items():
+            squares = (factor * (values - gauge.measured_values)) ** 2
+            if factor is ONE or np.isfinite(squares).any():
+                readings[name] = float(np.sqrt(np.nanmean(squares)))
     depth = {name: surface.error for name, surface in surfaces(experiment, predicted).items()}
     return PredictionErrors(
         rms_m=root_mean(distances_m**2) if distances_m.size else None,
@@ -242,9 +249,31 @@ def copied_times_s(experiment: Experiment, other: Experiment) -> Iterator[tuple[
 # Results of a fit ---------------------------------------------------------------------------------
 
 
+def _shown_as(experiment: Experiment, gauge: CustomSensor) -> dict[str, Array]:
+    """Return the factors, (1, 1) or (S, 1), of a sensor's values to what a table states: moduli in
+    place of the stresses that stand for them. By name; NaN where a sample has no such value.
+    """
+    if experiment.specimen is not None and gauge.name == STRESS_NAME:
+        moduli = moduli_per_stress(specimen_strains(experiment)[0])
+        if moduli and len(gauge.sample_times_s) == len(experiment.t_s):
+            return {name: factor[:, None] for name, factor in moduli.items()}
+    return {gauge.name: ONE}
+
+
 def units_by_name(experiment: Experiment) -> dict[str, str] | None:
     """Return the units of the custom sensors that state one, by name; None if none does."""
-    return {gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit} or None
+    gauges = [gauge for gauge in experiment.readings if gauge.unit]
+    return {name: each.unit for each in gauges for name in _shown_as(experiment, each)} or None
+
+
+def _shown_sigmas(experiment: Experiment) -> dict[str, float] | None:
+    sigmas = {}
+    for gauge in experiment.readings:
+        for name, factor in _shown_as(experiment, gauge).items():
+            squares = (factor * gauge.sample_sigmas) ** 2
+            of_moduli = float(np.sqrt(np.nanmean(squares)))
+            sigmas[name] = gauge.sigma if factor is ONE else of_moduli
+    return sigmas or None
 
 
 def stated_sigmas(experiment: Experiment) -> dict[str, Any]:
@@ -262,7 +291,7 @@ def stated_sigmas(experiment: Experiment) -> dict[str, Any]:
     return {
         "wrench_sigma_n": of_force,
         "wrench_sigma_nm": of_torque,
-        "reading_sigma": {gauge.name: gauge.sigma for gauge in experiment.readings} or None,
+        "reading_sigma": _shown_sigmas(experiment),
         "reading_unit": units_by_name(experiment),
     }
 

@@ -583,6 +583,37 @@ class LateralStretch:
         return at.position_m[self.axis, 0] / CELL_SIZE_M
 
 
+def is_harmonic(strain: Array) -> bool:
+    """Return whether strains (T,) are those of a harmonic test, see `Specimen.harmonic`."""
+    rest, amplitudes = strain[::2], strain[1::2]
+    is_small = len(strain) > 1 and amplitudes.max() <= 1.001 * RELAXED_STRAIN
+    return bool(is_small and len(strain) % 2 and amplitudes.min() > 0 and not rest.any())
+
+
+def is_relaxation(strain: Array) -> bool:
+    """Return whether strains (T,) are those of a table of a modulus, see `Specimen.relaxation`."""
+    is_held = np.isclose(strain[1:], RELAXED_STRAIN, rtol=1e-3, atol=0.0).all()
+    return bool(len(strain) > 2 and not strain[0] and is_held)
+
+
+def moduli_per_stress(strain: Array) -> dict[str, Array]:
+    """Return the factors (T,) of stresses to the moduli that they stand for, by name of the modulus;
+    NaN for samples that have none. Empty unless the strains (T,) are those of a table of moduli.
+    """
+    with np.errstate(divide="ignore"):
+        compliance = 1.0 / strain
+    missing = np.full_like(strain, np.nan)
+    if is_harmonic(strain):
+        storage, loss = missing, missing.copy()
+        storage[1::2] = compliance[1::2]
+        loss[2::2] = -compliance[1::2]
+        return {"storage modulus": storage, "loss modulus": loss}
+    if is_relaxation(strain):
+        missing[2:] = compliance[2:]
+        return {"relaxation modulus": missing}
+    return {}
+
+
 def _require_small_strain_test(test: str) -> None:
     if test not in MODULUS_TESTS:
         fault = f'found "{test}"; expected "uniaxial" for E or "simple-shear" for G'

@@ -22,7 +22,7 @@ PICTURE_CAPTIONS = {
     "tracks": "Measured, fitted and simulated markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and simulated.",
     "reading": "Custom sensor: measured, fitted and simulated.",
-    "modulus": "Storage and loss modulus over frequency: measured, fitted and simulated.",
+    "modulus": "Modulus over frequency or time: measured, fitted and simulated.",
     "error": "Distance of the markers from their measurements over time.",
     "spectrum": "Spectrum of the motion against the body's first natural frequencies.",
     "confidence": "95 % regions of pairs of parameters, for the combined uncertainty if it is known.",

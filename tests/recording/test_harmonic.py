@@ -9,8 +9,10 @@ import pytest
 from kit.problem_files import run_command, write_problem
 
 import collocation_sysid as cs
+from collocation_sysid.features.measurements import prediction_error
 from collocation_sysid.features.specimens.hypotheses import exchanged_moduli
-from collocation_sysid.result.pictures.stress_strain import harmonic_picture, is_harmonic
+from collocation_sysid.recording.specimen import is_harmonic
+from collocation_sysid.result.pictures.stress_strain import harmonic_picture
 
 YOUNG_PA, SHARES, TAU_S = 2e5, np.array([0.5, 2.0]), np.array([10.0, 0.1])
 MEMORY = {"a.share": 0.5, "a.tau_s": 10.0, "b.share": 2.0, "b.tau_s": 0.1}
@@ -329,6 +331,21 @@ def test_a_table_and_a_swing_of_one_body_are_one_problem(tmp_path):
         assert lower < MIXED_TRUTH[name] < upper
         assert found[name]["value"] == pytest.approx(MIXED_TRUTH[name], rel=relative)
     assert found["lambda_pa"]["value"] == pytest.approx(MIXED_TRUTH["lambda_pa"], rel=0.2)
+
+
+def test_differences_of_a_harmonic_test_are_those_of_its_moduli():
+    storage, loss = complex_modulus_pa(FREQUENCY_HZ)
+    specimen = cs.Specimen.harmonic(FREQUENCY_HZ, storage, loss, 0.01)
+    experiment = specimen.experiment(prony=("a", "b"))
+    measured = experiment.readings[0].measured_values
+    predicted = measured.copy()
+    predicted[1::2] *= 1.1
+    predicted[2::2] *= 0.8
+    found = prediction_error(experiment, [predicted]).reading_rms
+    assert found is not None
+    assert found["storage modulus"] == pytest.approx(0.1 * np.sqrt(np.mean(storage**2)))
+    assert found["loss modulus"] == pytest.approx(0.2 * np.sqrt(np.mean(loss**2)))
+    assert len(found) == 2
 
 
 def test_the_picture_of_a_harmonic_test_has_its_moduli_over_frequency():

@@ -7,7 +7,10 @@ import pytest
 from kit.problem_files import run_command
 
 import collocation_sysid as cs
+from collocation_sysid.features.measurements import prediction_error, stated_sigmas
 from collocation_sysid.features.specimens.hypotheses import find_specimen_misspecifications
+from collocation_sysid.recording.specimen_files import specimen_strains
+from collocation_sysid.result.pictures.stress_strain import relaxation_picture
 
 T_S = np.geomspace(0.01, 30.0, 25)
 LONG_TERM, SHARE, TAU_S = 2e5, 0.5, 1.5
@@ -48,6 +51,22 @@ def test_a_relaxation_modulus_determines_the_constants_of_the_memory(test, modul
 def test_other_times_and_tests_are_refused(t_s, test, found):
     with pytest.raises(cs.InputError, match=found):
         cs.Specimen.relaxation(t_s, [2.0, 1.0], 0.1, test)
+
+
+def test_differences_and_picture_are_those_of_the_modulus():
+    experiment = cs.Specimen.relaxation(T_S, MODULUS_PA, 20.0).experiment("linear")
+    measured = experiment.readings[0].measured_values
+    found = prediction_error(experiment, [1.1 * measured]).reading_rms
+    expected_pa = 0.1 * np.sqrt(np.mean(MODULUS_PA**2))
+    assert found == {"relaxation modulus": pytest.approx(expected_pa)}
+    stated = stated_sigmas(experiment)
+    assert stated["reading_sigma"] == {"relaxation modulus": pytest.approx(20.0)}
+    assert stated["reading_unit"] == {"relaxation modulus": "Pa"}
+    strain, _ = specimen_strains(experiment)
+    samples = np.column_stack([experiment.t_s, measured, measured, measured])
+    (axes,) = relaxation_picture(strain, experiment.t_s, samples).axes
+    assert axes.get_ylabel() == "relaxation modulus [kPa]"
+    np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), np.c_[T_S, MODULUS_PA / 1e3])
 
 
 def relaxation_file(folder, test, columns, lines=("sigma_pa = 20",)):

@@ -14,6 +14,7 @@ from ...common.files import replaced_file, safe_name
 from ...common.signal_handling import INTERRUPTS
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...recording.measured_wrench import COMPONENTS, UNITS
+from ...recording.specimen import is_harmonic, is_relaxation
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI, own_settings
 from ..replay import MotionRecord, damaged_run_refused, read_run
@@ -31,7 +32,7 @@ from .over_time import marker_errors, marker_tracks, sensor_picture
 from .search_pictures import convergence, scan_picture
 from .shapes import obstacle_pictures, shapes_picture
 from .spectrum import spectrum_picture
-from .stress_strain import force_picture, harmonic_picture, is_harmonic, strain_picture
+from .stress_strain import force_picture, harmonic_picture, relaxation_picture, strain_picture
 
 
 @own_settings()
@@ -107,8 +108,8 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
 
     A name is the kind of picture before the name of the experiment, such as "tracks_swing", and of
     a custom sensor or camera also that one's name; names may repeat. A specimen has only
-    pictures of its measurements over strain, named "<measurement>_<experiment>", and a harmonic one
-    that of its moduli, named "modulus_<experiment>". Infinite positions are drawn as NaN: as gaps.
+    pictures of its measurements over strain, named "<measurement>_<experiment>", and one of a table
+    of moduli that of its moduli, named "modulus_<experiment>". Infinite positions are drawn as NaN: as gaps.
     """
     t_s = replay.t_s
     measured = replay.measured_m
@@ -120,6 +121,9 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
             unit = replay.reading_units.get(name, "")
             if is_harmonic(replay.strain) and len(values) == len(replay.strain):
                 yield f"modulus_{replay.name}", harmonic_picture(replay.strain, t_s, values)
+                continue
+            if is_relaxation(replay.strain) and len(values) == len(replay.strain):
+                yield f"modulus_{replay.name}", relaxation_picture(replay.strain, t_s, values)
                 continue
             picture = strain_picture(
                 replay.strain, replay.t_s, samples=values, name=name, unit=unit

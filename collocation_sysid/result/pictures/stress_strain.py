@@ -1,4 +1,4 @@
-"""Pictures of specimens and test benches: stress over strain, complex modulus over frequency, and
+"""Pictures of specimens and test benches: stress over strain, modulus over frequency or time, and
 force over displacement, measured, fitted and simulated.
 """
 
@@ -10,7 +10,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
-from ...recording.specimen import RELAXED_STRAIN
 from ..figure_style import BLACK, COLUMN_MM, add_legend_above, framed_figure, style_axes
 from .over_time import drawn_models
 
@@ -49,13 +48,6 @@ def strain_picture(strain: Array, t_s: Array, samples: Array, name: str, unit: s
     return _curve(at, factor * samples[:, 1:], xlabel="strain", ylabel=label)
 
 
-def is_harmonic(strain: Array) -> bool:
-    """Return whether strains (T,) are those of a harmonic test, see `Specimen.harmonic`."""
-    rest, amplitudes = strain[::2], strain[1::2]
-    is_small = len(strain) > 1 and amplitudes.max() <= 1.001 * RELAXED_STRAIN
-    return bool(is_small and len(strain) % 2 and amplitudes.min() > 0 and not rest.any())
-
-
 def harmonic_picture(strain: Array, t_s: Array, samples: Array) -> Figure:
     """Return a figure of storage and loss modulus over frequency; arguments as of `strain_picture`."""
     moduli_pa = samples[1:, 1:].reshape(-1, 2, 3) / strain[1::2, None, None] * [[[1], [-1]]]
@@ -76,6 +68,16 @@ def harmonic_picture(strain: Array, t_s: Array, samples: Array) -> Figure:
     axes.set_xscale("log")
     axes.set_yscale("log")
     add_legend_above(axes, columns=2)
+    return figure
+
+
+def relaxation_picture(strain: Array, t_s: Array, samples: Array) -> Figure:
+    """Return a figure of the relaxation modulus over time; arguments as of `strain_picture`."""
+    moduli_pa = samples[2:, 1:] / strain[2:, None]
+    unit, factor = _readable_unit(moduli_pa, "Pa")
+    label = f"relaxation modulus [{unit}]"
+    figure = _curve(t_s[2:], factor * moduli_pa, xlabel="time [s]", ylabel=label)
+    figure.axes[0].set_xscale("log")
     return figure
 
 
