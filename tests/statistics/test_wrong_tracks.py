@@ -179,6 +179,16 @@ def test_a_video_of_half_the_stated_rate_is_named_in_the_template() -> None:
     assert "their rate is 0.5 times the stated one" in found.message
 
 
+def test_an_image_that_is_missing_is_named_in_the_template() -> None:
+    experiment = video_template()
+    (tracks,) = (each for each in experiment.readings if isinstance(each, cs.ImageTracks))
+    left = np.delete(pixels_of(tracks), 39, axis=0).reshape(-1, 2 * len(tracks.names))
+    shorter = tracks.with_samples(tracks.t_s[:-1], left)
+    (found,) = hypotheses(replace(experiment, readings=[shorter]))
+    assert found.cause == "image-tracks"
+    assert f"the first before {tracks.t_s[39]:.4g} s" in found.message
+
+
 def test_a_wrong_rate_is_named_where_four_points_far_from_the_grasp_determine_the_pose() -> None:
     experiment = video_template()
     (tracks,) = (each for each in experiment.readings if isinstance(each, cs.ImageTracks))

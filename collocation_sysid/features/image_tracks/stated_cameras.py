@@ -27,6 +27,7 @@ from ...statistics.misspecification.misspecification_hypothesis import (
     corrected_hypothesis,
 )
 from ...statistics.misspecification.sensor_misspecifications import measurement_mistake
+from ...statistics.thresholds import CERTAIN
 from .rays import facing, points_on_surface
 from .tracked_places import poses_of_tracks
 from .tracks import ImageTracks, stated_places
@@ -114,11 +115,13 @@ def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     for tracks in experiment.readings:
         if isinstance(tracks, ImageTracks) and tracks.pixels is not None:
             yield from _camera_hypotheses(experiment, tracks)
-            yield from _missing_images(experiment, tracks)
+            yield from missing_image_hypotheses(experiment, tracks)
 
 
-def _missing_images(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that images are missing, whose times were not left out."""
+def missing_image_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that images are missing, whose times were not left out; the pixels alone
+    show it for certain.
+    """
     pixels = np.where(tracks.is_followed[..., None], np.asarray(tracks.pixels), np.nan)
     t_s = tracks.sample_times_s
     missing = dict(missing_images(pixels, t_s, tracks.sigma_px))
@@ -126,7 +129,7 @@ def _missing_images(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hyp
         first = min(missing)
         data = {"count": sum(missing.values()), "t_s": float(t_s[first])}
         of = f"'{tracks.name}' of '{experiment.name}'"
-        yield Hypothesis("image-tracks/missing", of, data=data, strength=1.0 + missing[first])
+        yield Hypothesis("image-tracks/missing", of, data=data, strength=2 * CERTAIN)
 
 
 def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:

@@ -47,14 +47,21 @@ MESSAGES = stated_cameras.MESSAGES | {
 
 
 def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
-    """Yield exchanged, stuck, jumping and lost tracks."""
+    """Yield exchanged, stuck, jumping and lost tracks; of a camera with missing images these alone,
+    because they deform the fit.
+    """
     for part in solution.parts:
-        name = part.transcription.experiment.name
+        experiment = part.transcription.experiment
+        name = experiment.name
         pairs = zip(part.transcription.residuals, part.observables, strict=True)
         for reading, values in pairs:
             if isinstance(reading, ImageTrackResidual):
                 predicted = reading.predict(values, part.phi)[..., :2]
                 of = f"'{reading.sensor.name}' of '{name}'"
+                missing = [*stated_cameras.missing_image_hypotheses(experiment, reading.sensor)]
+                if missing:
+                    yield from missing
+                    continue
                 yield from places_off_body(reading, part.phi, of)
                 yield from track_hypotheses(reading, predicted, of)
 
