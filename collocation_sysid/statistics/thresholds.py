@@ -214,15 +214,21 @@ INDISTINGUISHABLE = Threshold(
     "Difference of losses (χ²) below which two corrections explain the data equally well.",
     study="mistakes",
 )
+FURTHER = Threshold(
+    2.0,
+    "Factor by which a correction must decrease the misfit more than one that is known to first "
+    "order, such as a finer mesh, to be mentioned beside it if neither suffices.",
+    study="mistakes",
+)
 PARTIAL = Threshold(
     0.7,
     "Strength over the largest one from which on a correction that does not suffice is mentioned.",
     study="mistakes",
 )
 FAR = Threshold(
-    10.0,
+    6.0,
     "Error of gravity or of the pose in the grasp, in standard deviations, from which on a "
-    "linear step from the answer does not tell which law is right (31 in a twin of another "
+    "linear step from the answer does not tell which law is right (8 and 31 in twins of another "
     "law).",
     study="mistakes",
 )

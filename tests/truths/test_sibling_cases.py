@@ -2,18 +2,21 @@
 
 The reports themselves are in `test_public_cases`. Siblings of files in the working folder are in
 `messages/test_foreign_files`, those of tables that are not called in `messages/test_uncalled`, those
-of damaged depth images in `messages/test_hostile_input`, those of a law that is taken for a turn in
-`statistics/test_body_causes`, and those of a falling body in `scripts/studies/study_falling.py`.
+of damaged depth images in `messages/test_hostile_input`, and those of plane strain in
+`program/test_plane_strain`.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from kit.problems import hung_cube, measured
+from study_falling import DURATION_S, FREE, TRUTH, TWIN_HZ, falling_block, noise_of
+from study_hidden_errors import unplaced
 
 import collocation_sysid as cs
 
@@ -321,3 +324,56 @@ def test_tracks_with_a_missing_coordinate_are_used(lost):
     tracks_m[..., lost] = np.nan
     seen = cs.with_markers(cube, tracks_m)
     assert seen.markers.is_measured.sum() == 2 * cube.markers.is_present.sum()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("side_m", "drop_m", "young_pa", "poisson", "rate_hz", "guess_pa", "seed"),
+    [(0.06, 0.1, 5e4, 0.4, 240, None, 20), (0.15, 0.25, 6e5, 0.25, 120, 2e5, 21)],
+)
+def test_other_blocks_fall_without_a_good_guess(
+    side_m, drop_m, young_pa, poisson, rate_hz, guess_pa, seed
+):
+    truth = TRUTH | {"young_pa": young_pa, "poisson": poisson}
+    t_s = np.arange(round(DURATION_S * rate_hz)) / rate_hz
+    size = {"side_m": side_m, "drop_m": drop_m}
+    real = falling_block(3, t_s, **size)
+    exact_m = cs.simulate(real, truth, "bdf2", substeps=TWIN_HZ // rate_hz).markers_m
+    seen_m = exact_m + noise_of(seed, exact_m.shape)
+    fall = cs.with_markers(falling_block(2, t_s, **size), seen_m)
+    unknown = {name: cs.Unknown() for name in FREE} | {"young_pa": cs.Unknown(guess_pa)}
+    run = cs.run(cs.Problem([fall], truth | unknown, scheme="bdf2"))
+    assert run.solution.status.converged
+    assert_within(run, "young_pa", young_pa)
+    assert abs(np.log10(run.parameters["young_pa"] / young_pa)) < 0.05
+    low, high = run.interval("young_pa")
+    assert high < 1.5 * low
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("young_pa", "are_placed", "seed"), [(8e3, True, 3), (8e3, False, 1), (5e3, False, 2)]
+)
+def test_the_law_of_mujoco_is_named_and_no_turn(young_pa, are_placed, seed):
+    """Cylinders with the material and the damping law of MuJoCo, solved with the default laws."""
+    pytest.importorskip("mujoco")
+    from kit import swung_cylinders
+
+    mesh = swung_cylinders.cylinder(rings=1, layers=4)
+    truth = swung_cylinders.TRUTH | {"young_pa": young_pa}
+    real = swung_cylinders.recording(mesh, swung_cylinders.simulate_flex(mesh, truth), seed)
+    density = real.body.parts[0].density_kg_m3
+    stated = replace(
+        real,
+        body=cs.Body(mesh, density_kg_m3=density, rest_shape="stress_free"),
+        markers=real.markers if are_placed else unplaced(real.markers),
+        nuisance=cs.Nuisance(),
+    )
+    unknown = {"young_pa": cs.Unknown(), "poisson": cs.Unknown(lower=0.05, upper=0.45)}
+    unknown |= {"gamma_r_s": cs.Unknown()}
+    run = cs.run(cs.Problem([stated], unknown | {"gamma_m_1_s": 0.0}))
+    assert run.trust.verdict == "doubtful"
+    first = run.trust.reasons[0]
+    assert "such as st-venant-kirchhoff" in first
+    assert "widen its prior" not in first
+    assert run.parameters["young_pa"] == pytest.approx(young_pa, rel=0.15)

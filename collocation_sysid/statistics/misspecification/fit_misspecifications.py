@@ -40,6 +40,7 @@ from ..thresholds import (
     CERTAIN,
     ESTIMATED_LAGS,
     FAR,
+    FURTHER,
     INDISTINGUISHABLE,
     LINEAR,
     MIRRORED,
@@ -269,7 +270,8 @@ def _named_alone_or_together(
 
     A linear correction, such as a finer mesh, is of an error that is known, beside which other
     corrections say little: it is named alone if it explains the residuals as far as a linear
-    correction can (`LINEAR`) or nothing else brings them to the noise, else before the others.
+    correction can (`LINEAR`), or if nothing else brings them to the noise or decreases them far more
+    (`FURTHER`), else before the others.
     """
     linear = [each for each in tested if isinstance(each.corrected, LinearCorrection)]
     if any(each.strength >= LINEAR for each in linear):
@@ -280,7 +282,9 @@ def _named_alone_or_together(
         if each not in linear and each.remaining is not None and each.remaining <= 1.0
     ]
     if not sufficient:
-        partial = sorted(linear or tested, key=lambda each: -each.strength)
+        least = max((FURTHER * each.strength for each in linear), default=0.0)
+        partial = [each for each in tested if each in linear or each.strength > least]
+        partial.sort(key=lambda each: -each.strength)
         partial = [each for each in partial if each.strength > PARTIAL * partial[0].strength]
         return _together("insufficient", partial)
     losses = [loss_of(each.corrected) for each in sufficient]
