@@ -372,15 +372,14 @@ TOPICS: dict[str, Topic] = {
             "noise: branches of the memory ({branches}) may be too few, or their times too far from "
             "those of the table. First add an [[object.prony]] about every decade of time or "
             "frequency; then check which column is which modulus, the units and the noise",
-            "outlier": "sample {number} deviates by {deviations:.2g} sigma and contributes "
+            "outlier": "{sample} deviates by {deviations:.2g} sigma and contributes "
             "{percent:.0f} % of the sum of squared residuals: correct or remove this row, or set "
             "solver.huber",
-            "stress": "the residuals of {marker} are {factor:.2g} times sigma_pa: check sigma_pa, "
-            "the unit of the column and the kind of test, and compare laws with compare-models "
-            "--materials",
-            "stresses": "the residuals of {count} tests or stresses are larger than sigma_pa, most "
-            "of all those of {marker} ({factor:.2g} times): check sigma_pa, the units of the "
-            "columns and the kinds of test, and compare laws with compare-models --materials",
+            "stress": "the residuals of {marker} are {factor:.2g} times {stated}: check {stated}, "
+            "the unit of the column and the kind of test, and {remedy}",
+            "stresses": "the residuals of {count} tests or stresses are larger than {stated}, most "
+            "of all those of {marker} ({factor:.2g} times): check {stated}, the units of the "
+            "columns and the kinds of test, and {remedy}",
             "persist": "the residuals are not independent noise: consecutive samples are "
             "correlated (autocorrelation {autocorrelation:.2f}). The law or the description of the "
             "test lacks an effect: look at measured and fitted stresses over the strain",

@@ -93,7 +93,9 @@ def test_everything_else_is_in_the_details():
 def test_of_many_reasons_the_gravest_are_shown_and_the_others_counted():
     concerns = [
         Concern(
-            "specimen/outlier", "doubtful", data={"number": k, "deviations": 9.0, "percent": 30.0}
+            "specimen/outlier",
+            "doubtful",
+            data={"sample": f"sample {k}", "deviations": 9.0, "percent": 30.0},
         )
         for k in range(7)
     ]

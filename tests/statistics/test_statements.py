@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -111,6 +112,43 @@ def test_an_outlier_in_a_table_without_times_has_a_row():
     assert "sample 3 deviates" in concern.message
     assert " s " not in concern.message
     assert isinstance(concern, Concern)
+
+
+def test_an_outlier_in_a_table_of_moduli_has_a_modulus_and_comes_first():
+    frequency_hz, modulus_pa = [0.1, 1.0, 10.0], [1e5, 1.1e5, 1.2e5]
+    dma = cs.Specimen.harmonic(frequency_hz, modulus_pa, [1e3, 2e3, 1e3], 0.01)
+    relaxed = cs.Specimen.relaxation([0.5, 2.0, 8.0], modulus_pa[::-1], 1e3)
+    tests = [
+        dma.experiment(name="dma", prony=("slow",)),
+        relaxed.experiment(name="hold", prony=("slow",)),
+    ]
+    large = Concern("noise/larger", "doubtful", {"factor": 9.0, "stated": "sigma"})
+    # Harmonic samples begin with the shortest period and alternate between E' and E".
+    for series, sample, named in (
+        ("dma/stress", 4, "dma: the loss modulus at 1 Hz"),
+        ("dma/stress", 5, "dma: the storage modulus at 0.1 Hz"),
+        ("hold/stress", 3, "hold: the relaxation modulus at 2 s"),
+    ):
+        outlier = Outlier(series, sample, 2.0, 0.9, 12.0, is_relaxed_start=False).to_concern()
+        first, second = as_specimen_concerns([large, outlier], tests)
+        assert first.message.startswith(f"{named} deviates by 12 sigma")
+        assert first.grade == "doubtful"
+        assert second.code == "specimen/branches"
+    half = replace(outlier, data={**outlier.data, "percent": 60.0})
+    assert as_specimen_concerns([large, half], tests)[0].code == "specimen/branches"
+
+
+@pytest.mark.parametrize(("tests", "key"), [("dma", "relative_sigma"), ("pull", "sigma_pa")])
+def test_too_large_noise_is_named_by_the_key_of_the_test(tests, key):
+    by_name = {
+        "dma": cs.Specimen.harmonic([0.1, 1.0], [1e5, 1.1e5], [1e3, 2e3], 0.01),
+        "pull": cs.Specimen("uniaxial", [0.1, 0.2], [1e3, 2e3], 10.0),
+    }
+    small = Concern("noise/smaller", data={"factor": 35.0, "stated": "sigma"})
+    (concern,) = as_specimen_concerns(
+        [small], [by_name[tests].experiment(name=tests, prony=("slow",))]
+    )
+    assert concern.message.startswith(f"{key} seems 35 times too large")
 
 
 def test_noisy_residuals_of_a_force_are_not_those_of_a_marker():

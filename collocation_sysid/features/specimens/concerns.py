@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from ...common.array_types import Array
 from ...recording.experiment import Experiment
-from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN
+from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic, moduli_per_stress
 from ...recording.specimen_files import specimen_strains
 from ...statistics.concerns import Concern
 
@@ -29,6 +31,8 @@ SPECIMEN_CODES: Mapping[str, str] = {
 COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "gent", "ogden-2")
 # Laws to compare for foams, whose volume changes.
 FOAM_LAWS = ("neo-hookean", "hyperfoam-1", "hyperfoam-2")
+# Percentage of the squared residuals from which on a sample is the cause, whatever the law.
+NEARLY_ALL = 75.0
 # Largest change of the logarithm of a volume, relative to that of the stretch, in rubber.
 LITTLE_DILATATION = 0.1
 
@@ -37,11 +41,11 @@ def as_specimen_concerns(
     concerns: Iterable[Concern], experiments: Sequence[Experiment]
 ) -> list[Concern]:
     """Return concerns about a fit, replaced by those of `SPECIMEN_CODES` if all experiments are
-    specimens, whose noise is stated by `sigma_pa`; else as they are.
+    specimens; else as they are.
 
     The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
-    too simple is the most frequent cause of the others; in its place "specimen/branches" about tables
-    of moduli, at whose small strain all laws are linear.
+    too simple is the most frequent cause of the others, unless one sample makes nearly all of them;
+    in its place "specimen/branches" about tables of moduli, at whose small strain all laws are linear.
 
     Parameters
     ----------
@@ -52,16 +56,61 @@ def as_specimen_concerns(
     """
     if not experiments or any(each.specimen is None for each in experiments):
         return list(concerns)
-    data = {"stated": "sigma_pa", **_law_data(experiments)}
+    strains = [specimen_strains(each)[0] for each in experiments]
+    keys = ["relative_sigma" if is_harmonic(strain) else "sigma_pa" for strain in strains]
+    data = {
+        "stated": " and ".join(dict.fromkeys(keys)),
+        "remedy": "compare laws with compare-models --materials",
+        **_law_data(experiments),
+    }
     codes = dict(SPECIMEN_CODES)
-    if all(np.abs(specimen_strains(each)[0]).max() < 2 * RELAXED_STRAIN for each in experiments):
+    if all(np.abs(strain).max() < 2 * RELAXED_STRAIN for strain in strains):
         codes["noise/larger"] = "specimen/branches"
         data["branches"] = max(len(p.prony) for each in experiments for p in each.body.parts)
+        data["remedy"] = "add branches of the memory, [[object.prony]]"
     replaced = [
-        replace(concern, code=codes.get(concern.code, concern.code), data={**concern.data, **data})
+        replace(
+            concern,
+            code=codes.get(concern.code, concern.code),
+            data={**concern.data, **data, **_named(concern.data, experiments)},
+        )
         for concern in concerns
     ]
-    return sorted(replaced, key=lambda each: each.code != codes["noise/larger"])
+    alone = [each for each in replaced if _makes_nearly_all(each)]
+    large = [each for each in replaced if each.code == codes["noise/larger"]]
+    others = [each for each in replaced if each not in alone and each not in large]
+    grave = any(each.grade == "doubtful" for each in large)
+    return [*(replace(e, grade="doubtful") if grave else e for e in alone), *large, *others]
+
+
+def _makes_nearly_all(concern: Concern) -> bool:
+    return concern.code == "specimen/outlier" and concern.data["percent"] > NEARLY_ALL
+
+
+def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:
+    """Return what a concern is about in the words of the test: for a table of moduli the table in
+    place of its stress, and modulus and time or frequency in place of the number of a sample.
+    """
+    names = {"sample": f"sample {data['number']}"} if "number" in data else {}
+    for key in ("of", "marker"):
+        name, _, sensor = str(data.get(key, "")).partition("/")
+        test = next((each for each in experiments if sensor and each.name == name), None)
+        moduli = {} if test is None else moduli_per_stress(specimen_strains(test)[0])
+        if test is None or not moduli:
+            continue
+        names[key] = name
+        if key == "of" and "number" in data:
+            (modulus,) = [m for m, each in moduli.items() if np.isfinite(each[data["number"] - 1])]
+            names["sample"] = f"the {modulus} at {_place(test.t_s, data['number'] - 1, moduli)}"
+    return names
+
+
+def _place(t_s: Array, sample: int, moduli: Mapping[str, Array]) -> str:
+    """Return the time or the frequency of a sample (index) of a table of moduli."""
+    if len(moduli) == 1:
+        return f"{t_s[sample]:.4g} s"
+    quarter_s = t_s[sample] - t_s[sample - 1]
+    return f"{0.25 / quarter_s:.4g} Hz"
 
 
 def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
