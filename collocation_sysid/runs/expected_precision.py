@@ -29,7 +29,7 @@ from ..recording.measured_wrench import Wrench
 from ..recording.measurement_selection import with_some_samples
 from ..recording.obstacle import Obstacle
 from ..recording.poses import PoseSequence
-from ..recording.specimen import Specimen, cell_of_other_test
+from ..recording.specimen import Specimen, cell_of_other_test, moduli_per_stress
 from ..recording.specimen_files import specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
 from ..statistics.budget.consider_analysis import (
@@ -303,9 +303,10 @@ def added_measurements(
     """Yield measurements that may be added to a problem, as phrases with all experiments.
 
     For specimens these are other tests of the same strains with the same relative noise and errors
-    of area and zero. A body with a mesh, of which no force is measured, gets a force sensor at its
-    grasp, with `noise` over the largest force, and a recorded motion a second recording after which
-    it is held as long again. A test that the law or the body does not allow is left out.
+    of area and zero; beside a table of moduli they say nothing more. A body with a mesh, of which no
+    force is measured, gets a force sensor at its grasp, with `noise` over the largest force, and a
+    recorded motion a second recording after which it is held as long again. A test that the law or
+    the body does not allow is left out.
     """
     experiments = [each.experiment for each in collocation.transcriptions]
     values = collocation.parameters.values(z[: collocation.nq])
@@ -324,7 +325,9 @@ def added_measurements(
                     f"another recording of '{experiment.name}', held as long again at its end",
                     [*experiments, longer],
                 )
-        elif len(experiment.body.parts) == 1:
+        elif len(experiment.body.parts) == 1 and not moduli_per_stress(
+            specimen_strains(experiment)[0]
+        ):
             for test, phrase in ADDED_TESTS.items():
                 if test not in tests:
                     tests.add(test)

@@ -13,6 +13,7 @@ from collocation_sysid.features.measurements import prediction_error
 from collocation_sysid.features.specimens.hypotheses import exchanged_moduli
 from collocation_sysid.recording.specimen import is_harmonic
 from collocation_sysid.result.pictures.stress_strain import harmonic_picture
+from collocation_sysid.runs.check.measurements import check_recording
 
 YOUNG_PA, SHARES, TAU_S = 2e5, np.array([0.5, 2.0]), np.array([10.0, 0.1])
 MEMORY = {"a.share": 0.5, "a.tau_s": 10.0, "b.share": 2.0, "b.tau_s": 0.1}
@@ -143,6 +144,15 @@ def test_too_few_branches_are_the_reason():
     parameters = unknown | {"poisson": 0.4999, "a.tau_s": cs.Unknown(3.0)}
     run = cs.run(cs.Problem([specimen.experiment("neo-hookean", "dma", prony=("a",))], parameters))
     assert [each.code for each in run.trust.concerns] == ["specimen/branches"]
+    # Beside moduli at small strain, tests to larger strains are no advice.
+    assert not any("up to the same strain" in note for note in run.notes)
+
+
+def test_a_check_counts_the_frequencies_of_each_modulus():
+    specimen = cs.Specimen.harmonic([0.1, 1.0, 10.0], [1e5, 1e5, 2e5], [1e3, 2e3, 3e3], 0.01)
+    recording = check_recording(specimen.experiment("neo-hookean", "dma", prony=("a",)), None)
+    assert recording.frames == 3
+    assert recording.instruments == ("storage modulus", "loss modulus")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...recording.experiment import Experiment
+from ...recording.specimen import moduli_per_stress
+from ...recording.specimen_files import specimen_strains
 from ...statistics.concerns import Concern, concern_if
 from .body_check import BodyCheck
 
@@ -97,17 +99,20 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
                 else None,
             )
         )
+    moduli = moduli_per_stress(specimen_strains(experiment)[0]) if experiment.specimen else {}
+    frames = [int(np.isfinite(each).sum()) for each in moduli.values()]
     return RecordingCheck(
         experiment.name,
         experiment.validation,
         static=experiment.is_static,
         duration_s=experiment.duration_s,
         rate_hz=1 / experiment.timestep_s,
-        frames=len(experiment.t_s),
+        frames=max(frames, default=len(experiment.t_s)),
         samples=markers.count_samples(),
         missing=int(missing.sum()),
         markers=tuple(findings),
-        instruments=tuple(
+        instruments=tuple(moduli)
+        or tuple(
             dict.fromkeys(filter(None, (each.instrument_text for each in experiment.measurements)))
         ),
         air_density_kg_m3=experiment.air_density_kg_m3,
