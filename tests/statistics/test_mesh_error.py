@@ -267,7 +267,8 @@ def test_a_motion_between_whose_samples_little_changes_has_the_error_of_a_part_o
     fit = linearise_fit(solution.collocation, solution.z)
     of_part = mesh_change(solution.collocation, solution.z, fit)
     monkeypatch.setattr(mesh_error, "ROW_DISTANCES", ())
-    of_all = mesh_change(solution.collocation, solution.z, fit)
+    # Another program: the changes of the last answer of a program are known.
+    of_all = mesh_change(replace(solution.collocation), solution.z, fit)
     assert abs(of_all[0]) > 0.05
     assert of_part[0] != of_all[0]
-    np.testing.assert_allclose(of_part, of_all, rtol=0.02)
+    np.testing.assert_allclose(of_part, of_all, rtol=0.005)

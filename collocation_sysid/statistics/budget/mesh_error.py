@@ -63,8 +63,10 @@ from .systematic_effects import Effect, ExperimentAtAnswer
 LARGEST_NODE_COUNT = 1500
 # Relative accuracy of e: that of an estimate of an error.
 ACCURACY = 1e-2
-# Largest distances of the rows of a motion at which e is solved for; it is linear between them.
-ROW_DISTANCES = (16, 8, 4, 2)
+# Largest distances of the rows of a motion at which e is solved for; between them the forces of e
+# are splines of third order, as the motion is to the accuracy of e.
+ROW_DISTANCES = (64, 32, 16, 8, 4, 2)
+ORDER = 3
 # Weight of the shape function of a node below which it is zero apart from rounding.
 NO_WEIGHT = 1e-9
 
@@ -197,18 +199,18 @@ def _equivalent_forces(
             own = -given_forces.linearise(given_xi[now], given_nu[now]).by_position
             equivalent_n[now] = at.dynamics.pattern.products(own, relative[:, given])
     if len(rows) < len(given_xi):
-        corrections_n = make_interp_spline(rows, corrections_n, k=1)(np.arange(len(given_xi)))
+        corrections_n = make_interp_spline(rows, corrections_n, k=ORDER)(np.arange(len(given_xi)))
     return equivalent_n + (unbalanced_n - corrections_n) @ interpolation
 
 
 def _sampled_rows(xi: Array, *, is_static: bool) -> Index:
-    """Return the evaluations between which the motion is linear to the accuracy of e."""
+    """Return the evaluations between which the motion is a spline to the accuracy of e."""
     every = np.arange(len(xi))
     largest_m = np.abs(xi - xi.mean(axis=0)).max()
     for distance in ROW_DISTANCES if not is_static else ():
         rows = np.append(every[:-1:distance], every[-1])
-        if len(rows) > 2:
-            between = make_interp_spline(rows, xi[rows], k=1)(every)
+        if len(rows) > 2 * ORDER:
+            between = make_interp_spline(rows, xi[rows], k=ORDER)(every)
             if np.abs(between - xi).max() < ACCURACY * largest_m:
                 return rows
     return every
