@@ -109,7 +109,7 @@ def test_an_outlier_in_a_table_without_times_has_a_row():
     test = cs.Specimen("uniaxial", [0.1, 0.2, 0.3], [1e3, 2e3, 3e3], 10.0)
     outlier = Outlier("pull/stress", 2, 2.0, 0.9, 12.0, is_relaxed_start=False)
     (concern,) = as_specimen_concerns([outlier.to_concern()], [test.experiment(name="pull")])
-    assert "sample 3 deviates" in concern.message
+    assert "sample 3 (strain 0.3) deviates" in concern.message
     assert " s " not in concern.message
     assert isinstance(concern, Concern)
 

@@ -88,20 +88,27 @@ def _makes_nearly_all(concern: Concern) -> bool:
 
 
 def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:
-    """Return what a concern is about in the words of the test: for a table of moduli the table in
-    place of its stress, and modulus and time or frequency in place of the number of a sample.
+    """Return what a concern is about in the words of the test: a sample with its strain; for a table
+    of moduli the table in place of its stress, and modulus and time or frequency of a sample.
     """
-    names = {"sample": f"sample {data['number']}"} if "number" in data else {}
+    sample = data.get("number", 0) - 1
+    names = {"sample": f"sample {sample + 1}"} if sample >= 0 else {}
     for key in ("of", "marker"):
         name, _, sensor = str(data.get(key, "")).partition("/")
         test = next((each for each in experiments if sensor and each.name == name), None)
-        moduli = {} if test is None else moduli_per_stress(specimen_strains(test)[0])
-        if test is None or not moduli:
+        if test is None:
             continue
-        names[key] = name
-        if key == "of" and "number" in data:
-            (modulus,) = [m for m, each in moduli.items() if np.isfinite(each[data["number"] - 1])]
-            names["sample"] = f"the {modulus} at {_place(test.t_s, data['number'] - 1, moduli)}"
+        strain, _ = specimen_strains(test)
+        moduli = moduli_per_stress(strain)
+        if moduli:
+            names[key] = name
+        if key == "of" and sample >= 0:
+            of_sample = [m for m, each in moduli.items() if np.isfinite(each[sample])]
+            names["sample"] = (
+                f"the {of_sample[0]} at {_place(test.t_s, sample, moduli)}"
+                if of_sample
+                else f"sample {sample + 1} (strain {strain[sample]:.4g})"
+            )
     return names
 
 
