@@ -90,6 +90,14 @@ def _largest_probes(result: Result) -> list[Probe]:
     return list(largest.values())
 
 
+def is_another_effect(result: Result) -> bool:
+    """Return whether the assumption that decreases χ² most is relaxed as no body can be: another
+    effect, which no probe has, resembles it.
+    """
+    found = [p for p in result.probes if p.sentences and p.kind == "assumption"]
+    return bool(found) and not is_possible(max(found, key=lambda probe: probe.chi_squared))
+
+
 def _ratio(probe: Probe) -> float:
     """Return the absolute size of a relaxed assumption over its standard error; 0 without one."""
     return abs(probe.size or 0.0) / probe.size_error if probe.size_error else 0.0
@@ -171,8 +179,16 @@ def _conclusions(result: Result) -> Iterator[str]:
                 for p in disagreeing
             )
             yield f"{kind}s disagree significantly ({'; '.join(changes)})"
-    if relaxed:
-        first = relaxed[0]
+    if assumptions and not is_possible(assumptions[0]):
+        less = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed)
+        yield (
+            f"χ² would decrease by {assumptions[0].chi_squared:.3g} with memory of a negative share, "
+            "which no material has: this is another effect, not memory"
+            + (f"; by less with {less}" if less else "")
+        )
+    elif relaxed:
+        first, *others = relaxed
+        alternatives = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
         names = _shown_estimates(result)
         moved = [_named_change(first, result, name=n) for n in names if n in first.moves][:2]
         size = short(first.size or 0.0)
@@ -182,14 +198,7 @@ def _conclusions(result: Result) -> Iterator[str]:
             f"by {first.chi_squared:.3g}"
             + (f" and the estimates change by {listed(moved)}" if moved else "")
             + "; measure it, or estimate it"
-        )
-        if others := [f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed[1:]]:
-            yield f"alternative explanations with similar effects: {listed(others)}"
-    if len(relaxed) < len(assumptions):
-        most = next(p.chi_squared for p in assumptions if not is_possible(p))
-        yield (
-            f"χ² would decrease by {most:.3g} with memory of a negative share, which no material "
-            "has: this is another effect, not memory"
+            + (f" (alternative explanations: {alternatives})" if alternatives else "")
         )
     elif not significant and is_routine(result):
         tested = listed(source_label(probe.name) for probe in _largest_probes(result))

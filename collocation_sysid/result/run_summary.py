@@ -30,6 +30,7 @@ from ..statistics.remedies import remedy_for
 from .alternative_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,
+    is_another_effect,
     is_deeper_check_worthwhile,
     is_first_to_correct,
     is_routine,
@@ -116,8 +117,10 @@ def _brief(result: Result) -> list[Shown]:
     outcome = [] if result.converged else [outcome_section(result)]
     probes = probe_lines(result)
     is_found = any(probe.sentences for probe in result.probes)
-    # A mistake of the description or the search is corrected before an assumption is relaxed.
-    if is_routine(result) and (not is_found or is_first_to_correct(result)):
+    # A mistake of the description or the search is corrected before an assumption is relaxed, and an
+    # effect without a name is nothing to act on beside a good answer.
+    is_nothing = is_another_effect(result) and result.trust.verdict == "good"
+    if is_routine(result) and (not is_found or is_nothing or is_first_to_correct(result)):
         probes = []
     sections = (*outcome, verdict_section(result.trust, max_reasons=SHOWN_REASONS))
     return [

@@ -121,6 +121,17 @@ def test_a_probe_that_the_budget_explains_is_one_line_and_a_table_in_the_details
     assert any(line.startswith("refit") for line in lines(result, details=True))
 
 
+def test_an_effect_without_a_name_is_in_the_details_of_a_good_answer():
+    first, *others = solved().probes
+    found = replace(
+        first, name="memory_share τ=0.1s", size=-0.2, sentences=("young_pa",), chi_squared=99.0
+    )
+    trust = replace(solved().trust, concerns=[])
+    result = replace(solved(), probes=[found, *others], trust=trust)
+    assert not any("negative share" in line for line in lines(result))
+    assert any("negative share" in line for line in lines(result, details=True))
+
+
 def test_a_probe_without_a_finding_is_not_called_insignificant_beside_its_ratio():
     told = "\n".join(lines(solved(), details=True))
     assert "no significant" not in told

@@ -11,7 +11,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.features.specimens.concerns import as_specimen_concerns
-from collocation_sysid.result.probe_sections import _conclusions
+from collocation_sysid.result.probe_sections import _conclusions, is_another_effect
 from collocation_sysid.runs.check.body_check import bending_concerns
 from collocation_sysid.statistics.assessment import _noisy_marker_concerns
 from collocation_sysid.statistics.concerns import Concern
@@ -80,12 +80,17 @@ def test_memory_of_a_negative_share_is_called_another_effect():
 
     probes = [probe("memory_share τ=0.01s", -0.25, 79.8), probe("clock_rate", 0.1, 30.0)]
     result: Any = SimpleNamespace(probes=probes, collect_estimates=dict, parameters={}, budget={})
-    measured, impossible = _conclusions(result)
-    assert measured.startswith("the data determine clock rate")
+    (impossible,) = _conclusions(result)
     assert impossible.startswith("χ² would decrease by 79.8 with memory of a negative share")
+    assert impossible.endswith("this is another effect, not memory; by less with clock rate (30)")
+    assert is_another_effect(result)
     result.probes = probes[:1]
     (impossible,) = _conclusions(result)
     assert impossible.endswith("this is another effect, not memory")
+    result.probes = [probe("memory_share τ=0.01s", -0.25, 20.0), probes[1]]
+    (measured,) = _conclusions(result)
+    assert measured.startswith("the data determine clock rate")
+    assert not is_another_effect(result)
 
 
 @pytest.mark.parametrize(("chi_squared", "explained"), [(44.0, True), (4.0, False)])
