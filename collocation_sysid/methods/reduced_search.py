@@ -16,7 +16,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.validated_classes import validated
-from ..common.validated_types import Count, Positive
+from ..common.validated_types import Count, NotNegative, Positive
 from ..errors import SimulationError
 from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
 from .horizon import Horizon, Iterate
@@ -103,6 +103,11 @@ class SearchOptions(MethodOptions):
     ----------
     tolerance : float
         The search ends when a step changes the logarithm of no parameter by more than this value.
+    least_decrease : float
+        The search ends also when the next step is predicted to decrease the loss by less than this
+        fraction times the largest change of a parameter's logarithm, if that is below 1; 0 by
+        default. Then constants that change the loss little are not found, and the positions satisfy
+        the equations of motion to the accuracy of the last step.
     max_iterations : int
         Largest number of sweeps, over all horizons; a rejected trial counts.
     trust : float
@@ -129,6 +134,7 @@ class SearchOptions(MethodOptions):
     """
 
     tolerance: Positive = 1e-8
+    least_decrease: NotNegative = 0.0
     max_iterations: Count = 200
     trust: Positive = 1.0
     ladder: Shares = SHARES
@@ -426,6 +432,8 @@ class ReducedSearch:
                     return Status.CONVERGED
             predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not is_last and predicted_share < self.options.rung_decrease:
+                return Status.CONVERGED
+            if predicted_share < self.options.least_decrease * min(1.0, length):
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT

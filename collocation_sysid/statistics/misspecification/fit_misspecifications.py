@@ -86,6 +86,9 @@ EFFORT = 5
 BUDGET = 200
 # Length of the last step of a parameter's logarithm.
 TOLERANCE = 1e-2
+# Predicted relative decrease of the loss by a change of one logarithm by 1 that ends a refit: far
+# below that of a correction that counts.
+LEAST_DECREASE = 1e-2
 # Change of the lag that ends the search [s].
 SAME_LAG_S = 5e-4
 # Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
@@ -451,7 +454,11 @@ class _Refitter:
         """
         if self.sweeps <= 0:
             return None
-        method = ReducedSpace(max_iterations=min(self.each, self.sweeps), tolerance=TOLERANCE)
+        method = ReducedSpace(
+            max_iterations=min(self.each, self.sweeps),
+            tolerance=TOLERANCE,
+            least_decrease=LEAST_DECREASE,
+        )
         try:
             changed = replace(self.collocation, experiments=(experiment,))
             if experiment in self.near_answer:
