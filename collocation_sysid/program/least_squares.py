@@ -28,6 +28,8 @@ NEGLIGIBLE = 1e-3
 # Triangles with a smaller reciprocal condition number are not solved by substitution, whose error
 # would exceed that of the orthogonal methods used instead.
 ROUNDING = 1e-12
+# Size of the entries of a triangle above which their squares may overflow.
+SQUARED = 1e140
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +142,9 @@ class SquareRootInformation:
         p = _trtrs(square, right)[0] if regular else np.linalg.lstsq(square, right)[0]
         if ((lower <= p) & (p <= upper)).all():
             return np.asarray(p, dtype=np.float64)
+        # The residuals of a motion that diverges are so large that their squares overflow.
+        if (largest := np.abs(self.triangle).max()) > SQUARED:
+            square, right = square / largest, right / largest
         return np.clip(lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper)
 
     def marginal(self, count: int) -> SquareRootInformation:

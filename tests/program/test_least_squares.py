@@ -93,3 +93,18 @@ def test_the_loss_of_a_divergent_trial_step_is_infinite_without_a_warning(rng):
         rng.normal(size=4), rng.normal(size=(4, 2)), np.zeros(2)
     )
     assert information.loss(np.full(2, 1e200)) == np.inf
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_best_between_bounds_does_not_depend_on_the_size_of_the_residuals(rng):
+    slope, residual = rng.normal(size=(9, 3)), rng.normal(size=9)
+    bounds = np.full(3, -0.1), np.full(3, 0.1)
+    usual, huge = (
+        SquareRootInformation(
+            size * SquareRootInformation.empty(3).with_rows(residual, slope).triangle
+        )
+        for size in (1.0, 1e180)
+    )
+    expected = usual.minimiser(*bounds)
+    assert np.abs(expected).max() == 0.1
+    np.testing.assert_allclose(huge.minimiser(*bounds), expected, atol=1e-12)
