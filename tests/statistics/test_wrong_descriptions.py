@@ -473,10 +473,7 @@ def test_a_clock_that_is_estimated_is_reported(rng):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "fault",  # of gravity `test_trust` asks for the verdict and the cause
-    [pytest.param(f, marks=pytest.mark.slow) if f == "gravity" else f for f in AFTER],
-)
+@pytest.mark.parametrize("fault", AFTER)
 def test_a_wrong_description_is_named_after_solving(fault: str, rng):
     causes = find_misspecifications(solve(FAULTS[fault](soft("bar"), rng)))
     assert causes, fault

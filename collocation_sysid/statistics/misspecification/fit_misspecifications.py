@@ -220,12 +220,13 @@ def _refit_hypotheses(
     of = f"'{experiment.name}'"
     lags = [] if first.is_static else _clock_hypotheses(alone, first, stated=stated, of=of)
     comparison = ModalComparison.from_experiment(first, solution.parameters)
-    turned = [] if comparison is None else _gravity_hypotheses(first, comparison)
+    turned = [] if comparison is None else [*_gravity_hypotheses(first, comparison)]
     images = mirrored_meshes(first) if discrepancy > MIRRORED else ()
     mirrored = [*corrected_hypotheses(images, first)]
     is_far = max(map(_pose_deviation, solution.parts)) > FAR
-    if is_far and budget is None:  # mirror images come first, and leave the others their sweeps
-        alone.sweeps += alone.each * len(mirrored)
+    if is_far and budget is None:  # these come first, and leave the others their sweeps
+        alone.sweeps += alone.each * (len(mirrored) + len(turned))
+        alone.longer.update(each.corrected for each in turned)
     bodies = [*screened_bodies(solution, first, is_far=is_far)]
     alone.near_answer.update(each.corrected for each in bodies)
     # The first samples may end before the unloading: the complete fit is what must improve. The
@@ -408,6 +409,9 @@ class _Refitter:
         work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
         self.near_answer: set[Experiment] = set()
+        # Experiments whose fits may take twice the sweeps: that of another direction of gravity than
+        # the one to which a fit turned the body begins far from its answer.
+        self.longer: set[Experiment] = set()
         self.declared = declared
         parameters = solution.collocation.parameters
         values = parameters.values(solution.q)
@@ -455,7 +459,7 @@ class _Refitter:
         if self.sweeps <= 0:
             return None
         method = ReducedSpace(
-            max_iterations=min(self.each, self.sweeps),
+            max_iterations=min(self.each * (1 + (experiment in self.longer)), self.sweeps),
             tolerance=TOLERANCE,
             least_decrease=LEAST_DECREASE,
         )
