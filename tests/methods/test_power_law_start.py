@@ -209,3 +209,13 @@ def test_a_recording_for_validation_does_not_change_the_start():
     beside, _ = start_of(replace(problem, experiments=[problem.experiments[0], tested]))
     assert beside.loss == alone.loss
     assert beside.parameters.guesses == alone.parameters.guesses
+
+
+@pytest.mark.long
+def test_three_terms_of_treloars_rubber_leave_little_in_tension():
+    """The start ended at a worse minimum where only the first exponent had wider bounds."""
+    keys = [f"{key}_{p}{unit}" for p in (1, 2, 3) for key, unit in (("mu", "_pa"), ("alpha", ""))]
+    unknown = dict.fromkeys(keys, cs.Unknown()) | {"kappa_pa": 1e9} | STILL
+    solution = cs.solve(cs.Problem(cs.datasets.treloar_1944("ogden-3"), unknown))
+    assert solution.status.converged
+    assert solution.history[-1].loss < 105

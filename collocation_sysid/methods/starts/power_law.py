@@ -33,6 +33,8 @@ from ...recording.specimen_files import deformed_gradients
 
 # Sizes of the exponents of the grid, each with both signs.
 GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0)
+# Share of the largest exponent that counts as at its bound.
+AT_BOUND = 0.99
 # β of the grid; the largest one is nearly incompressible.
 BETA_GRID = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
 # Least distance of two exponents: nearer ones are one term and its derivative by the exponent,
@@ -138,6 +140,7 @@ class PowerLawStart:
     young_pa: float
     note: str  # what the measurements do not determine; empty if they determine all constants
     loss: float  # χ² of the closed form at the start
+    is_at_bound: bool  # whether an exponent is at the largest one that is allowed
 
 
 def power_law_start(collocation: Collocation) -> PowerLawStart | None:
@@ -149,8 +152,14 @@ def power_law_start(collocation: Collocation) -> PowerLawStart | None:
     exponents of both signs. No constant is fixed if one of the law has a guess: who states a guess
     asks for this term.
     """
-    fits = _PowerLawFits.of(collocation)
-    return None if fits is None else fits.start()
+    fits = _PowerLawFits.of(collocation, _with_both_signs)
+    start = None if fits is None else fits.start()
+    if start is None or not start.is_at_bound:
+        return start
+    # Wider bounds are no better start of others: bounded searches depend on them.
+    wider = _PowerLawFits.of(collocation, _widened)
+    other = None if wider is None else wider.start()
+    return start if other is None or other.loss >= start.loss else other
 
 
 class _PowerLawFits:
@@ -162,13 +171,21 @@ class _PowerLawFits:
     tests : sequence of _Test
     is_foam : bool
         Whether the law is the compressible foam, else Ogden's with incompressible specimens.
+    widened : function
+        Returns a parameter with the bounds of the fits.
     """
 
-    def __init__(self, parameters: Parameters, tests: Sequence[_Test], is_foam: bool) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        tests: Sequence[_Test],
+        is_foam: bool,
+        widened: Callable[[Parameter], Parameter],
+    ) -> None:
         self.parameters = parameters
         self.tests = tests
         self.is_foam = is_foam
-        self.items = {item.name: _widened(item) for item in parameters.components}
+        self.items = {item.name: widened(item) for item in parameters.components}
         self.terms = len(term_numbers(self.items))
         self.measurements = sum(test.measurements for test in tests)
         sigmas = [
@@ -188,7 +205,9 @@ class _PowerLawFits:
         )
 
     @classmethod
-    def of(cls, collocation: Collocation) -> _PowerLawFits | None:
+    def of(
+        cls, collocation: Collocation, widened: Callable[[Parameter], Parameter]
+    ) -> _PowerLawFits | None:
         """Return the fits of a problem; None if it has none, see `power_law_start`."""
         experiments = [each.experiment for each in collocation.transcriptions]  # fitted ones
         parts = [part for each in experiments for part in each.body.parts]
@@ -207,7 +226,7 @@ class _PowerLawFits:
             return None
         is_foam = law.startswith("hyperfoam-")
         tests = [test for each in experiments if (test := _test(each, is_foam))]
-        fits = cls(parameters, tests, is_foam)
+        fits = cls(parameters, tests, is_foam, widened)
         return fits if own and fits.measurements > len(own) else None
 
     def _numbers(self) -> range:
@@ -457,7 +476,10 @@ class _PowerLawFits:
         parameters = self.parameters.map_components(
             lambda item: _started(self.items[item.name], guesses, fixed=fixed, tied=tied)
         )
-        return PowerLawStart(parameters, young_pa, note="; ".join(notes), loss=fit.loss)
+        is_at_bound = not (
+            AT_BOUND * self.lowest < fit.alpha.min() and fit.alpha.max() < AT_BOUND * self.highest
+        )
+        return PowerLawStart(parameters, young_pa, "; ".join(notes), fit.loss, is_at_bound)
 
     def _notes(
         self, terms: int, near: Sequence[int], tied: Mapping[str, Tied], fixed: Mapping[str, float]
@@ -493,11 +515,20 @@ def _has_default_bounds(item: Parameter) -> bool:
     return is_free and item.has_default_bound(0) and item.has_default_bound(1)
 
 
-def _widened(item: Parameter) -> Parameter:
-    """Return the first exponent with its widest bounds, which admit both signs, in place of its
-    default bounds; any other parameter itself.
+def _with_both_signs(item: Parameter) -> Parameter:
+    """Return the first exponent with bounds that admit both signs in place of its default bounds;
+    any other parameter itself.
     """
     if item.name != "alpha_1" or not _has_default_bounds(item):
+        return item
+    return replace(item, lower=-item.upper)
+
+
+def _widened(item: Parameter) -> Parameter:
+    """Return an exponent with its widest bounds, which admit both signs, in place of its default
+    bounds; any other parameter itself.
+    """
+    if not item.name.startswith("alpha_") or not _has_default_bounds(item):
         return item
     return with_widest_bounds(item)
 
