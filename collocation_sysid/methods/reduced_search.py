@@ -433,7 +433,8 @@ class ReducedSearch:
             predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
             if not is_last and predicted_share < self.options.rung_decrease:
                 return Status.CONVERGED
-            if predicted_share < self.options.least_decrease * min(1.0, length):
+            # With curvature that Gauss–Newton neglects its own loss may be predicted to grow.
+            if 0.0 <= predicted_share < self.options.least_decrease * min(1.0, length):
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
