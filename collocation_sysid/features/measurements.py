@@ -23,8 +23,8 @@ from ..recording.markers import Markers
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement
 from ..recording.sample_times import TIME_TOLERANCE_S
-from ..recording.specimen import STRESS_NAME, moduli_per_stress
-from ..recording.specimen_files import specimen_strains
+from ..recording.specimen import STRESS_NAME
+from ..recording.specimen_files import moduli_of
 from ..statistics.instrument_misfit import InstrumentMisfit, misfit
 from .measurement_results import PredictionErrors, PredictionResiduals
 
@@ -253,8 +253,8 @@ def _shown_as(experiment: Experiment, gauge: CustomSensor) -> dict[str, Array]:
     """Return the factors, (1, 1) or (S, 1), of a sensor's values to what a table states: moduli in
     place of the stresses that stand for them. By name; NaN where a sample has no such value.
     """
-    if experiment.specimen is not None and gauge.name == STRESS_NAME:
-        moduli = moduli_per_stress(specimen_strains(experiment)[0])
+    if gauge.name == STRESS_NAME:
+        moduli = moduli_of(experiment)
         if moduli and len(gauge.sample_times_s) == len(experiment.t_s):
             return {name: factor[:, None] for name, factor in moduli.items()}
     return {gauge.name: ONE}

@@ -56,7 +56,7 @@ from .formats.columns import (
 from .formats.text import TextTable, names_file_in_errors
 from .formats.units import si_factor
 from .homogeneous_deformation import AXES, CELL_SIZE_M, DEFORMATIONS, transverse_stretch
-from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME
+from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME, moduli_per_stress
 
 # Name of a column that no column of a table fits.
 MISSING = "…"
@@ -613,6 +613,13 @@ def specimen_strains(experiment: Experiment) -> tuple[Array, Array]:
     # Components of different strains are orthogonal.
     strains = shifts.reshape(-1, 9) @ by_strain.T / np.maximum((by_strain**2).sum(axis=1), 1e-300)
     return strains[:, 0], strains[:, 1]
+
+
+def moduli_of(experiment: Experiment) -> dict[str, Array]:
+    """Return the factors (T,) of the stresses of an experiment to moduli, see `moduli_per_stress`;
+    empty unless it is a table of moduli.
+    """
+    return moduli_per_stress(specimen_strains(experiment)[0]) if experiment.specimen else {}
 
 
 def deformed_gradients(experiment: Experiment) -> Array:

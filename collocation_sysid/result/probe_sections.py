@@ -94,8 +94,14 @@ def is_another_effect(result: Result) -> bool:
     """Return whether the assumption that decreases χ² most is relaxed as no body can be: another
     effect, which no probe has, resembles it.
     """
+    found = _found_assumptions(result)
+    return bool(found) and not is_possible(found[0])
+
+
+def _found_assumptions(result: Result) -> list[Probe]:
+    """Return the significant relaxed assumptions, that which decreases χ² most first."""
     found = [p for p in result.probes if p.sentences and p.kind == "assumption"]
-    return bool(found) and not is_possible(max(found, key=lambda probe: probe.chi_squared))
+    return sorted(found, key=lambda probe: -probe.chi_squared)
 
 
 def _ratio(probe: Probe) -> float:
@@ -167,9 +173,7 @@ def _conclusions(result: Result) -> Iterator[str]:
     assumption that the data do not determine follows.
     """
     significant = [probe for probe in result.probes if probe.sentences]
-    assumptions = sorted(
-        (p for p in significant if p.kind == "assumption"), key=lambda p: -p.chi_squared
-    )
+    assumptions = _found_assumptions(result)
     relaxed = [p for p in assumptions if is_possible(p)]
     for kind in ("window", "recording"):
         disagreeing = [p for p in significant if p.kind == kind]
@@ -179,7 +183,7 @@ def _conclusions(result: Result) -> Iterator[str]:
                 for p in disagreeing
             )
             yield f"{kind}s disagree significantly ({'; '.join(changes)})"
-    if assumptions and not is_possible(assumptions[0]):
+    if is_another_effect(result):
         less = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in relaxed)
         yield (
             f"χ² would decrease by {assumptions[0].chi_squared:.3g} with memory of a negative share, "

@@ -29,8 +29,8 @@ from ..recording.measured_wrench import Wrench
 from ..recording.measurement_selection import with_some_samples
 from ..recording.obstacle import Obstacle
 from ..recording.poses import PoseSequence
-from ..recording.specimen import Specimen, cell_of_other_test, moduli_per_stress
-from ..recording.specimen_files import specimen_strains
+from ..recording.specimen import Specimen, cell_of_other_test
+from ..recording.specimen_files import moduli_of, specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
 from ..statistics.budget.consider_analysis import (
     UNWEIGHTED,
@@ -325,9 +325,7 @@ def added_measurements(
                     f"another recording of '{experiment.name}', held as long again at its end",
                     [*experiments, longer],
                 )
-        elif len(experiment.body.parts) == 1 and not moduli_per_stress(
-            specimen_strains(experiment)[0]
-        ):
+        elif len(experiment.body.parts) == 1 and not moduli_of(experiment):
             for test, phrase in ADDED_TESTS.items():
                 if test not in tests:
                     tests.add(test)

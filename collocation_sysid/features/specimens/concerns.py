@@ -14,8 +14,8 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...recording.experiment import Experiment
-from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic, moduli_per_stress
-from ...recording.specimen_files import specimen_strains
+from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic
+from ...recording.specimen_files import moduli_of, specimen_strains
 from ...statistics.concerns import Concern
 
 # Code of the concern about a specimen by that of the general concern with the same data.
@@ -76,15 +76,15 @@ def as_specimen_concerns(
         )
         for concern in concerns
     ]
-    alone = [each for each in replaced if _makes_nearly_all(each)]
+    alone = [
+        each
+        for each in replaced
+        if each.code == codes["residuals/outlier"] and each.data["percent"] > NEARLY_ALL
+    ]
     large = [each for each in replaced if each.code == codes["noise/larger"]]
     others = [each for each in replaced if each not in alone and each not in large]
     grave = any(each.grade == "doubtful" for each in large)
     return [*(replace(e, grade="doubtful") if grave else e for e in alone), *large, *others]
-
-
-def _makes_nearly_all(concern: Concern) -> bool:
-    return concern.code == "specimen/outlier" and concern.data["percent"] > NEARLY_ALL
 
 
 def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:
@@ -98,8 +98,7 @@ def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[s
         test = next((each for each in experiments if sensor and each.name == name), None)
         if test is None:
             continue
-        strain, _ = specimen_strains(test)
-        moduli = moduli_per_stress(strain)
+        moduli = moduli_of(test)
         if moduli:
             names[key] = name
         if key == "of" and sample >= 0:
@@ -107,7 +106,7 @@ def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[s
             names["sample"] = (
                 f"the {of_sample[0]} at {_place(test.t_s, sample, moduli)}"
                 if of_sample
-                else f"sample {sample + 1} (strain {strain[sample]:.4g})"
+                else f"sample {sample + 1} (strain {specimen_strains(test)[0][sample]:.4g})"
             )
     return names
 

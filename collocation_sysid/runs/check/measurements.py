@@ -9,8 +9,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...recording.experiment import Experiment
-from ...recording.specimen import moduli_per_stress
-from ...recording.specimen_files import specimen_strains
+from ...recording.specimen_files import moduli_of
 from ...statistics.concerns import Concern, concern_if
 from .body_check import BodyCheck
 
@@ -99,7 +98,7 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
                 else None,
             )
         )
-    moduli = moduli_per_stress(specimen_strains(experiment)[0]) if experiment.specimen else {}
+    moduli = moduli_of(experiment)
     frames = [int(np.isfinite(each).sum()) for each in moduli.values()]
     return RecordingCheck(
         experiment.name,
