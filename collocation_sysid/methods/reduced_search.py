@@ -93,6 +93,8 @@ ACCURACY_SHARE = 0.01
 FINAL_ACCURACY_SHARE = 0.1
 # Largest number of new associations of the measurements.
 REREADINGS = 40
+# Larger than any loss.
+UNLIMITED = 1e100
 
 
 @validated
@@ -118,6 +120,9 @@ class SearchOptions(MethodOptions):
     rung_decrease : float
         The search on each share of the recording except the last ends when the next step is
         predicted to decrease the loss by less than this fraction.
+    largest_loss : float
+        The search stalls when the solve of a share of the recording except the last leaves a larger
+        loss than this; unlimited by default.
     rung_prior : float
         Standard deviation of a prior of the logarithm of each parameter about its guess, for all
         shares of the recording except the last. A short part of a recording does not determine all
@@ -139,6 +144,7 @@ class SearchOptions(MethodOptions):
     trust: Positive = 1.0
     ladder: Shares = SHARES
     rung_decrease: Positive = 0.05
+    largest_loss: Positive = UNLIMITED
     rung_prior: Positive = 2.3
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     factorisation: Choice = "auto"
@@ -301,6 +307,11 @@ class ReducedSearch:
         """
         complete = all(map(_oscillates, self.collocation.transcriptions))
         return self.options.ladder[-1:] if complete else self.options.ladder
+
+    @property
+    def loss(self) -> float:
+        """Loss of the best point; 0 before the first."""
+        return self.point.loss if self.point else 0.0
 
     def horizon_of_share(self, share: float) -> Horizon:
         """Return the problem on a share of the recording, one of `ladder`."""

@@ -122,6 +122,9 @@ class ReducedSpace(SearchOptions):
                     status = search.minimise(horizon, share == search.ladder[-1])
                     if status is Status.ITERATION_LIMIT:
                         break
+                    if share != search.ladder[-1] and search.loss > self.largest_loss:
+                        status = Status.STALLED
+                        break
             status = status or Status.CONVERGED
             if search.ended_by_association:
                 recorder.notes.append(ENDED_BY_ASSOCIATION)

@@ -20,11 +20,12 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.time_dependence import at_times
 from ...errors import InputError, SimulationError
+from ...methods.reduced_search import UNLIMITED
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution, Status
 from ...methods.starts.continuation import first_samples
 from ...methods.starts.initial_trajectories import associated_at_guess
-from ...program.collocation import ExperimentIterate
+from ...program.collocation import Collocation, ExperimentIterate
 from ...program.modes.modal_prediction import DeclaredMotion
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
@@ -89,6 +90,9 @@ TOLERANCE = 1e-2
 # Predicted relative decrease of the loss by a change of one logarithm by 1 that ends a refit: far
 # below that of a correction that counts.
 LEAST_DECREASE = 1e-2
+# Loss of a part of the samples over that of all samples without a correction, above which a
+# correction is refuted: more samples have no smaller loss.
+REFUTED = 4.0
 # Change of the lag that ends the search [s].
 SAME_LAG_S = 5e-4
 # Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
@@ -201,6 +205,7 @@ def _refit_hypotheses(
     stated = alone.fit(first)
     if stated is None:
         return []
+    alone.stated_loss = stated.history[-1].loss
     fitted_m = stated.readings_m[0]
     trial = HypothesisTest(
         _discrepancy(stated),
@@ -388,7 +393,7 @@ def _largest_step(residual: Array) -> tuple[float, int]:
 
 class _Refitter:
     """Fits of one experiment at a time with a limited number of sweeps, from the problem's guess, or
-    from the answer for experiments in `near_answer`.
+    from the answer and its motion for experiments in `near_answer`.
 
     Parameters
     ----------
@@ -408,11 +413,13 @@ class _Refitter:
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
+        self.stated_loss = UNLIMITED
         self.near_answer: set[Experiment] = set()
         # Experiments whose fits may take twice the sweeps: that of another direction of gravity than
         # the one to which a fit turned the body begins far from its answer.
         self.longer: set[Experiment] = set()
         self.declared = declared
+        self.parts = solution.parts
         parameters = solution.collocation.parameters
         values = parameters.values(solution.q)
         self.answer = {item.name: values[item.name] for item in parameters.free}
@@ -462,18 +469,41 @@ class _Refitter:
             max_iterations=min(self.each * (1 + (experiment in self.longer)), self.sweeps),
             tolerance=TOLERANCE,
             least_decrease=LEAST_DECREASE,
+            largest_loss=min(UNLIMITED, REFUTED * self.stated_loss),
         )
+        start = None
         try:
             changed = replace(self.collocation, experiments=(experiment,))
             if experiment in self.near_answer:
                 changed = changed.with_parameters(changed.parameters.with_estimates(self.answer))
-            solution = method(associated_at_guess(changed))
+                start = self._answer_of(changed)
+            solution = method(associated_at_guess(changed), start=start)
         except (InputError, SimulationError):
             return None
         self.sweeps -= solution.iterations
         solution.unless_interrupted()
         ended = solution.status.converged or solution.status is Status.ITERATION_LIMIT
         return solution if ended else None
+
+    def _answer_of(self, changed: Collocation) -> Array | None:
+        """Return variables with the motion and the nuisance parameters of the fit, for the first
+        samples of a recording with the same nodes and the problem's parameters at the answer; None
+        for other times or nodes.
+        """
+        (transcription,) = changed.transcriptions
+        name = transcription.experiment.name
+        part = next(p for p in self.parts if p.transcription.experiment.name == name)
+        times_s = transcription.dynamics.t_s
+        x = part.x[: len(times_s)]
+        if x.shape != (len(times_s), transcription.dof_count) or not np.allclose(
+            part.transcription.dynamics.t_s[: len(x)], times_s
+        ):
+            return None
+        p = changed.guess_p
+        phi = dict(zip(part.transcription.nuisance.names, part.phi.tolist(), strict=True))
+        names = changed.list_parameter_names()[changed.nq :]
+        p[changed.nq :] = [phi.get(n, guess) for n, guess in zip(names, p[changed.nq :], strict=True)]
+        return changed.pack(p, [x])
 
 
 def _clock_hypotheses(
