@@ -91,11 +91,11 @@ def test_the_exponent_is_not_determined_by_small_strains(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"alpha_1": "40.0"}, "alpha_1: fixed = 40, expected less than 30"),
-        ({"alpha_1": "-40.0"}, "alpha_1: fixed = -40, expected a number >= -30"),
+        ({"alpha_1": "80.0"}, "alpha_1: fixed = 80, expected less than 60"),
+        ({"alpha_1": "-80.0"}, "alpha_1: fixed = -80, expected a number >= -60"),
         # It is possible with a negative exponent, but not with the usual one.
         ({"mu_1_pa": "-5.0"}, "the body cannot be simulated"),
-        ({"alpha_1": "{ lower = -50.0 }"}, "expected -30 <= lower < upper"),
+        ({"alpha_1": "{ lower = -80.0 }"}, "expected -60 <= lower < upper"),
         ({"alpha_2": "2.0"}, "alpha_2"),
     ],
 )
