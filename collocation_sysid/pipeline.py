@@ -61,7 +61,7 @@ from .statistics.budget.consider_analysis import (
 )
 from .statistics.budget.discretisation_error import MOST_SUBSTEPS
 from .statistics.budget.systematic_effects import ASSUMPTIONS, DEVIATIONS
-from .statistics.budget.uncertainty_budget import VarianceSources
+from .statistics.budget.variance_sources import VarianceSources
 from .statistics.curved_intervals import with_curved_intervals
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
@@ -70,11 +70,11 @@ from .statistics.probes.budgeted_residuals import (
     is_significant_beside_budget,
     with_budget,
 )
-from .statistics.probes.deep_probes import deep_probes, routine_probes_with_steps
+from .statistics.probes.deep import deep_probes, routine_probes_with_steps
 from .statistics.probes.profile_likelihood import Profile, profile_of_solution
 from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
-from .statistics.probes.routine_probes import is_alarming, probed_deviations
-from .statistics.residuals.residual_diagnostics import diagnose_markers
+from .statistics.probes.routine import is_alarming, probed_deviations
+from .statistics.residuals.diagnostics import diagnose_markers
 from .statistics.thresholds import NOISE
 from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
 

@@ -121,7 +121,7 @@ def _write_bodies(folder: Path, body: str | None, output: OutputOptions) -> None
     instead.
     """
     from ..extras.benchmark import BODIES, write_benchmark
-    from ..extras.benchmark.benchmark_bodies import chosen_bodies
+    from ..extras.benchmark.bodies import chosen_bodies
 
     chosen = chosen_bodies(body)
     with shown_progress("simulating the bodies", quiet=output.quiet) as progress:

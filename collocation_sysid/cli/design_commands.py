@@ -84,9 +84,9 @@ def design(
     search and keeps the best motion so far; the exit code is then 130
     (143 after SIGTERM).
     """
-    from ..extras.design.design_folder import DESIGN_FILE, design_json, write_design
-    from ..extras.design.design_page import design_summary
-    from ..extras.studies.study_progress import DesignProgress
+    from ..extras.design.folder import DESIGN_FILE, design_json, write_design
+    from ..extras.design.page import design_summary
+    from ..extras.studies.progress import DesignProgress
 
     folder = out or Path("runs") / f"{run_name(source.problem)}-design"
     names = () if for_ is None else tuple(n.strip() for n in for_.split(","))
@@ -156,7 +156,7 @@ def plan(
     (143 after SIGTERM).
     """
     from ..extras.planning import Task, plan_motion
-    from ..extras.planning.plan_folder import PLAN_FILE, plan_json, plan_summary, write_plan
+    from ..extras.planning.folder import PLAN_FILE, plan_json, plan_summary, write_plan
     from ..extras.planning.trajectory_log import require_trajectory_packages
 
     if rate is not None and not 0 < rate < float("inf"):

@@ -22,7 +22,7 @@ from .common import EXIT_BAD_INPUT, error_console, print_result, shown_progress
 
 if TYPE_CHECKING:
     from ..extras.live.frames import Frame
-    from ..extras.live.live_recording import LiveRecording
+    from ..extras.live.recording import LiveRecording
 
 commands = typer.Typer()
 
@@ -58,7 +58,7 @@ class LiveEstimationOptions:
             cannot be written.
         """
         if self.rerun is not None:
-            from ..extras.live.live_recording import require_recordable
+            from ..extras.live.recording import require_recordable
 
             require_recordable(self.rerun)
 
@@ -74,7 +74,7 @@ class LiveEstimationOptions:
         if self.rerun is None:
             yield None
             return
-        from ..extras.live.live_recording import LiveRecording
+        from ..extras.live.recording import LiveRecording
 
         written = LiveRecording(self.rerun, estimator.model.experiment)
         try:
@@ -201,13 +201,13 @@ def replay(
     from rich.live import Live
 
     from ..common.display import on_terminal
-    from ..extras.live import live_display
+    from ..extras.live import display
     from ..extras.live.sources import frames_of_recording, paced_frames, without_garbage_of_startup
     from ..extras.live.sources import update_as_json as json_line
 
     if film is not None:
         require_possible(film.parent)
-        live_display.require_gif(film)
+        display.require_gif(film)
     estimator = estimation.make_estimator(recording, output.quiet)
     experiment = estimator.model.experiment
     frames = frames_of_recording(experiment, estimator.model)
@@ -222,13 +222,13 @@ def replay(
                 if output.as_json:
                     typer.echo(json_line(updates[-1]))
                 elif watched:
-                    shown.update(on_terminal(live_display.display_of(updates)))
+                    shown.update(on_terminal(display.display_of(updates)))
         settled = settled_update(estimator, written) or updates[-1]
     if output.as_json:
         typer.echo(json_line(settled))
     else:
-        print_result(live_display.final_display(updates, settled))
+        print_result(display.final_display(updates, settled))
     if film is not None:
         with shown_progress("making the film", quiet=output.quiet):
-            live_display.write_film(updates, film)
+            display.write_film(updates, film)
         typer.echo(film)

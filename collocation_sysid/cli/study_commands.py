@@ -28,10 +28,10 @@ from ..extras.studies import (
     plan_sweep,
     run_all,
 )
+from ..extras.studies.arguments import parse_methods, parse_varied_keys, read_truth
 from ..extras.studies.model_variants import models, parse_branches, parse_dampings, parse_materials
-from ..extras.studies.study_arguments import parse_methods, parse_varied_keys, read_truth
-from ..extras.studies.study_planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
-from ..extras.studies.study_rows import SuccessCriterion
+from ..extras.studies.planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
+from ..extras.studies.rows import SuccessCriterion
 from ..fem.kernels import available_threads
 from ..problem import Problem
 from .command_options import OneMethod, OutputFolder, OutputOptions, ProblemOptions, command, option
@@ -149,7 +149,7 @@ def compare_models(
     """
     if not with_ and {materials, damping, prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
-    from ..extras.studies.study_progress import STUDY_FACTOR, expected_study_s
+    from ..extras.studies.progress import STUDY_FACTOR, expected_study_s
     from ..runs.check import expected_search_s
 
     is_announced = not (output.quiet or study.dry_run)
@@ -258,14 +258,14 @@ def _run_study(
     are only listed, with those that are finished marked, and nothing is written. Runs that fail do
     not end the study: they are in the tables. Without any record no tables are written.
     """
-    from ..extras.studies.study_page import (
+    from ..extras.studies.page import (
         load_report,
         plan_table,
         report_json,
         study_tables,
         write_report,
     )
-    from ..extras.studies.study_progress import StudyProgress
+    from ..extras.studies.progress import StudyProgress
 
     name = run_name(source.problem)
     folder = study.out or Path("runs") / f"{name}-{kind}"

@@ -165,7 +165,7 @@ def _word_table(word: str) -> Table:
     from ..fem.laws.constants import KNOWN, constants_with_symbol, unit_of
     from ..recording.nuisance import nuisances_called
     from ..statistics.budget.systematic_effects import ASSUMPTIONS
-    from ..statistics.budget.uncertainty_budget import source_label
+    from ..statistics.budget.variance_sources import source_label
     from ..statistics.remedies import REMEDIES
 
     constants = [word] if word in KNOWN else constants_with_symbol(word)
@@ -263,8 +263,8 @@ def new(
     If a file of the same name exists, nothing is written, and the exit code is 2. The names of the
     files are printed.
     """
-    from ..datasets.dataset_files import copy_dataset
-    from ..problem.new_problem import create_problem
+    from ..datasets.files import copy_dataset
+    from ..problem.new import create_problem
 
     folder = Path(name)
     if kind is not None and dataset is not None:

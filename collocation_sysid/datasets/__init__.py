@@ -22,7 +22,7 @@ from ..errors import InputError
 from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
 from ..recording.specimen_files import SpecimenLayout, read_specimen
-from .dataset_files import DATASETS, dataset_file, read_problem
+from .files import DATASETS, dataset_file, read_problem
 from .hyperelastic_curves import hyperelastic_curves
 from .public_data import fetch
 

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from ..errors import InputError, require_among
 from ..fem.kernels.jit import cache_folder
-from .dataset_files import DATASETS, dataset_folder
+from .files import DATASETS, dataset_folder
 
 HOST = "https://github.com"
 INSTALLATION = "pip install 'collocation-sysid[datasets]'"

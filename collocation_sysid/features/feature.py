@@ -14,7 +14,7 @@ from ..problem import Problem
 from ..program.collocation import Collocation, ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, Topic
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ..statistics.misspecification.hypothesis import Hypothesis
 from .measurement_results import PredictionErrors
 
 

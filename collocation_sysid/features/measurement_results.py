@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..common.array_types import Array
 from ..common.display import quantity, short
 from ..common.serialisation import optional
-from ..model.contact.contact_summary import FrictionSummary
+from ..model.contact.summary import FrictionSummary
 from ..program.depth.surface_comparison import DepthError
 
 

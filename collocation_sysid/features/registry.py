@@ -6,8 +6,8 @@ from ..statistics.concerns import declare_messages, declare_topics
 from .cameras.feature import CAMERAS
 from .contact.feature import CONTACT
 from .feature import Feature
-from .image_tracks.track_feature import IMAGE_TRACKS
-from .outlines.outline_feature import OUTLINES
+from .image_tracks.feature import IMAGE_TRACKS
+from .outlines.feature import OUTLINES
 from .specimens.feature import SPECIMENS
 from .wrenches.feature import WRENCH
 

@@ -15,7 +15,7 @@ Start
     parameters, and searches of the first samples.
 Common
     `solution` defines the protocol of methods and the result, `solve_recorder` the history,
-    `method_options` the construction of methods from options by name, `nlpsol` and `callbacks` the
+    `options` the construction of methods from options by name, `nlpsol` and `callbacks` the
     interface to CasADi's solvers.
 """
 

@@ -18,7 +18,7 @@ import scipy.sparse.linalg as spla
 from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import BOUND_TOLERANCE, Collocation, convert_variables
-from ..program.lifted.lifted_collocation import lifted_count, with_lifted_variables
+from ..program.lifted.collocation import lifted_count, with_lifted_variables
 from .loss_curvature import reduced_hessian, sensitivities, tangent_directions
 from .starts.initial_point import adjoint_multipliers
 

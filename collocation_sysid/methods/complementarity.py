@@ -16,10 +16,10 @@ import numpy as np
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.meshes.selection import Indices
-from ..model.contact.contact_force import contact_terms
-from ..model.contact.contact_summary import smallest_gaps
+from ..model.contact.force import contact_terms
+from ..model.contact.summary import smallest_gaps
 from ..program.collocation import Collocation
-from ..program.lifted.lifted_collocation import with_lifted_variables
+from ..program.lifted.collocation import with_lifted_variables
 from ..recording.experiment import Experiment
 from ..recording.obstacle import Obstacle
 from .solution import Solution

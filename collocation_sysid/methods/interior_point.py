@@ -19,14 +19,14 @@ from ..common.validated_classes import validated
 from ..common.validated_types import Count, Finite, NotNegative, Positive, StrictInteger, Text
 from ..errors import located
 from ..program.collocation import Collocation
-from ..program.lifted.lifted_collocation import lifted_count, with_lifted_variables
+from ..program.lifted.collocation import lifted_count, with_lifted_variables
 from ..recording.experiment import Experiment
 from . import nlpsol
 from .callbacks import NlpFunctions
 from .certificate import certify
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
-from .method_options import MethodOptions
+from .options import MethodOptions
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
 from .starts.initial_point import InitialPoint, adjoint_multipliers, compute_initial_point

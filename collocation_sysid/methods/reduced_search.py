@@ -21,7 +21,7 @@ from ..errors import SimulationError
 from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
 from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
-from .method_options import FEWEST, SHARES, MethodOptions, Shares, samples_in_share
+from .options import FEWEST, SHARES, MethodOptions, Shares, samples_in_share
 from .solution import Iteration, Status
 from .solve_recorder import Recorder
 from .trajectory_sweeps import FitSummary

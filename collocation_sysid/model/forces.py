@@ -23,7 +23,7 @@ from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.laws.memory import MemoryInput
 from ..fem.pattern import JointPattern, SymmetricPattern
 from ..recording.experiment import Experiment
-from .contact.contact_force import contact_terms
+from .contact.force import contact_terms
 from .force_term import AssemblyIndices, ForceTerm, Potential, States
 from .local_force import LocalForces
 from .point_forces import (

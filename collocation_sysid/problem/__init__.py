@@ -1,22 +1,22 @@
 """Estimation problems, and the problem file (TOML).
 
-`problem` defines `Problem`, and `problem_options` its options for checks and uncertainties. The
-other modules read a problem file: `problem_reading` parses and validates it, `loading` converts it
+`problem` defines `Problem`, and `options` its options for checks and uncertainties. The
+other modules read a problem file: `reading` parses and validates it, `loading` converts it
 to a problem, `recording_reader` reads the files of one experiment (`marker_tracking` its markers,
 `recording_frames` the frames of logs, `code_loader` Python files, `named_files` finds those that a
-key names, `bench_files` tables of a test bench, `density_guesses` the mass), and `problem_size`
+key names, `bench_files` tables of a test bench, `density_guesses` the mass), and `size`
 estimates memory and time; `specimen_reader` reads tests without a mesh, and `gripper_transforms`
 the poses of bodies in grippers. `schema`, `recording_schema`, `camera_section` (a
 `measurement_section`, which reads its own files), `nuisance_schema`, `specimen_schema` and
 `solver_schema` define the keys, those of declared classes by reference to these
 (`common.schema_tables.Section`); `editor_schema` describes the keys for editors,
-`key_descriptions` for readers, and `validation_messages` words validation errors. `new_problem`
+`key_descriptions` for readers, and `validation_messages` words validation errors. `new`
 writes the file of a new problem.
 
 Use `Problem` in Python and `Problem.read` for a file.
 """
 
+from .options import Origin, RolloutOptions, UncertaintyOptions
 from .problem import Problem
-from .problem_options import Origin, RolloutOptions, UncertaintyOptions
 
 __all__ = ["Origin", "Problem", "RolloutOptions", "UncertaintyOptions"]

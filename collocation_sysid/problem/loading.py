@@ -35,9 +35,8 @@ from ..statistics.misspecification.plausibility import SIZES_M, size_and_density
 from .code_loader import CodeLoader
 from .density_guesses import with_declared_densities, with_guessed_densities
 from .named_files import existing_file
-from .problem_options import Origin, RolloutOptions, UncertaintyOptions
-from .problem_reading import read_problem_file
-from .problem_size import Say, Size, announce_reading, require_feasible
+from .options import Origin, RolloutOptions, UncertaintyOptions
+from .reading import read_problem_file
 from .recording_reader import RecordingReader
 from .recording_schema import LOADS
 from .schema import (
@@ -48,6 +47,7 @@ from .schema import (
     ProblemFile,
     RegionSection,
 )
+from .size import Say, Size, announce_reading, require_feasible
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
 

@@ -30,8 +30,8 @@ from .named_files import existing_file
 ENTRY_POINTS = "collocation_sysid.measurements"
 # The same of the features of this package, which it imports when a table is read.
 OWN_TABLES = {
-    "image_tracks": "collocation_sysid.features.image_tracks.tracks_table:ImageTracksSection",
-    "outlines": "collocation_sysid.features.outlines.outlines_table:OutlinesSection",
+    "image_tracks": "collocation_sysid.features.image_tracks.table:ImageTracksSection",
+    "outlines": "collocation_sysid.features.outlines.table:OutlinesSection",
 }
 
 

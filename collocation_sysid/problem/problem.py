@@ -29,7 +29,7 @@ from ..recording import Experiment
 from ..recording.impact_steps import impact_steps
 from ..statistics.misspecification.plausibility import size_and_density_hypotheses
 from ..statistics.scale_identifiability import scale_concerns, static_concerns
-from .problem_options import Origin, RolloutOptions, UncertaintyOptions
+from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
 def _unconverted(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:

@@ -42,7 +42,7 @@ from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.time_tables import is_within_experiment
-from ..statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
+from ..statistics.misspecification.modes import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
 from .marker_tracking import (
@@ -54,7 +54,6 @@ from .marker_tracking import (
 from .measurement_section import RecordingFolder
 from .named_files import existing_file
 from .nuisance_schema import nuisance_from_section
-from .problem_size import MOST_SAMPLES, Say, Size, require_feasible
 from .recording_frames import RecordingFrames
 from .recording_schema import (
     LOADS,
@@ -66,6 +65,7 @@ from .recording_schema import (
     ReadingSection,
     TableSection,
 )
+from .size import MOST_SAMPLES, Say, Size, require_feasible
 
 Moved = GraspSection | ObstacleSection
 

@@ -29,7 +29,7 @@ from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
 from ..statistics.budget.systematic_effects import Assumptions, ExactIfNone
-from .problem_options import RolloutOptions, UncertaintyOptions
+from .options import RolloutOptions, UncertaintyOptions
 from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
 from .specimen_schema import SpecimenSection

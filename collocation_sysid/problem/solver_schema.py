@@ -20,7 +20,7 @@ from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
 from ..methods.comparison.penalty import AugmentedLagrangian, Penalty
 from ..methods.comparison.shooting import Shooting
 from ..methods.interior_point import InteriorPoint
-from ..methods.method_options import MethodOptions, method_from_options
+from ..methods.options import MethodOptions, method_from_options
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
 from ..methods.starts.continuation import Continuation

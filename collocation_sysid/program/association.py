@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from ..common.array_types import Array
 from ..fem.body import Body
 from .correspondences import Correspondences
-from .markers.marker_association import MarkerAssociation
+from .markers.association import MarkerAssociation
 
 # The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0

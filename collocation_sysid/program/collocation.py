@@ -15,7 +15,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
 =================  =========================================================================
 
 History variables, reaction forces, their resultants and pressures of obstacles are eliminated. A
-subclass, `lifted.lifted_collocation.LiftedCollocation`, has them as variables at the end of z, with
+subclass, `lifted.collocation.LiftedCollocation`, has them as variables at the end of z, with
 equations at the end of g.
 
 Constraints g, in this order:

@@ -24,7 +24,7 @@ from ..recording.placement import place_markers
 from ..recording.sample_times import TIME_TOLERANCE_S
 from .association import Association
 from .correspondences import CorrespondenceResidual, Correspondences
-from .markers.marker_association import MarkerAssociation
+from .markers.association import MarkerAssociation
 from .measurement_model import MeasurementModel
 from .measurement_residual import (
     GROUP,
@@ -35,7 +35,7 @@ from .measurement_residual import (
     neighbouring_times,
 )
 from .observables import ObservedMotion, PointPositions
-from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
+from .reactions.resultant import ReactionGrid, ReactionResultant
 
 # Grid times around a sample, for positions, velocities and accelerations.
 NEIGHBOURS = 5

@@ -21,7 +21,7 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.internal_variables import AnyHistory
 from .measurement_residual import MeasurementResidual, Observable
 from .observables import ObservedMotion, ReactionForces
-from .reactions.reaction_forces import reaction_vjp, reactions_at
+from .reactions.forces import reaction_vjp, reactions_at
 from .transcription import Transcription
 
 R = TypeVar("R", bound=MeasurementResidual)

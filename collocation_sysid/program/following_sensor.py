@@ -16,7 +16,7 @@ from ..recording.placement import Placement
 from .association import Association
 from .correspondences import Correspondences
 from .custom_sensor_residual import CorrespondingSensorResidual
-from .markers.marker_association import MarkerAssociation
+from .markers.association import MarkerAssociation
 from .measurement_model import CorrespondenceModel
 from .measurement_residual import GROUP, SampledMotion
 from .observables import PointPositions

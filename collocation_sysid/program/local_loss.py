@@ -2,7 +2,7 @@
 
 An observable is local if it depends on few positions at each time, such as the place of a marker.
 Resultants of reactions are not; programs that need their second derivatives lift them, see
-`lifted_resultants`.
+`lifted.resultants`.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from .depth.surface_comparison import SurfaceComparison
 from .experiment_iterate import ExperimentIterate
 from .measurement_residual import SampledMotion
 from .observables import ObservedMotion
-from .reactions.reaction_resultant import ReactionGrid
+from .reactions.resultant import ReactionGrid
 from .simulation import Trajectory
 from .transcription import Transcription
 

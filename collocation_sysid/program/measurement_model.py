@@ -20,7 +20,7 @@ from ..recording.experiment import Experiment
 from .association import Association
 from .correspondences import CorrespondenceResidual, Correspondences
 from .measurement_residual import MeasurementResidual, ResidualExpression
-from .reactions.reaction_resultant import ReactionGrid
+from .reactions.resultant import ReactionGrid
 
 Residual = TypeVar("Residual", bound=CorrespondenceResidual)
 

@@ -12,10 +12,10 @@ from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement
 from .association import Association
 from .custom_sensor_residual import CustomSensorModel
-from .depth.depth_model import DepthModel
+from .depth.model import DepthModel
 from .following_sensor import FollowingSensorModel
-from .markers.marker_association import MarkerAssociation
-from .markers.marker_residual import MarkerModel
+from .markers.association import MarkerAssociation
+from .markers.residual import MarkerModel
 from .measurement_model import CorrespondenceModel, MeasurementModel, MotionGrid
 from .wrench_residual import WrenchModel
 

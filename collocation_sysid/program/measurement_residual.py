@@ -27,7 +27,7 @@ from ..model.generated_functions import GeneratedFunction
 from ..model.nuisance_map import NuisanceMap
 from ..recording.measurement import Measurement
 from .observables import ObservableDerivatives, ObservedMotion, PointPositions, SparseEntries
-from .reactions.reaction_resultant import ReactionGrid, ReactionResultant
+from .reactions.resultant import ReactionGrid, ReactionResultant
 
 # Numbers of a vector [x, y, z], whose residuals share a weight of Huber's loss.
 GROUP = 3

@@ -41,7 +41,7 @@ from .linear_algebra.block_band import (
 from .measurement_model import MeasurementModel, MotionGrid
 from .measurement_models import measurement_models
 from .motion_jacobian import MotionJacobian, shifted_back
-from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
+from .reactions.resultant import ReactionGrid, sensed_dofs
 from .shared_nuisances import NuisanceIndices
 
 T = TypeVar("T", bound=np.generic)

@@ -15,7 +15,7 @@ import numpy as np
 from ..common.array_types import Array
 from .experiment_iterate import ExperimentIterate
 from .observables import ObservedMotion
-from .reactions.reaction_forces import GraspForces, linearised_reactions
+from .reactions.forces import GraspForces, linearised_reactions
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 
 from ..common.array_types import Array, Index
 from ..recording.grasp import Grasp
-from .markers.marker_association import MarkerAssociation, ShapeFunctions
+from .markers.association import MarkerAssociation, ShapeFunctions
 
 
 @dataclass(frozen=True, eq=False)

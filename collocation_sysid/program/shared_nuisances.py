@@ -20,7 +20,7 @@ from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
 from ..recording.nuisance import PLACE, POSE_TURN
 from .association import Association
-from .markers.marker_association import MarkerAssociation
+from .markers.association import MarkerAssociation
 
 # Attributes of a `MarkerAssociation` with one row for each marker.
 OF_MARKERS = (

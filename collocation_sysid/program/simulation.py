@@ -38,13 +38,13 @@ from .forward.newmark import simulate_newmark
 from .forward.newton_solver import NewtonOptions
 from .forward.scheme_simulation import Progress, simulate_scheme
 from .forward.stable_path import BranchChange, find_branch_change
-from .markers.marker_association import MarkerAssociation
+from .markers.association import MarkerAssociation
 from .measurement_model import CorrespondenceModel, MotionGrid
 from .measurement_models import measurement_models
 from .measurement_residual import SampledMotion
 from .observables import ObservedMotion, ReactionForces
-from .reactions.reaction_forces import reactions_at
-from .reactions.reaction_resultant import ReactionGrid, sensed_dofs
+from .reactions.forces import reactions_at
+from .reactions.resultant import ReactionGrid, sensed_dofs
 
 # Name of the integrator that is no collocation scheme.
 NEWMARK = "newmark"

@@ -25,11 +25,11 @@ from .custom_sensor_residual import NEIGHBOURS as GAUGE_NEIGHBOURS
 from .custom_sensor_residual import CustomSensorResidual
 from .forward.newton_solver import NewtonOptions, NewtonSolver
 from .least_squares import SquareRootInformation
-from .markers.marker_residual import NEIGHBOURS, MarkerResidual
+from .markers.residual import NEIGHBOURS, MarkerResidual
 from .measurement_residual import MeasurementResidual
 from .observables import PointPositions
-from .reactions.grasp_reactions import DELAY_STEPS, Sensor
-from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
+from .reactions.grasps import DELAY_STEPS, Sensor
+from .reactions.resultant import TIMES_PER_SAMPLE, ReactionResultant
 from .sweep import Sweep
 from .transcription import Transcription
 from .wrench_residual import WrenchResidual

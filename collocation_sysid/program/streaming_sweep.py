@@ -29,7 +29,7 @@ from .forward.scheme_simulation import RowEquations, extrapolate, solve_row
 from .least_squares import SquareRootInformation
 from .measurement_residual import huber_as_least_squares, lagrange_weights
 from .observables import ObservableDerivatives, ObservedMotion, PointPositions
-from .reactions.grasp_reactions import DELAY_STEPS, GraspReactions
+from .reactions.grasps import DELAY_STEPS, GraspReactions
 from .streaming_model import ROW_TOLERANCE, ROWS_PER_CHUNK, StreamingModel
 from .sweep import (
     FactorisedStep,

@@ -50,7 +50,7 @@ from .linear_algebra.reused_factor import (
     ReusedFactor,
     relative_cost,
 )
-from .reactions.reaction_forces import GraspForces
+from .reactions.forces import GraspForces
 from .stopwatch import Stopwatch
 from .transcription import Transcription
 

@@ -21,7 +21,7 @@ from ..recording.nuisance import TIME
 from .association import Association
 from .correspondences import CorrespondenceResidual
 from .local_loss import LocalLoss
-from .markers.marker_residual import MarkerModel, MarkerResidual
+from .markers.residual import MarkerModel, MarkerResidual
 from .measurement_model import CorrespondenceModel
 from .measurement_residual import MeasurementResidual
 from .motion_transcription import MotionTranscription, RowWeights, WeightedHistory

@@ -2,7 +2,7 @@
 
     ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
 
-where Y is the resultant of the reactions on the grid (`reactions.reaction_resultant`), τ the shift
+where Y is the resultant of the reactions on the grid (`reactions.resultant`), τ the shift
 of the sensor's clock, and ℓ are the cubic weights of the four grid times around the sample. Each
 sample is compared at its own time, however many there are in a step, so that no averaging hides a
 motion.
@@ -32,7 +32,7 @@ from .measurement_residual import (
     neighbouring_times,
 )
 from .observables import ObservedMotion
-from .reactions.reaction_resultant import TIMES_PER_SAMPLE, ReactionResultant
+from .reactions.resultant import TIMES_PER_SAMPLE, ReactionResultant
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
   `hysteresis` compares loading and unloading.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
-displacements, pressures, custom sensors) and the subpackage `formats`; `recording_writers` writes
+displacements, pressures, custom sensors) and the subpackage `formats`; `writers` writes
 them. `alignment`, `sample_times`, `frame_times`, `gap_interpolation` and `rigid_fit` prepare data:
 one time grid, sample times, samples of lost or jittered frames, interpolation between consecutive
 samples, rigid fits. `experiment_refinement` and
@@ -63,9 +63,6 @@ from .obstacle_solids import Sphere as Sphere
 from .pose_files import read_poses as read_poses
 from .poses import PoseSequence as PoseSequence
 from .pressure import Pressure as Pressure
-from .recording_writers import write_gauge_csv as write_gauge_csv
-from .recording_writers import write_markers_csv as write_markers_csv
-from .recording_writers import write_poses_csv as write_poses_csv
 from .rigid_fit import align_to_template as align_to_template
 from .rigid_fit import fit_poses as fit_poses
 from .sample_times import sample_interval_s as sample_interval_s
@@ -73,3 +70,6 @@ from .specimen import Specimen as Specimen
 from .tendon import Tendon as Tendon
 from .time_tables import displaced_axes as displaced_axes
 from .time_tables import read_displacement as read_displacement
+from .writers import write_gauge_csv as write_gauge_csv
+from .writers import write_markers_csv as write_markers_csv
+from .writers import write_poses_csv as write_poses_csv

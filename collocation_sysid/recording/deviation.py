@@ -121,7 +121,7 @@ class Deviation:
         Whether it is never negative, so that a known mean may be stated.
     is_ruler : bool
         Whether it is estimated by one linear step, instead of considered, where the data determine
-        it much better than the budget does, see `uncertainty_budget`.
+        it much better than the budget does, see `budget.variance_sources`.
     is_limited : bool
         Whether data that determine it much better than the budget does limit its size, without
         being corrected for it, because errors of the mesh resemble it.
@@ -134,7 +134,7 @@ class Deviation:
         budget does not contain the deviation, unless that is stated to be exact.
     proportional_to : callable, optional
         Whether the forces as described and those of the alternative are proportional to a constant,
-        by name, see `uncertainty_budget.rescaled`.
+        by name, see `budget.variance_sources.rescaled`.
     key : str
         Key of [experiment.nuisance] in the problem file.
     reference : float or None

@@ -29,9 +29,9 @@ from ..errors import InputError
 from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
 from .measurement import Measurement, checked_ratios, split_sigma
 from .poses import Frame
-from .recording_writers import write_columns_csv
 from .sample_times import first_unordered_time
 from .time_tables import axis_components, without_rounding
+from .writers import write_columns_csv
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Units of the components: three forces and three torques.

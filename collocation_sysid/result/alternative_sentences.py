@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from ..errors import listed
 from ..fem.laws.constants import is_modulus, symbol_of, unit_of
 from ..runs.result_content import Result
-from ..statistics.budget.uncertainty_budget import is_definition
+from ..statistics.budget.variance_sources import is_definition
 from ..statistics.remedies import remedy_for
 
 

@@ -34,7 +34,7 @@ from .figure_style import (
     own_settings,
     style_axes,
 )
-from .pictures.camera_pictures import LEGEND_ENTRY
+from .pictures.cameras import LEGEND_ENTRY
 from .pictures.over_time import rms_over_markers
 from .pictures.projection import ParallelCamera
 from .pictures.scene import (

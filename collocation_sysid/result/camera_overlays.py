@@ -18,7 +18,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..features.measurements import Predictions, surfaces
 from ..model.nuisance_map import NuisanceMap
-from ..program.depth.depth_camera_model import DepthCameraModel
+from ..program.depth.camera_model import DepthCameraModel
 from ..program.depth.surface_comparison import SurfaceComparison
 from ..program.depth.visible_surface import VisibleSurface
 from ..recording.experiment import Experiment
@@ -26,7 +26,7 @@ from ..runs.forward_simulation import ForwardSimulation
 from ..runs.solved_problem import SolvedProblem
 from .figure_style import own_settings
 from .pictures.album import save_pictures, with_unique_names
-from .pictures.camera_pictures import KIND, depth_picture
+from .pictures.cameras import KIND, depth_picture
 from .pictures.projection import ParallelCamera
 from .replay import image_unit
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..common.display import Line, Shown, Table, duration, labelled, quantity
 from ..fem.laws.constants import symbol_of, unit_of
 from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
-from ..runs.check.body_check import grasp_sentence
+from ..runs.check.body import grasp_sentence
 from ..runs.check.cost import MethodCost
 from .run_sections import remedy_command
 

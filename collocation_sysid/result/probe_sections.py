@@ -8,9 +8,9 @@ from ..common.display import Table, TitledParts, short
 from ..errors import listed
 from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
-from ..statistics.budget.uncertainty_budget import source_label
+from ..statistics.budget.variance_sources import source_label
 from ..statistics.probes.relaxed_assumptions import EstimateChange, Probe, assumption_name
-from ..statistics.probes.routine_probes import is_possible
+from ..statistics.probes.routine import is_possible
 from ..statistics.thresholds import SIGNIFICANT_ALONE
 
 # Measures of stiffness, the most important first.

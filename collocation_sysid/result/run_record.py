@@ -24,8 +24,8 @@ from ..common.serialisation import as_json
 from ..errors import InputError
 from ..features.contact.feature import contact_fields
 from ..features.measurements import recorded_series
-from ..features.outlines.outline_residual import OutlinesResidual
 from ..features.outlines.outlines import edge_pixels
+from ..features.outlines.residual import OutlinesResidual
 from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation

@@ -28,8 +28,8 @@ from ..statistics.budget.discretisation_error import (
     Refinement,
     RefinementLevel,
 )
-from ..statistics.budget.uncertainty_budget import MESH
-from ..statistics.budget.uncertainty_budget import NUMERICAL as DISCRETISATION
+from ..statistics.budget.variance_sources import MESH
+from ..statistics.budget.variance_sources import NUMERICAL as DISCRETISATION
 from ..statistics.estimates import Estimate
 from .replay import damaged_run_refused
 from .run_record import REFINEMENT_FILE

@@ -37,7 +37,7 @@ from ..fem.laws.constants import symbol_of, unit_of
 from ..recording.deviation import in_readable_unit
 from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment
-from ..statistics.budget.uncertainty_budget import main_sources, source_label
+from ..statistics.budget.variance_sources import main_sources, source_label
 from ..statistics.concerns import Concern, topics_of
 from ..statistics.remedies import remedy_for
 from .alternative_sentences import alternative_sentences, origin_sentences

@@ -24,7 +24,7 @@ from ..fem.laws.constants import (
 )
 from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
-from ..statistics.budget.uncertainty_budget import source_label
+from ..statistics.budget.variance_sources import source_label
 from ..statistics.combinations import precision_text
 from ..statistics.remedies import remedy_for
 from .alternative_sentences import alternative_sentences

@@ -32,7 +32,7 @@ from ..problem.bench_files import (
     has_displacement_table,
     table_name,
 )
-from ..problem.problem_reading import parse_toml
+from ..problem.reading import parse_toml
 from ..problem.recording_reader import by_marker
 from ..problem.recording_schema import ExperimentSection, ForceSensorSection
 from ..problem.schema import ProblemFile
@@ -40,8 +40,8 @@ from ..problem.specimen_reader import layout_from_section
 from ..problem.specimen_schema import SpecimenSection
 from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import Experiment, write_gauge_csv, write_markers_csv, write_poses_csv
-from ..recording.recording_writers import write_columns_csv
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
+from ..recording.writers import write_columns_csv
 from ..statistics.stability_concerns import branch_concern
 from .run_writers import (
     FRAMES_FILE,

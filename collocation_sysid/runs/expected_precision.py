@@ -38,7 +38,7 @@ from ..statistics.budget.consider_analysis import (
     prescribes_no_motion,
 )
 from ..statistics.budget.systematic_effects import CORRELATION_KEY
-from ..statistics.budget.uncertainty_budget import VarianceSources
+from ..statistics.budget.variance_sources import VarianceSources
 from ..statistics.combinations import (
     WIDE,
     Combination,

@@ -22,7 +22,7 @@ from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_change
 from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
-from .check.body_check import LINEAR, bending_concerns, slenderness
+from .check.body import LINEAR, bending_concerns, slenderness
 
 # Value of `RefinementLevel.refined` of a solve on a finer mesh.
 MESH = "mesh"

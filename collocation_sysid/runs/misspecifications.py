@@ -6,11 +6,8 @@ from collections.abc import Sequence
 
 from ..features.registry import FEATURES
 from ..methods.solution import Solution
-from ..statistics.misspecification.fit_misspecifications import (
-    measurements_miss,
-    motion_misspecifications,
-)
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ..statistics.misspecification.hypothesis import Hypothesis, rank
+from ..statistics.misspecification.refits import measurements_miss, motion_misspecifications
 
 # Note on tests of hypotheses without a result.
 NO_CAUSE = "possible causes of the misfit were tested: none explains it"

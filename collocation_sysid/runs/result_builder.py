@@ -27,7 +27,7 @@ from ..features.measurements import prediction_error, stated_sigmas, units_by_na
 from ..fem.laws.constants import GAMMA_R
 from ..methods.solution import pooled_wrench_rms
 from ..methods.starts.stiffness_scan import ScanSummary
-from ..model.contact.contact_summary import friction_summaries
+from ..model.contact.summary import friction_summaries
 from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate

@@ -25,7 +25,7 @@ from ..statistics.combinations import Combination, Direction
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.remedies import remedy_for
-from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
+from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import ScaleReference
 from ..statistics.uncertainty import MarkerPlace
 
@@ -46,7 +46,7 @@ class ReportedEstimate(Estimate):
     # The optimum of the discretised problem, without the correction; None in a study's summary.
     optimum: float | None = None
     # Standard deviation of the systematic effects in the coordinate of the estimate, see
-    # `statistics.budget.uncertainty_budget`.
+    # `statistics.budget.variance_sources`.
     systematic: float | None = None
     # Correction for known effects, such as the compliance of a machine, in the coordinate of the
     # estimate; None if there is none.

@@ -27,7 +27,7 @@ from ..statistics.budget.alternatives import (
 )
 from ..statistics.budget.combined_intervals import combine
 from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
-from ..statistics.budget.uncertainty_budget import (
+from ..statistics.budget.variance_sources import (
     MESH,
     NUMERICAL,
     BudgetLine,
@@ -47,14 +47,14 @@ from ..statistics.estimates import Estimate, relative_derivatives
 from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli, LinearisedFit
-from ..statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ..statistics.misspecification.hypothesis import Hypothesis
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.probes.profile_likelihood import Profile
 from ..statistics.probes.relaxed_assumptions import Probe
-from ..statistics.residuals.residual_diagnostics import MarkerDiagnosis
+from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
 from .check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
-from .check.modes_check import ModesCheck
+from .check.modes import ModesCheck
 from .ensemble import draw_samples
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes

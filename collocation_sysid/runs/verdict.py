@@ -41,12 +41,12 @@ from ..statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
 )
-from ..statistics.misspecification.track_misspecifications import copied_measurements
+from ..statistics.misspecification.tracks import copied_measurements
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
-from .check.modes_check import ModesCheck, check_modes
+from .check.modes import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation
 from .prediction import fit_misfits
 

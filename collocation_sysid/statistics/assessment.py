@@ -26,17 +26,17 @@ from ..recording.impact_steps import impact_steps
 from ..recording.rotation_per_step import WARNING_ANGLE_RAD, fastest_rotation
 from .budget.discretisation_error import Refinement
 from .budget.systematic_effects import DEVIATIONS
-from .budget.uncertainty_budget import source_label
+from .budget.variance_sources import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name, limitless_shares
 from .instrument_misfit import InstrumentMisfit
-from .misspecification.misspecification_hypothesis import Hypothesis
+from .misspecification.hypothesis import Hypothesis
 from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
-from .probes.routine_probes import is_alarming, is_routine_assumption
+from .probes.routine import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import Dependence
+from .residuals.diagnostics import MOST_WILD
 from .residuals.noise_level import NoiseLevel
-from .residuals.residual_diagnostics import MOST_WILD
 from .thresholds import (
     ABSURD,
     AS_GOOD_AS_CERTAIN,

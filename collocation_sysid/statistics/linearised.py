@@ -32,7 +32,7 @@ from ..program.least_squares import SquareRootInformation
 from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.measurement_residual import huber_as_weights
 from ..program.observable_response import ObservableResponse
-from ..program.reactions.reaction_forces import GraspForces
+from ..program.reactions.forces import GraspForces
 from ..program.sweep import Sweep
 
 

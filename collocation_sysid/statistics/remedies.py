@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from .budget.systematic_effects import DEVIATIONS
-from .budget.uncertainty_budget import BETWEEN, MESH, NOISE, NUISANCES, NUMERICAL
+from .budget.variance_sources import BETWEEN, MESH, NOISE, NUISANCES, NUMERICAL
 
 LAW = "law"
 

@@ -55,6 +55,7 @@ from .residuals.autocorrelation import (
     error_processes,
     score_covariance,
 )
+from .residuals.diagnostics import Outlier, remove_outliers
 from .residuals.noise_level import (
     Noise,
     NoiseLevel,
@@ -68,7 +69,6 @@ from .residuals.recording_scatter import (
     compare_recordings,
     single_fits,
 )
-from .residuals.residual_diagnostics import Outlier, remove_outliers
 
 Errors = Literal["independent", "autocorrelated"]
 

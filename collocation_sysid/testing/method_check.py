@@ -15,7 +15,7 @@ from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..fem.meshes.structured import box_mesh
-from ..methods.method_options import method_from_options
+from ..methods.options import method_from_options
 from ..methods.solution import Iteration, Method, Solution
 from ..model.parameters import Parameters, Unknown
 from ..program.collocation import Collocation

@@ -16,7 +16,7 @@ from ..model.nuisance_map import NuisanceMap
 from ..problem.code_loader import CodeLoader
 from ..problem.nuisance_schema import CustomNuisanceSection
 from ..program.collocation import Collocation
-from ..program.markers.marker_residual import MarkerResidual
+from ..program.markers.residual import MarkerResidual
 from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
 from ..recording.nuisance import KINDS, Nuisance

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..program.collocation import Collocation
-from ..program.lifted.lifted_collocation import with_lifted_variables
+from ..program.lifted.collocation import with_lifted_variables
 from .property_check import PropertyCheck
 from .small_problems import shaken_variables
 

@@ -15,7 +15,7 @@ from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
 from ..model.parameters import Parameters, Unknown
 from ..program.collocation import Collocation
-from ..program.lifted.lifted_collocation import lifted_variables
+from ..program.lifted.collocation import lifted_variables
 from ..recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
 # A soft foam: stiffness [Pa], Poisson's ratio and density [kg/m³] of the bodies.

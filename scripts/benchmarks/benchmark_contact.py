@@ -17,7 +17,7 @@ import numpy as np
 from script_arguments import make_parser
 
 import collocation_sysid as cs
-from collocation_sysid.model.contact.contact_force import contact_terms
+from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.sweep import Sweep

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from script_arguments import make_parser
 
+from collocation_sysid.fem.meshes.checks import orient_elements
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.fem.meshes.mesh_checks import orient_elements
 
 FILE = Path(__file__).parents[2] / "problems" / "phantom_compression" / "eighth.vtu"
 # Number of wedges over the quarter circle.

@@ -17,7 +17,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import cylinder_of_edge
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.new_problem import TEMPLATES
+from collocation_sysid.problem.new import TEMPLATES
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import (
     Experiment,

@@ -16,7 +16,7 @@ from collocation_sysid.extras.studies import (
     plan_comparison,
     run_all,
 )
-from collocation_sysid.extras.studies.study_rows import Row, SuccessCriterion, run_row
+from collocation_sysid.extras.studies.rows import Row, SuccessCriterion, run_row
 from collocation_sysid.problem import Problem
 
 # True parameters of the cylinder of the studies.

@@ -25,7 +25,7 @@ from scipy.stats import t as student
 
 import collocation_sysid as cs
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.contact.contact_force import contact_terms
+from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.recording.obstacle_solids import Solid
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
 

@@ -24,7 +24,7 @@ from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
-from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources
+from collocation_sysid.statistics.budget.variance_sources import VarianceSources
 from collocation_sysid.statistics.linearised import gauss_newton_step
 
 SIDE_M, DROP_M, DURATION_S, SIGMA_M = 0.1, 0.15, 0.4, 1e-3

@@ -49,11 +49,7 @@ from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_assumptions,
 )
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.budget.uncertainty_budget import (
-    BudgetLine,
-    VarianceSources,
-    budget,
-)
+from collocation_sysid.statistics.budget.variance_sources import BudgetLine, VarianceSources, budget
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import Uncertainty

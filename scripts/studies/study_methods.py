@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from studies import TRUTH, Variant, markdown, number, run_variants, save, worst_error
 from synthetic import swing
 
-from collocation_sysid.extras.studies.study_rows import Row, wilson_interval
+from collocation_sysid.extras.studies.rows import Row, wilson_interval
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import write_poses_csv

@@ -34,10 +34,7 @@ from collocation_sysid.methods.starts.initial_trajectories import initial_variab
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    rank,
-)
+from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis, rank
 
 # Seed of the random choices of a mistake, such as which markers are exchanged.
 FAULT_SEED = 3

@@ -28,7 +28,7 @@ from collocation_sysid.program.collocation import ExperimentIterate
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import identifiability_sentences
 from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
-from collocation_sysid.statistics.residuals.residual_diagnostics import diagnose_markers
+from collocation_sysid.statistics.residuals.diagnostics import diagnose_markers
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 
 TRIALS = ("gravity", "load52", "load101")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, number, run_variants, save
 
-from collocation_sysid.extras.studies.study_rows import Row
+from collocation_sysid.extras.studies.rows import Row
 
 PROBLEM = Path(__file__).parents[2] / "problems" / "table1" / "problem_scheme.toml"
 # Options of methods: inner Levenberg–Marquardt solver.

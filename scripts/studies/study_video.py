@@ -22,7 +22,7 @@ from make_templates import VIDEO_IMAGES, VIDEO_POINTS, write_poses_csv
 from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
-from collocation_sysid.problem.new_problem import create_problem
+from collocation_sysid.problem.new import create_problem
 
 NAMES = tuple(rendered_video.EYES_M)
 DURATION_S = VIDEO_IMAGES / 60

@@ -62,7 +62,7 @@ from collocation_sysid.cli import problem_commands
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.export import TARGETS
 from collocation_sysid.extras.planning import motion_plan
-from collocation_sysid.features.image_tracks.track_files import TrackFile, read_tracks
+from collocation_sysid.features.image_tracks.files import TrackFile, read_tracks
 from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem

@@ -39,7 +39,7 @@ from collocation_sysid import cli, pipeline
 from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sources, common
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration, Status
-from collocation_sysid.problem.problem_reading import read_problem_file
+from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.environment import usual_air_density

@@ -19,14 +19,10 @@ from rich.console import Console
 
 from collocation_sysid.cli import study_commands
 from collocation_sysid.common.serialisation import as_json
+from collocation_sysid.extras.studies import progress as display
 from collocation_sysid.extras.studies import run_execution
-from collocation_sysid.extras.studies import study_progress as display
-from collocation_sysid.extras.studies.study_plots import sweep_plots
-from collocation_sysid.extras.studies.study_progress import (
-    FIT_FACTOR,
-    RUN_START_S,
-    expected_study_s,
-)
+from collocation_sysid.extras.studies.plots import sweep_plots
+from collocation_sysid.extras.studies.progress import FIT_FACTOR, RUN_START_S, expected_study_s
 from collocation_sysid.methods.solution import Iteration
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]

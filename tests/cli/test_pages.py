@@ -21,13 +21,13 @@ from collocation_sysid.common.display import Table, plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url
 from collocation_sysid.fem.laws.constants import KNOWN, constants_with_symbol
 from collocation_sysid.problem.key_descriptions import all_keys, find_keys
-from collocation_sysid.problem.new_problem import create_problem
+from collocation_sysid.problem.new import create_problem
 from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.budget.uncertainty_budget import source_label
+from collocation_sysid.statistics.budget.variance_sources import source_label
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 from collocation_sysid.statistics.remedies import REMEDIES
 

@@ -14,13 +14,8 @@ from kit.problem_files import contents, run_command
 
 from collocation_sysid.common.written_files import list_files
 from collocation_sysid.errors import InputError
-from collocation_sysid.extras.benchmark import (
-    BODIES,
-    Score,
-    benchmark_bodies,
-    score_benchmark,
-    write_benchmark,
-)
+from collocation_sysid.extras.benchmark import BODIES, Score, score_benchmark, write_benchmark
+from collocation_sysid.extras.benchmark import bodies as benchmark_bodies
 from collocation_sysid.fem.meshes.mesh import TetMesh
 
 RUBBER = "isoprene_rubber"

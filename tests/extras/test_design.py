@@ -17,17 +17,12 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.extras.design import (
-    DesignCriterion,
-    DesignOptions,
-    HandMotion,
-    Limits,
-    motion_design,
-)
-from collocation_sysid.extras.design.design_folder import PROBLEM_FILE, write_design
+from collocation_sysid.extras.design import DesignCriterion, DesignOptions, HandMotion, Limits
+from collocation_sysid.extras.design import motion as motion_design
 from collocation_sysid.extras.design.evolution_search import minimise
+from collocation_sysid.extras.design.folder import PROBLEM_FILE, write_design
 from collocation_sysid.extras.design.hand_motion import angular_motion
-from collocation_sysid.extras.design.motion_design import MotionObjective, design_motion
+from collocation_sysid.extras.design.motion import MotionObjective, design_motion
 from collocation_sysid.extras.design.predicted_information import (
     FutureRecording,
     LinearRecording,
@@ -36,7 +31,7 @@ from collocation_sysid.extras.design.predicted_information import (
     shared_information,
     symmetric_draws,
 )
-from collocation_sysid.extras.studies.study_progress import DesignProgress
+from collocation_sysid.extras.studies.progress import DesignProgress
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation

@@ -32,9 +32,9 @@ from collocation_sysid.extras.export import (
     write_ensemble,
     write_export,
 )
-from collocation_sysid.extras.export.export_target import equilibria
 from collocation_sysid.extras.export.identified import without_obstacles
 from collocation_sysid.extras.export.obstacle_shapes import Facets, faceted_obstacles
+from collocation_sysid.extras.export.target import equilibria
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.fibres import Fibres
 from collocation_sysid.fem.meshes.structured import box_mesh

@@ -14,7 +14,7 @@ from kit.problems import nodes_where
 import collocation_sysid as cs
 from collocation_sysid.extras.live import estimator
 from collocation_sysid.extras.live.estimator import LiveEstimator
-from collocation_sysid.extras.live.live_model import model_from_problem
+from collocation_sysid.extras.live.model import model_from_problem
 
 TRUTH = {"young_pa": 1e4, "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.3}
 UNKNOWN = {"young_pa": cs.Unknown(8e3), "gamma_r_s": cs.Unknown(0.015)}

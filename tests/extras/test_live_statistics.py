@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from collocation_sysid.extras.live.live_trust import ResidualScatter, variance_factor
+from collocation_sysid.extras.live.trust import ResidualScatter, variance_factor
 from collocation_sysid.program.least_squares import SquareRootInformation
 
 WAVE = 2.0 * np.cos(np.pi / 4 * np.arange(33))

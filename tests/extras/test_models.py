@@ -39,14 +39,14 @@ from collocation_sysid.extras.studies.model_variants import (
     parse_materials,
     variants,
 )
-from collocation_sysid.extras.studies.study_page import model_views
+from collocation_sysid.extras.studies.page import model_views
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import usual_value
 from collocation_sysid.fem.laws.materials import MATERIALS
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.new_problem import create_problem
+from collocation_sysid.problem.new import create_problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.recording import Experiment, Markers, Wrench, write_poses_csv

@@ -22,18 +22,18 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import durations, motion_plan, reduced_solver
+from collocation_sysid.extras.planning.folder import (
+    command_times_s,
+    plan_json,
+    plan_summary,
+    write_plan,
+)
 from collocation_sysid.extras.planning.full_program import (
     FullProgram,
     iteration_monitor,
     solve_full,
 )
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
-from collocation_sysid.extras.planning.plan_folder import (
-    command_times_s,
-    plan_json,
-    plan_summary,
-    write_plan,
-)
 from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
 from collocation_sysid.extras.planning.reduced_solver import ReducedTolerances, solve_reduced

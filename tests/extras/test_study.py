@@ -26,14 +26,10 @@ from collocation_sysid.extras.studies import (
     run_execution,
     run_worker,
 )
-from collocation_sysid.extras.studies.study_arguments import (
-    parse_methods,
-    parse_varied_keys,
-    read_truth,
-)
-from collocation_sysid.extras.studies.study_planning import shortened_keys
-from collocation_sysid.extras.studies.study_progress import remaining_time_s
-from collocation_sysid.extras.studies.study_rows import (
+from collocation_sysid.extras.studies.arguments import parse_methods, parse_varied_keys, read_truth
+from collocation_sysid.extras.studies.planning import shortened_keys
+from collocation_sysid.extras.studies.progress import remaining_time_s
+from collocation_sysid.extras.studies.rows import (
     SuccessCriterion,
     method_rows,
     run_row,

@@ -37,11 +37,7 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.budget.uncertainty_budget import (
-    BudgetLine,
-    VarianceSources,
-    budget,
-)
+from collocation_sysid.statistics.budget.variance_sources import BudgetLine, VarianceSources, budget
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
 

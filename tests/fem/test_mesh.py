@@ -16,7 +16,7 @@ import pytest
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import EDGES
-from collocation_sysid.fem.meshes import mesh_files
+from collocation_sysid.fem.meshes import files as mesh_files
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Named
 from collocation_sysid.fem.meshes.structured import box_mesh

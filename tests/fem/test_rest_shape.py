@@ -29,7 +29,7 @@ from collocation_sysid.fem.meshes.selection import Indices
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.model.parameters import Unknown
-from collocation_sysid.problem.problem_options import UncertaintyOptions
+from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate

@@ -10,8 +10,8 @@ import pytest
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes import surface
+from collocation_sysid.fem.meshes.files import read_triangles
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.fem.meshes.mesh_files import read_triangles
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.meshes.surface import merge_coincident, tetrahedralize_surface
 

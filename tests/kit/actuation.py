@@ -7,8 +7,8 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import spsolve
 
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.checks import orient_elements
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.fem.meshes.mesh_checks import orient_elements
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.shape import EnclosedVolume
 

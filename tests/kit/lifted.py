@@ -10,10 +10,7 @@ import numpy as np
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import (
-    LiftedCollocation,
-    with_lifted_variables,
-)
+from collocation_sysid.program.lifted.collocation import LiftedCollocation, with_lifted_variables
 from collocation_sysid.recording import Experiment
 from kit.memories import ONE
 from kit.problems import box, hung_cube, measured_with

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.program.modes.natural_modes import Modes, natural_modes
+from collocation_sysid.program.modes.natural import Modes, natural_modes
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from kit.problems import EDGE_M, hung_cube, nodes_where, vertex_markers

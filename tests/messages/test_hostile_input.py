@@ -33,7 +33,8 @@ from collocation_sysid.fem.meshes.structured import (
     count_cylinder_elements,
     cylinder_of_edge,
 )
-from collocation_sysid.problem import Problem, loading, problem_size
+from collocation_sysid.problem import Problem, loading
+from collocation_sysid.problem import size as problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.formats.depth_files import read_depth
 from collocation_sysid.recording.formats.text import read_bytes

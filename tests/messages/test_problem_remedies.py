@@ -15,7 +15,7 @@ from kit.depth import MATRIX, POSE
 from kit.problem_files import replace_text, write_problem
 
 import collocation_sysid as cs
-from collocation_sysid.problem.new_problem import create_problem
+from collocation_sysid.problem.new import create_problem
 
 MOST_STEPS = 3
 # What a person knows who follows a remedy that asks for it.

@@ -14,7 +14,7 @@ import collocation_sysid as cs
 from collocation_sysid.methods.complementarity import RELAXED
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.model.contact.contact_force import contact_terms
+from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.forward_simulation import ForwardSimulation, simulate_experiment
 

@@ -20,7 +20,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.lifted.collocation import with_lifted_variables
 from collocation_sysid.recording import Experiment, Nuisance
 
 DEFAULT, ON_TIME = Nuisance(), Nuisance(time_shift_s=None)

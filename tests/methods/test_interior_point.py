@@ -47,7 +47,7 @@ from collocation_sysid.model.parameters import Parameter, Parameters, Unknown
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, convert_variables
-from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.lifted.collocation import with_lifted_variables
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Markers, Nuisance
 from collocation_sysid.runs.warm_start import WarmStart

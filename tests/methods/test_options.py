@@ -12,7 +12,7 @@ from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.comparison.penalty import Penalty
-from collocation_sysid.methods.method_options import method_from_options
+from collocation_sysid.methods.options import method_from_options
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.starts.continuation import Continuation
 from collocation_sysid.program.collocation import Collocation

@@ -14,9 +14,9 @@ from kit.problems import GUESS, hung_cube
 from collocation_sysid.model.recursion import Recursion, RecursionTrajectory
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.experiment_iterate import ExperimentIterate
+from collocation_sysid.program.lifted.collocation import LiftedCollocation
 from collocation_sysid.program.lifted.expression_patterns import ExpressionPattern, PatternIndices
-from collocation_sysid.program.lifted.lifted_collocation import LiftedCollocation
-from collocation_sysid.program.lifted.lifted_variables import LiftedVariables
+from collocation_sysid.program.lifted.variables import LiftedVariables
 from collocation_sysid.program.motion_transcription import Offsets
 
 CORNERS = np.array([[0, 3], [1, 5], [2, 4]])

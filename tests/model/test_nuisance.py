@@ -29,7 +29,7 @@ from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.markers.marker_association import MarkerAssociation
+from collocation_sysid.program.markers.association import MarkerAssociation
 from collocation_sysid.program.measurement_models import first_association
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence

@@ -21,7 +21,7 @@ from collocation_sysid.fem.meshes.mesh import ElementNodes
 from collocation_sysid.fem.meshes.selection import Face
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.new_problem import TEMPLATES, create_problem
+from collocation_sysid.problem.new import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
 from collocation_sysid.recording.formats.units import si_factor
@@ -30,13 +30,9 @@ from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.result.synthesis import write_data
-from collocation_sysid.statistics.misspecification.fit_misspecifications import _unloading
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
-    corrected_hypothesis,
-)
-from collocation_sysid.statistics.misspecification.modal_misspecifications import (
-    find_misspecifications_by_modes,
-)
+from collocation_sysid.statistics.misspecification.hypothesis import corrected_hypothesis
+from collocation_sysid.statistics.misspecification.modes import find_misspecifications_by_modes
+from collocation_sysid.statistics.misspecification.refits import _unloading
 
 TIMES = [0.0, 0.1, 0.2]
 PRESSED_MM = [0.0, 0.25, 0.5]

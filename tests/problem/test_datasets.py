@@ -14,7 +14,7 @@ import pytest
 from kit.problem_files import run_command
 
 import collocation_sysid as cs
-from collocation_sysid.datasets.dataset_files import copy_dataset
+from collocation_sysid.datasets.files import copy_dataset
 from collocation_sysid.recording.homogeneous_deformation import DEFORMATIONS
 
 ROOT = Path(__file__).parents[2]

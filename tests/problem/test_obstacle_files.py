@@ -13,8 +13,8 @@ from kit.problems import TRUTH, as_theta, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.contact.contact_force import contact_terms
-from collocation_sysid.model.contact.contact_summary import surface_gaps_and_pressures
+from collocation_sysid.model.contact.force import contact_terms
+from collocation_sysid.model.contact.summary import surface_gaps_and_pressures
 from collocation_sysid.model.force_term import States
 from collocation_sysid.recording import write_markers_csv, write_poses_csv, write_wrench_csv
 from collocation_sysid.result.pictures.shapes import obstacle_pictures

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from collocation_sysid.errors import InputError
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, write_markers_csv
-from collocation_sysid.statistics.misspecification.modal_misspecifications import (
+from collocation_sysid.statistics.misspecification.modes import (
     FRAME_CAUSES,
     find_misspecifications_by_modes,
 )

@@ -11,7 +11,7 @@ from collocation_sysid.common.declarations import keys_of
 from collocation_sysid.common.schema_tables import Section
 from collocation_sysid.model.parameters import PARAMETER_KEYS
 from collocation_sysid.problem import recording_schema, schema
-from collocation_sysid.problem.problem_options import RolloutOptions, UncertaintyOptions
+from collocation_sysid.problem.options import RolloutOptions, UncertaintyOptions
 from collocation_sysid.recording.obstacle_solids import KINDS, SolidSection
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 

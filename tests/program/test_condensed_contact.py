@@ -9,7 +9,7 @@ import pytest
 from benchmark_contact import TRUTH, pressed_cube
 from kit.problems import EDGE_M, IDEAL, box, vertex_markers
 
-from collocation_sysid.model.contact.contact_force import contact_terms
+from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.forward import condensed_steps, newton_solver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme

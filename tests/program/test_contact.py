@@ -15,8 +15,8 @@ from study_contact import cylinder, sphere, sphere_on_half_space
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.model.contact.contact_force import contact_terms
-from collocation_sysid.model.contact.contact_summary import friction_summaries
+from collocation_sysid.model.contact.force import contact_terms
+from collocation_sysid.model.contact.summary import friction_summaries
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces

@@ -12,7 +12,7 @@ from kit.pokes import poked
 from kit.problems import EDGE_M, box
 
 import collocation_sysid as cs
-from collocation_sysid.model.contact.contact_force import contact_terms
+from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.recording import Experiment, Obstacle, Plane
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals

@@ -31,8 +31,8 @@ from PIL import Image
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance_map import NuisanceMap
-from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
-from collocation_sysid.program.depth.depth_comparison import camera_residuals
+from collocation_sysid.program.depth.camera_model import DepthCameraModel
+from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.formats.depth_files import read_depth

@@ -8,7 +8,7 @@ import collocation_sysid as cs
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth import camera_alignment
 from collocation_sysid.program.depth.camera_alignment import SLIDING, _alignment_steps
-from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.camera_model import DepthCameraModel
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 
 

@@ -9,7 +9,7 @@ from kit.depth import MATRIX, NOISE_M, SHAPE, looking
 
 import collocation_sysid as cs
 from collocation_sysid.model.nuisance_map import NuisanceMap
-from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
+from collocation_sysid.program.depth.camera_model import DepthCameraModel
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 

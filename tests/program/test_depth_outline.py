@@ -18,8 +18,8 @@ from collocation_sysid.features.cameras.feature import camera_pose_concerns, out
 from collocation_sysid.methods.starts.stiffness_scan import other_starts
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.depth.depth_camera_model import DepthCameraModel
-from collocation_sysid.program.depth.depth_outline import no_depth_is_empty
+from collocation_sysid.program.depth.camera_model import DepthCameraModel
+from collocation_sysid.program.depth.outline import no_depth_is_empty
 from collocation_sysid.program.depth.outline_residual import OutlineResidual
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.program.depth.visible_surface import VisibleSurface

@@ -29,14 +29,14 @@ from kit.filmed import (
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
+from collocation_sysid.features.image_tracks.feature import notes
 from collocation_sysid.features.image_tracks.rays import (
     is_behind,
     is_occluded,
     points_on_surface,
     poses_from_points,
 )
-from collocation_sysid.features.image_tracks.track_feature import notes
-from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
+from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
 from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.observables import ObservableDerivatives
 

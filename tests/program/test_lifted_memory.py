@@ -15,7 +15,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.collocation import Collocation, convert_variables
-from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.lifted.collocation import with_lifted_variables
 
 
 def fitted(branches: int, steps: int, noise_m: float = 0.0) -> Collocation:

@@ -22,7 +22,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.methods.starts.continuation import Continuation
 from collocation_sysid.program.collocation import Collocation, convert_variables
-from collocation_sysid.program.lifted.lifted_collocation import lifted_count
+from collocation_sysid.program.lifted.collocation import lifted_count
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance

@@ -16,7 +16,7 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.modes.modal_prediction import oscillator_responses
-from collocation_sysid.program.modes.natural_modes import Modes, natural_modes
+from collocation_sysid.program.modes.natural import Modes, natural_modes
 
 ELASTIC = np.array([200.0, 300.0, 0.0, 0.0])
 DENSITY = 30.0

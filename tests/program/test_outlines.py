@@ -28,10 +28,10 @@ from kit.silhouettes import (
 from PIL import Image
 
 import collocation_sysid as cs
+from collocation_sysid.features.outlines.feature import hypotheses
 from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
-from collocation_sysid.features.outlines.outline_feature import hypotheses
-from collocation_sysid.features.outlines.outline_residual import OutlinesResidual
 from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
+from collocation_sysid.features.outlines.residual import OutlinesResidual
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.observables import ObservableDerivatives
 from collocation_sysid.result.pictures.album import experiment_pictures
@@ -67,7 +67,7 @@ def test_the_distance_is_that_of_a_shifted_outline() -> None:
 def residual_of_pairs(residual: OutlinesResidual, pairs: Any) -> OutlinesResidual:
     from dataclasses import replace
 
-    from collocation_sysid.features.outlines.outline_residual import compared
+    from collocation_sysid.features.outlines.residual import compared
 
     return replace(
         residual, correspondences=pairs, is_compared=compared(pairs, residual.observable_s)

@@ -55,10 +55,7 @@ from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import (
-    LiftedCollocation,
-    with_lifted_variables,
-)
+from collocation_sysid.program.lifted.collocation import LiftedCollocation, with_lifted_variables
 from collocation_sysid.program.sweep import Sweep
 from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
 

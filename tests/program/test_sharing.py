@@ -29,7 +29,7 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.lifted.collocation import with_lifted_variables
 from collocation_sysid.recording import Experiment, Markers, Nuisance
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
 

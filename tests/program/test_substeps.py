@@ -10,7 +10,7 @@ import pytest
 from kit.problems import TRUTH, hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.extras.live.live_model import model_from_problem
+from collocation_sysid.extras.live.model import model_from_problem
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem

@@ -21,7 +21,7 @@ from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.observables import ObservedMotion, ReactionForces
-from collocation_sysid.program.reactions.reaction_resultant import LOW_PASS
+from collocation_sysid.program.reactions.resultant import LOW_PASS
 from collocation_sysid.program.simulation import simulate, with_wrenches
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, PoseSequence

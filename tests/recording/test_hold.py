@@ -10,7 +10,7 @@ from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.runs.check.body_check import (
+from collocation_sysid.runs.check.body import (
     GraspCheck,
     check_grasps,
     grasp_concerns,

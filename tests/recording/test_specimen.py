@@ -13,13 +13,13 @@ from scipy.optimize import brentq
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings
 from collocation_sysid.recording.homogeneous_deformation import TESTS
-from collocation_sysid.recording.recording_writers import write_columns_csv
 from collocation_sysid.recording.specimen_files import (
     SpecimenLayout,
     read_specimen,
     specimen_columns,
     specimen_strains,
 )
+from collocation_sysid.recording.writers import write_columns_csv
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.result.synthesis import Recipe, write_data
 from collocation_sysid.runs.numerical_error import finer_mesh

@@ -12,7 +12,7 @@ import pytest
 from kit.logs import json_mcap
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.track_files import read_tracks
+from collocation_sysid.features.image_tracks.files import read_tracks
 from collocation_sysid.recording.formats.calibration_files import read_calibration
 from collocation_sysid.recording.formats.topics import list_topics
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import track_video
 
-from collocation_sysid.features.image_tracks.track_files import read_tracks
+from collocation_sysid.features.image_tracks.files import read_tracks
 
 cv2 = pytest.importorskip("cv2")
 

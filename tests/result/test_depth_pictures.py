@@ -27,14 +27,14 @@ from kit.results import a_result
 import collocation_sysid as cs
 from collocation_sysid.features.cameras.poses import camera_hypotheses
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth.depth_comparison import camera_residuals
+from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.result.animation import FilmFigure
 from collocation_sysid.result.camera_overlays import save_overlays, surface_rows, undeformed_rows
 from collocation_sysid.result.pictures.album import all_pictures
-from collocation_sysid.result.pictures.camera_pictures import camera_pictures, depth_picture
+from collocation_sysid.result.pictures.cameras import camera_pictures, depth_picture
 from collocation_sysid.result.replay import MotionRecord
 
 UPWARD, INVERTED = np.diag([1.0, -1, -1, 1]), np.linalg.inv(POSE)

@@ -60,7 +60,7 @@ from collocation_sysid.result.pictures import (
 from collocation_sysid.result.pictures.album import experiment_pictures, with_unique_names
 from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
 from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
-from collocation_sysid.result.pictures.mesh_pictures import spread_levels
+from collocation_sysid.result.pictures.meshes import spread_levels
 from collocation_sysid.result.pictures.over_time import sensor_picture
 from collocation_sysid.result.pictures.projection import ParallelCamera
 from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet

@@ -41,7 +41,7 @@ from collocation_sysid.result.check_sections import (
     quick_check_tables,
 )
 from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
-from collocation_sysid.runs.check.body_check import element_concerns, slenderness, worst_elements
+from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
 from collocation_sysid.runs.check.cost import (
     FRICTION_FACTOR,
     STATIC_FACTOR,
@@ -52,12 +52,7 @@ from collocation_sysid.runs.check.cost import (
     search_factor,
 )
 from collocation_sysid.runs.check.derivatives import shortened_problem
-from collocation_sysid.runs.check.modes_check import (
-    ModeCheck,
-    ModesCheck,
-    check_modes,
-    mode_concerns,
-)
+from collocation_sysid.runs.check.modes import ModeCheck, ModesCheck, check_modes, mode_concerns
 from collocation_sysid.statistics.concerns import Concern
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.

@@ -38,7 +38,7 @@ from collocation_sysid.statistics.assessment import (
     prediction_concerns,
     validation_concerns,
 )
-from collocation_sysid.statistics.misspecification.track_misspecifications import (
+from collocation_sysid.statistics.misspecification.tracks import (
     copied_measurements,
     filtered_signals,
 )

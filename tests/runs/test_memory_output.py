@@ -15,7 +15,7 @@ from collocation_sysid.fem.laws.constants import symbol_of
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import (
+from collocation_sysid.program.lifted.collocation import (
     LiftedCollocation,
     lifted_count,
     with_lifted_variables,

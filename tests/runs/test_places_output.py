@@ -22,7 +22,7 @@ from matplotlib.legend import Legend
 import collocation_sysid as cs
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
-from collocation_sysid.result.pictures.mesh_pictures import mesh_picture
+from collocation_sysid.result.pictures.meshes import mesh_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.warm_start import WarmStart
 from collocation_sysid.statistics.curved_intervals import uncertainty_at

@@ -20,7 +20,7 @@ import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.validated_classes import validated
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.methods.method_options import MethodOptions
+from collocation_sysid.methods.options import MethodOptions
 from collocation_sysid.result.element_fields import ElementFields
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.check import check_problem

@@ -14,7 +14,7 @@ import collocation_sysid as cs
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Status
-from collocation_sysid.program.depth.depth_comparison import camera_residuals
+from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.runs import several_starts, solving, thinned_start
 

@@ -15,15 +15,11 @@ from collocation_sysid.fem.laws.materials import DAMPINGS
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.runs.misspecifications import find_misspecifications
-from collocation_sysid.statistics.misspecification.fit_misspecifications import (
-    _named_alone_or_together,
-    _Refitter,
-)
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
+from collocation_sysid.statistics.misspecification.hypothesis import (
     Hypothesis,
     corrected_hypotheses,
 )
-from collocation_sysid.statistics.misspecification.model_misspecifications import (
+from collocation_sysid.statistics.misspecification.models import (
     LinearCorrection,
     mirrored_meshes,
     other_materials,
@@ -32,11 +28,8 @@ from collocation_sysid.statistics.misspecification.model_misspecifications impor
     with_laws,
     with_shape,
 )
-from collocation_sysid.statistics.misspecification.track_misspecifications import (
-    _amplitudes,
-    _cutoff,
-    same_tracks,
-)
+from collocation_sysid.statistics.misspecification.refits import _named_alone_or_together, _Refitter
+from collocation_sysid.statistics.misspecification.tracks import _amplitudes, _cutoff, same_tracks
 
 STEP_S = 0.01
 

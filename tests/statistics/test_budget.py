@@ -41,7 +41,7 @@ from collocation_sysid.statistics.budget.consider_analysis import (
 )
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
-from collocation_sysid.statistics.budget.uncertainty_budget import (
+from collocation_sysid.statistics.budget.variance_sources import (
     VarianceSources,
     rescaled,
     source_label,

@@ -20,7 +20,7 @@ from collocation_sysid.statistics.probes.budgeted_residuals import (
     is_significant_beside_budget,
     with_budget,
 )
-from collocation_sysid.statistics.probes.routine_probes import is_alarming
+from collocation_sysid.statistics.probes.routine import is_alarming
 
 pytestmark = pytest.mark.long
 

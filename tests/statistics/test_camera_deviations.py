@@ -33,10 +33,10 @@ from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_nuisances,
 )
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.budget.uncertainty_budget import estimate_changes
+from collocation_sysid.statistics.budget.variance_sources import estimate_changes
 from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
 from collocation_sysid.statistics.probes.relaxed_assumptions import SolvedFit, probed_changes
-from collocation_sysid.statistics.probes.routine_probes import probed_deviations, routine_probes
+from collocation_sysid.statistics.probes.routine import probed_deviations, routine_probes
 from collocation_sysid.statistics.uncertainty import AUTO
 
 SINCE_S = T_S - T_S[0]

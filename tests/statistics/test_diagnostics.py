@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
-from collocation_sysid.statistics.residuals.residual_diagnostics import (
-    MarkerDiagnosis,
-    diagnose_markers,
-)
+from collocation_sysid.statistics.residuals.diagnostics import MarkerDiagnosis, diagnose_markers
 
 T_S = 0.01 * np.arange(160)
 SIGMA_M = 2e-4

@@ -21,7 +21,7 @@ from collocation_sysid.fem.meshes.refinement import refine_body
 from collocation_sysid.fem.spatial_field import FieldModes, FieldResolution, Laplacian
 from collocation_sysid.result.pictures.field_intervals import field_picture
 from collocation_sysid.result.replay import ARRAY_LAYOUT, GROUP_PREFIXES, read_run
-from collocation_sysid.runs.check.body_check import check_body
+from collocation_sysid.runs.check.body import check_body
 from collocation_sysid.runs.forward_simulation import simulate_experiment
 from collocation_sysid.runs.result_content import FieldResult
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions

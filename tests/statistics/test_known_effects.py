@@ -10,7 +10,7 @@ from kit.static import PRESSED_M, block
 
 from collocation_sysid import Experiment, Problem, Unknown, Wrench, run, simulate
 from collocation_sysid.errors import InputError
-from collocation_sysid.problem.problem_options import UncertaintyOptions
+from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.statistics.budget.combined_intervals import combine
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions

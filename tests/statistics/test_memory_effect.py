@@ -30,7 +30,7 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.memory_effect import is_distinguishable, supports_memory
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
-from collocation_sysid.statistics.budget.uncertainty_budget import source_label
+from collocation_sysid.statistics.budget.variance_sources import source_label
 
 VALUES = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
 TAU_S = 0.1

@@ -12,10 +12,10 @@ from kit.problems import GUESS, hung_cube, measured
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.runs.check.body_check import check_body
+from collocation_sysid.runs.check.body import check_body
 from collocation_sysid.statistics.budget.alternatives import modulus_axis_sentence
 from collocation_sysid.statistics.budget.systematic_effects import usual_deviations
-from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources
+from collocation_sysid.statistics.budget.variance_sources import VarianceSources
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.misspecification.plausibility import density_concerns
 

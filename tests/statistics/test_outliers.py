@@ -15,10 +15,7 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Wrench
 from collocation_sysid.statistics.assessment import Assessment, fit_concerns
-from collocation_sysid.statistics.residuals.residual_diagnostics import (
-    diagnose_markers,
-    remove_outliers,
-)
+from collocation_sysid.statistics.residuals.diagnostics import diagnose_markers, remove_outliers
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 RNG = np.random.default_rng

@@ -22,7 +22,7 @@ from collocation_sysid import (
     simulate,
 )
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.problem.problem_options import UncertaintyOptions
+from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals

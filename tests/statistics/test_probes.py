@@ -30,7 +30,7 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.probes.deep_probes import WINDOWS, Probe
+from collocation_sysid.statistics.probes.deep import WINDOWS, Probe
 
 TRUTH = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
 FREED = ("density_gradient", "anisotropy", "stiffness_drift", "clock_rate")

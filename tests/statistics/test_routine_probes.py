@@ -44,7 +44,7 @@ from collocation_sysid.statistics.probes.relaxed_assumptions import (
     has_monotonic_load,
     probed_changes,
 )
-from collocation_sysid.statistics.probes.routine_probes import (
+from collocation_sysid.statistics.probes.routine import (
     RELEVANT,
     is_alarming,
     probed_deviations,

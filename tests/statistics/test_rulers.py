@@ -12,8 +12,8 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid import pipeline
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
-from collocation_sysid.statistics.budget.uncertainty_budget import VarianceSources
-from collocation_sysid.statistics.probes.routine_probes import is_alarming
+from collocation_sysid.statistics.budget.variance_sources import VarianceSources
+from collocation_sysid.statistics.probes.routine import is_alarming
 
 SIDE_M, DROP_M = 0.1, 0.1
 T_S = np.arange(24) / 60

@@ -11,7 +11,7 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.statistics.budget.shape_error import other_section
-from collocation_sysid.statistics.misspecification.model_misspecifications import with_other_section
+from collocation_sysid.statistics.misspecification.models import with_other_section
 
 WIDTH_M, LENGTH_M = 0.02, 0.1
 DENSITY_KG_M3 = 1000.0

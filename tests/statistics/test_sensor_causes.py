@@ -11,7 +11,7 @@ from kit.problems import GUESS, TRUTH, hung_cube, measured
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.runs.misspecifications import find_misspecifications
-from collocation_sysid.statistics.misspecification.sensor_misspecifications import whole_mistakes
+from collocation_sysid.statistics.misspecification.sensors import whole_mistakes
 
 SIGMA = 2e-4
 STEPS = 15

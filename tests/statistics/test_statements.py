@@ -12,12 +12,12 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid.features.specimens.concerns import as_specimen_concerns
 from collocation_sysid.result.probe_sections import _conclusions, is_another_effect
-from collocation_sysid.runs.check.body_check import bending_concerns
+from collocation_sysid.runs.check.body import bending_concerns
 from collocation_sysid.statistics.assessment import _noisy_marker_concerns
 from collocation_sysid.statistics.concerns import Concern
 from collocation_sysid.statistics.estimates import derived_estimates
 from collocation_sysid.statistics.linearised import DerivedModuli
-from collocation_sysid.statistics.residuals.residual_diagnostics import Outlier
+from collocation_sysid.statistics.residuals.diagnostics import Outlier
 
 
 def estimated(name, value, slopes, reasons=()):

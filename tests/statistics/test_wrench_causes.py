@@ -21,7 +21,7 @@ from collocation_sysid.recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import rank
+from collocation_sysid.statistics.misspecification.hypothesis import rank
 
 
 def changed(change: Callable[[Wrench], Wrench]) -> Collocation:

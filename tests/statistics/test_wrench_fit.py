@@ -21,7 +21,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.lifted.lifted_collocation import with_lifted_variables
+from collocation_sysid.program.lifted.collocation import with_lifted_variables
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance

@@ -22,10 +22,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import check_problem, misspecification_hypotheses
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.solving import solve
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    rank,
-)
+from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis, rank
 
 # What the image of one moment shows, with the code that names it.
 OF_SHAPE = {

@@ -26,17 +26,17 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.runs.check.body_check import check_grasps, grasp_concerns
+from collocation_sysid.runs.check.body import check_grasps, grasp_concerns
 from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.misspecification import fit_misspecifications
-from collocation_sysid.statistics.misspecification.fit_misspecifications import _is_reproduced
-from collocation_sysid.statistics.misspecification.misspecification_hypothesis import Hypothesis
+from collocation_sysid.statistics.misspecification import refits
+from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis
 from collocation_sysid.statistics.misspecification.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
     step_hypotheses,
 )
+from collocation_sysid.statistics.misspecification.refits import _is_reproduced
 
 BEFORE = [
     "poses in mm",
@@ -262,7 +262,7 @@ def test_a_short_exchange_is_left_to_hubers_loss():
 @pytest.mark.long
 def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
-    monkeypatch.setattr(fit_misspecifications, "ReducedSpace", None)
+    monkeypatch.setattr(refits, "ReducedSpace", None)
     assert [cause.cause for cause in find_misspecifications(solution)] == ["markers-exchanged"]
 
 
@@ -276,10 +276,8 @@ def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rn
             sweeps.append(found.iterations)
             return found
 
-    monkeypatch.setattr(fit_misspecifications, "ReducedSpace", Counted)
-    monkeypatch.setattr(
-        fit_misspecifications, "find_misspecifications_by_modes", lambda *_, **__: ()
-    )
+    monkeypatch.setattr(refits, "ReducedSpace", Counted)
+    monkeypatch.setattr(refits, "find_misspecifications_by_modes", lambda *_, **__: ())
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
     assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done

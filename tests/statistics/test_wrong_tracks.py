@@ -26,14 +26,10 @@ from kit.filmed import (
 )
 
 import collocation_sysid as cs
+from collocation_sysid.features.image_tracks.feature import notes, places_off_body, track_hypotheses
+from collocation_sysid.features.image_tracks.places import find_places
+from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
 from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
-from collocation_sysid.features.image_tracks.track_feature import (
-    notes,
-    places_off_body,
-    track_hypotheses,
-)
-from collocation_sysid.features.image_tracks.track_residual import ImageTrackResidual
-from collocation_sysid.features.image_tracks.tracked_places import find_places
 
 TEMPLATE = Path(cs.__file__).parent / "problem/templates/video/problem.toml"
 Change = Callable[[cs.ImageTracks], cs.ImageTracks]

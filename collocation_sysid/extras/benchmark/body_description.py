@@ -68,7 +68,7 @@ Then `collocation-sysid benchmark FOLDER` prints the scores; `--body NAME` score
 def body_readme(content: Mapping[str, Any]) -> str:
     """Return the README of a body as one text of Markdown, with a section for each recording.
 
-    `content` is that of body.json: `_body_content` of `benchmark_folder`, with "recordings".
+    `content` is that of body.json: `_body_content` of `folder`, with "recordings".
     """
     parts = [
         f"# {content['body']}\n",

@@ -15,7 +15,7 @@ from ...common.array_types import Array
 from ...common.schema_tables import Section, Vector
 from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
-from ...problem.problem_reading import parse_toml, read_text
+from ...problem.reading import parse_toml, read_text
 from ...problem.validation_messages import explain_validation_error
 from .hand_motion import HandMotion, TimeDerivatives, angular_motion
 

@@ -3,7 +3,7 @@
 `write_export` writes the files of a target in `TARGETS`, `verify_export` runs the target and
 compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
 `usd`, `calculix` and `febio`. For all of them, `identified` reads the body from a run
-folder, `export_destination` finds format and place of the option --to, `export_target` describes
+folder, `destination` finds format and place of the option --to, `target` describes
 what a simulator can express, and `obstacle_shapes` converts obstacles. `rerun_recording` writes the
 motion of a run for a viewer instead.
 """
@@ -23,9 +23,9 @@ from ...recording import write_poses_csv
 from ...result.run_writers import replaced_folder
 from ...runs.solved_problem import SolvedProblem
 from . import calculix, febio, mujoco, newton, rerun_recording, usd
-from .export_destination import ExportDestination, parse_destination
-from .export_target import ExportedFiles, ExportTarget, PredictionComparison, values_as_text
+from .destination import ExportDestination, parse_destination
 from .identified import IdentifiedBody, read_draws
+from .target import ExportedFiles, ExportTarget, PredictionComparison, values_as_text
 
 IDENTIFIED_FILE = "identified.json"
 SAMPLES_FILE = "samples.csv"

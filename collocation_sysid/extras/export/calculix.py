@@ -20,7 +20,9 @@ from ...errors import InputError
 from ...fem.laws.constants import FIBRE_ANGLE, FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
 from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
 from ...fem.regions import BodyPart
-from .export_target import (
+from .identified import IdentifiedBody, IdentifiedRegion
+from .obstacle_shapes import FacetedObstacle, faceted_obstacles
+from .target import (
     ExportedFiles,
     PredictionComparison,
     TargetCapabilities,
@@ -28,8 +30,6 @@ from .export_target import (
     equilibria,
     longest_displacement_m,
 )
-from .identified import IdentifiedBody, IdentifiedRegion
-from .obstacle_shapes import FacetedObstacle, faceted_obstacles
 
 DECK = "body.inp"
 ABAQUS_DECK = "abaqus.inp"

@@ -13,8 +13,8 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ...fem.laws.constants import FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
 from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
-from .export_target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 from .identified import IdentifiedBody, IdentifiedRegion
+from .target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
 
 MODEL = "body.feb"
 # Law of FEBio with the energy of a material; "linear" has it at small strain.

@@ -16,9 +16,11 @@ from scipy.spatial.transform import Rotation
 from ...common.array_types import Array
 from ...errors import InputError
 from ...model.forces import Forces
-from ...program.modes.natural_modes import natural_modes
+from ...program.modes.natural import natural_modes
 from ...recording import Grasp, Solid
-from .export_target import (
+from .identified import IdentifiedBody
+from .obstacle_shapes import Primitive, offset_solid
+from .target import (
     ExportedFiles,
     PredictionComparison,
     TargetCapabilities,
@@ -27,8 +29,6 @@ from .export_target import (
     values_as_text,
     xml_attribute,
 )
-from .identified import IdentifiedBody
-from .obstacle_shapes import Primitive, offset_solid
 
 MODEL = "body.xml"
 # Oldest major version: with 3.3 to 3.8 and 3.17 the first natural frequency is 10 % too high, with

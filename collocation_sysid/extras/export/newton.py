@@ -14,7 +14,9 @@ import numpy as np
 from ...common.serialisation import content
 from ...errors import InputError, listed
 from ...recording import Obstacle
-from .export_target import (
+from .identified import IdentifiedBody
+from .obstacle_shapes import FacetedObstacle, Primitive, faceted_obstacles
+from .target import (
     ExportedFiles,
     PredictionComparison,
     TargetCapabilities,
@@ -23,8 +25,6 @@ from .export_target import (
     linear_tetrahedra,
     longest_displacement_m,
 )
-from .identified import IdentifiedBody
-from .obstacle_shapes import FacetedObstacle, Primitive, faceted_obstacles
 
 MODULE_FILE = "body.py"
 DATA_FILE = "body.json"

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
-from ...model.contact.contact_force import contact_terms
+from ...model.contact.force import contact_terms
 from ...recording import Capsule, Cuboid, Cylinder, Obstacle, Plane, Solid, Sphere
 from ...recording.obstacle_solids import solid_key
 from .identified import IdentifiedBody

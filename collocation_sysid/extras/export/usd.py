@@ -18,16 +18,16 @@ from scipy.spatial.transform import Rotation
 from ...common.array_types import Array, Index
 from ...errors import InputError, printable
 from ...recording import Grasp, Obstacle
-from .export_target import (
+from .identified import IdentifiedBody, IdentifiedRegion
+from .newton import compare_at_rest
+from .obstacle_shapes import Primitive
+from .target import (
     ExportedFiles,
     PredictionComparison,
     TargetCapabilities,
     comment_lines,
     linear_tetrahedra,
 )
-from .identified import IdentifiedBody, IdentifiedRegion
-from .newton import compare_at_rest
-from .obstacle_shapes import Primitive
 
 STAGE_FILE = "body.usda"
 ATTRIBUTE_NAMESPACE = "collocationSysid"

@@ -7,11 +7,11 @@ Use `LiveEstimator`: `LiveEstimator.update` takes one frame and returns estimate
 - `frames`: frames as Python values, JSON lines or rows of a table; `sources`: streams of frames.
 - `frame_buffer`: buffer that turns frames into time steps with interpolated poses; `initial_rest`:
   the end of a rest before the motion.
-- `live_model`: the model of a problem's recording, and the batch solution at the end;
+- `model`: the model of a problem's recording, and the batch solution at the end;
   `window_pass`: the window of recent time steps, with its information and prior. Time marching with
   sensitivities is `program.streaming`.
 - `time_budget`: computing time per frame; `stiffness_search`: initial values without a guess.
-- `live_trust`: verdict of a live estimate; `live_display`: terminal and film; `live_recording`: file
+- `trust`: verdict of a live estimate; `display`: terminal and film; `recording`: file
   for the Rerun viewer.
 """
 

@@ -26,7 +26,7 @@ from ...common.array_types import Array
 from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError, SimulationError
-from ...features.image_tracks.tracked_places import TrackedPlaces
+from ...features.image_tracks.places import TrackedPlaces
 from ...features.image_tracks.tracks import ImageTracks
 from ...pipeline import Run
 from ...problem import Problem
@@ -47,16 +47,16 @@ from .frames import (
     parse_wrenches,
 )
 from .initial_rest import InitialRest
-from .live_model import model_from_problem, recording_from_log, solve_recording
-from .live_trust import (
+from .model import model_from_problem, recording_from_log, solve_recording
+from .stiffness_search import TRIAL_SAMPLES, StiffnessSearch
+from .time_budget import TimeBudget
+from .trust import (
     LARGEST_SETTLED_DISTANCE,
     ResidualScatter,
     data_concerns,
     estimate_concerns,
     variance_factor,
 )
-from .stiffness_search import TRIAL_SAMPLES, StiffnessSearch
-from .time_budget import TimeBudget
 from .window_pass import CombinedPasses, WindowPass
 
 # Standard deviation, in steps of the trust region, of a prior that keeps the next linearisation

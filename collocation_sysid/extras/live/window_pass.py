@@ -29,7 +29,7 @@ from ...program.streaming import (
     SweepState,
 )
 from ...recording.poses import Poses
-from .live_trust import ResidualScatter
+from .trust import ResidualScatter
 
 # Largest number of samples that a second pass may lag behind for its residuals to be used.
 LARGEST_LAG = 20

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from ...model.contact.contact_force import Contact, contact_terms
+from ...model.contact.force import Contact, contact_terms
 from ...recording import Experiment
 from ..design.hand_limits import WITHIN
 

@@ -16,8 +16,8 @@ from ...common.array_types import Array
 from ...common.files import safe_name
 from ...problem.schema import with_experiment_defaults
 from ...recording import write_markers_csv, write_poses_csv
-from ...recording.recording_writers import write_columns_csv
-from ..design.design_folder import MARKERS_FILE, OF_MARKERS, OF_POSES, OF_TIME, relative_to
+from ...recording.writers import write_columns_csv
+from ..design.folder import MARKERS_FILE, OF_MARKERS, OF_POSES, OF_TIME, relative_to
 from .motion_plan import MotionPlan
 from .signals import standing_value
 

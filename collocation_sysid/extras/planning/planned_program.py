@@ -32,7 +32,7 @@ from ...common.time_dependence import at_times
 from ...errors import InputError
 from ...program.driven_motion import Drive, DrivenMotion
 from ...program.forward.initial_equilibrium import equilibrium
-from ...program.modes.natural_modes import natural_modes
+from ...program.modes.natural import natural_modes
 from ...recording import Experiment, PoseSequence
 from ..design.hand_limits import HandBounds, Limits
 from .body_limits import BodyLimits

@@ -27,7 +27,7 @@ from ...common.validated_types import (
     Text,
 )
 from ...errors import InputError, hint_at, listed, located
-from ...problem.problem_reading import parse_toml, read_text
+from ...problem.reading import parse_toml, read_text
 from ...problem.schema import CodeSection
 from ...problem.validation_messages import explain_validation_error
 from ...recording.formats.columns import find_time

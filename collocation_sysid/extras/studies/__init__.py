@@ -1,9 +1,9 @@
 """Studies of many runs, and comparison of models.
 
-Studies: `study_arguments` parses command-line arguments,
-`study_planning` plans the runs, `run_execution` executes them (each in its own process, see
-`run_worker`) and stores their records, `study_rows` converts records to rows of numbers, and
-`study_page` and `study_plots` present them. `study_progress` shows progress in the terminal, also
+Studies: `arguments` parses command-line arguments,
+`planning` plans the runs, `run_execution` executes them (each in its own process, see
+`run_worker`) and stores their records, `rows` converts records to rows of numbers, and
+`page` and `plots` present them. `progress` shows progress in the terminal, also
 of the search for a motion (package `design`).
 
 Model comparison: `model_variants` derives models from a problem file, `model_choice` compares their
@@ -11,8 +11,8 @@ predictions, `model_comparison` does so in Python, and `law_disagreements` evalu
 estimate depends on the model.
 """
 
+from .planning import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
 from .run_execution import RunOptions, RunStore, run_all
-from .study_planning import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
 
 __all__ = [
     "PlannedRun",

@@ -15,10 +15,10 @@ import numpy as np
 
 from ...common.display import Table
 from ...fem.laws.constants import is_damping, symbol_of, symbol_with_unit, without_region
-from ...statistics.budget.uncertainty_budget import BudgetLine
+from ...statistics.budget.variance_sources import BudgetLine
 from ...statistics.estimates import IntervalCoordinate
 from ...statistics.remedies import LAW
-from .study_rows import Row
+from .rows import Row
 
 # Ratio of the largest to the smallest estimate above which equally good models disagree.
 LEAST_DISAGREEMENT_RATIO = 1.05

@@ -48,9 +48,9 @@ from ...statistics.linearised import (
 from ...statistics.residuals.autocorrelation import ErrorProcess, error_processes
 from ...statistics.residuals.noise_level import ROUNDING
 from .law_disagreements import Disagreement, find_disagreements
+from .planning import PlannedRun, fitted_recordings
+from .rows import Row
 from .run_execution import Record
-from .study_planning import PlannedRun, fitted_recordings
-from .study_rows import Row
 
 # Predictions closer than this, as a logarithm, are considered equal.
 EQUIVALENT_ERROR = 0.01

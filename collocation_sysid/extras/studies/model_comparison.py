@@ -12,10 +12,10 @@ from ...errors import InputError
 from ...problem import Problem
 from ...recording.measurement_selection import measured_count
 from .model_choice import advice, fit_record, model_notes, model_rows
-from .study_page import comparable_names, model_views
-from .study_planning import PlannedRun, fitted_recordings, require_predictable
-from .study_plots import model_plots
-from .study_rows import Row
+from .page import comparable_names, model_views
+from .planning import PlannedRun, fitted_recordings, require_predictable
+from .plots import model_plots
+from .rows import Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import

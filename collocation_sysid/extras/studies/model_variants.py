@@ -20,9 +20,9 @@ from ...fem.laws.constants import MOST_TERMS, usual_value, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import ELASTIC, elastic_names
 from ...problem import Problem
-from ...problem.problem_reading import read_problem_file
+from ...problem.reading import read_problem_file
 from ...recording.measurement_selection import measured_count
-from .study_arguments import unique_items
+from .arguments import unique_items
 
 # Initial guess of a new branch's share of the stiffness.
 SHARE = 0.1

@@ -32,7 +32,7 @@ from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
 from ...fem.kernels import available_threads
-from .study_planning import PlannedRun
+from .planning import PlannedRun
 
 COMMAND = python_command(
     "from collocation_sysid.extras.studies.run_worker import main; main()", with_package=True

@@ -11,10 +11,10 @@ from ...methods.solution import Solution
 from ...methods.starts.stiffness_scan import typical_constants
 from ...problem import Problem
 from ...program.collocation import ExperimentIterate
-from ...program.depth.depth_comparison import depth_residuals, outline_distances_px
+from ...program.depth.comparison import depth_residuals, outline_distances_px
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...statistics.concerns import Concern, concern_if
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ...statistics.misspecification.hypothesis import Hypothesis, rank
 from ..feature import Feature, SimulatedCheck
 from ..measurement_results import PredictionErrors
 from .images import MESSAGES_OF_IMAGES, camera_image_hypotheses

@@ -20,7 +20,7 @@ from ...fem.laws.constants import is_modulus
 from ...fem.laws.moduli import engineering_constants
 from ...model.nuisance_map import NuisanceMap
 from ...program.depth.camera_alignment import AlignedPose, ExactCloud, iterate_alignments, thinned
-from ...program.depth.depth_camera_model import DepthCameraModel
+from ...program.depth.camera_model import DepthCameraModel
 from ...program.depth.visible_surface import VisibleSurface
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.forward.newton_solver import NewtonSolver
@@ -28,7 +28,7 @@ from ...recording.depth_camera import DepthCamera
 from ...recording.experiment import Experiment
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...recording.sample_times import TIME_TOLERANCE_S
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...statistics.misspecification.hypothesis import Hypothesis, HypothesisTest
 from ...statistics.thresholds import CERTAIN, LEAST_IMPROVEMENT, MISFIT, ONE_OF_MANY
 
 # Messages of the hypotheses by the codes of their concerns.

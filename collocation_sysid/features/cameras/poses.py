@@ -22,7 +22,7 @@ from ...program.depth.surface_correspondences import initial_gate_m
 from ...program.depth.visible_surface import VisibleSurface
 from ...recording.depth_camera import Depth, points_from_image
 from ...recording.experiment import Experiment
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...statistics.misspecification.hypothesis import Hypothesis
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES_OF_POSES = {

@@ -17,10 +17,10 @@ from scipy.spatial import KDTree
 from ...common.array_types import Array
 from ...program.collocation import ExperimentIterate
 from ...program.depth.camera_alignment import thinned
-from ...program.depth.depth_comparison import camera_residuals
-from ...program.depth.depth_residual import DepthResidual
+from ...program.depth.comparison import camera_residuals
+from ...program.depth.residual import DepthResidual
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, HypothesisTest
+from ...statistics.misspecification.hypothesis import Hypothesis, HypothesisTest
 from ...statistics.thresholds import LEAST_IMPROVEMENT
 
 # Messages of the hypotheses by the codes of their concerns.

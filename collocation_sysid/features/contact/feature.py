@@ -12,17 +12,13 @@ from scipy.sparse.csgraph import connected_components
 
 from ...common.array_types import Array
 from ...methods.solution import Solution
-from ...model.contact.contact_summary import (
-    ContactSummary,
-    contact_summaries,
-    surface_gaps_and_pressures,
-)
+from ...model.contact.summary import ContactSummary, contact_summaries, surface_gaps_and_pressures
 from ...program.collocation import ExperimentIterate
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.obstacle_solids import Plane
 from ...statistics.concerns import Concern, Topic, concern_if
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...statistics.misspecification.hypothesis import Hypothesis
 from ..feature import Feature
 from .obstacles import MESSAGES, obstacle_hypotheses
 

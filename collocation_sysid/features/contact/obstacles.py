@@ -15,7 +15,7 @@ from ...common.array_types import Array
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle, ObstacleForces
 from ...recording.obstacle_solids import Plane
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...statistics.misspecification.hypothesis import Hypothesis
 
 # Messages of the hypotheses by the codes of their concerns.
 MESSAGES = {

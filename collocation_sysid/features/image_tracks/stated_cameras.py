@@ -22,14 +22,11 @@ from ...recording.experiment import Experiment
 from ...recording.lost_points import missing_images
 from ...recording.measurement import Measurement
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
-from ...statistics.misspecification.misspecification_hypothesis import (
-    Hypothesis,
-    corrected_hypothesis,
-)
-from ...statistics.misspecification.sensor_misspecifications import measurement_mistake
+from ...statistics.misspecification.hypothesis import Hypothesis, corrected_hypothesis
+from ...statistics.misspecification.sensors import measurement_mistake
 from ...statistics.thresholds import CERTAIN
+from .places import poses_of_tracks
 from .rays import facing, points_on_surface
-from .tracked_places import poses_of_tracks
 from .tracks import ImageTracks, stated_places
 
 # Images in which places, and in which motions are compared.

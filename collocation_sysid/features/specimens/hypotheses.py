@@ -49,7 +49,7 @@ from ...recording.specimen import (
 )
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
-from ...statistics.misspecification.misspecification_hypothesis import (
+from ...statistics.misspecification.hypothesis import (
     Correction,
     Hypothesis,
     HypothesisTest,

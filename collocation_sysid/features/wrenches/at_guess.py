@@ -20,7 +20,7 @@ from ...program.wrench_residual import WrenchResidual
 from ...recording.experiment import Experiment
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...statistics.axes import with_other_axes
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis
+from ...statistics.misspecification.hypothesis import Hypothesis
 
 # Message of the offset by the code of its concern; those of other hypotheses are in
 # `mistakes`.

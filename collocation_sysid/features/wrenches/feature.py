@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...methods.solution import Solution
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
+from ...statistics.misspecification.hypothesis import Hypothesis, rank
 from ...statistics.misspecification.plausibility import load_sign_hypotheses
 from ..feature import Feature, SimulatedCheck
 from .at_guess import MESSAGE_OF_OFFSET, wrench_deviations

@@ -23,7 +23,7 @@ from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...methods.starts.continuation import first_samples
 from ...program.collocation import Collocation, ExperimentIterate
-from ...program.markers.marker_residual import MarkerResidual
+from ...program.markers.residual import MarkerResidual
 from ...program.observables import ObservedMotion, ReactionForces
 from ...program.transcription import Transcription
 from ...program.wrench_residual import WrenchResidual, without_grasp_sensors
@@ -34,12 +34,12 @@ from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ...recording.poses import Frame
 from ...statistics.axes import with_other_axes
 from ...statistics.budget.shape_error import other_section
-from ...statistics.misspecification.misspecification_hypothesis import (
+from ...statistics.misspecification.hypothesis import (
     Hypothesis,
     HypothesisTest,
     corrected_hypothesis,
 )
-from ...statistics.misspecification.sensor_misspecifications import measurement_mistake
+from ...statistics.misspecification.sensors import measurement_mistake
 from ...statistics.thresholds import BETTER, FITTED, NOISE_LEVEL, ONE_OF_MANY
 
 # Messages of the hypotheses by the codes of their concerns.

@@ -1,8 +1,8 @@
 """Tetrahedral meshes: construction, checks, files and selections.
 
-- `mesh`: tetrahedral mesh and nodes of the elements; `mesh_checks` validates it.
+- `mesh`: tetrahedral mesh and nodes of the elements; `checks` validates it.
 - `structured`: boxes and cylinders; `surface`: mesh of a closed surface; `refinement`: finer
   meshes;
   `coarsening`: coarser meshes.
-- `mesh_files`, `meshio_reader`: files; `selection`: nodes, cells and faces by position or name.
+- `files`, `meshio_reader`: files; `selection`: nodes, cells and faces by position or name.
 """

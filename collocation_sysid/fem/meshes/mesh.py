@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...common.array_types import Array, Index
 from ...errors import InputError
 from ..elements import Element
-from .mesh_checks import (
+from .checks import (
     MeshQuality,
     checked_arrays,
     checked_faces,
@@ -30,7 +30,7 @@ from .mesh_checks import (
     signed_volumes,
     unique_edges,
 )
-from .mesh_files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
+from .files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
 from .surface import tetrahedralize_surface
 
 

@@ -17,8 +17,8 @@ from ..elements import ELEMENTS
 from ..node_force import LocatedForce, NodeForce
 from ..regions import Region
 from ..rest_shape import UnderGravity
+from .checks import orient_elements
 from .mesh import ElementNodes, TetMesh
-from .mesh_checks import orient_elements
 from .selection import Ball, Box, Indices, Selection
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from ...common.checked_arrays import float_array
 from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Positive
 from ...errors import InputError
+from .checks import orient_elements
 from .mesh import TetMesh
-from .mesh_checks import orient_elements
 
 # Sectors of a cylinder by edge length: a multiple of four, which a quarter of a cylinder needs.
 _SECTORS = 8

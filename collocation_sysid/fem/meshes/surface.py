@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 from ...common.files import replaced_file
 from ...common.isolated_process import Failed, run_isolated
 from ...errors import InputError
-from .mesh_checks import clean_mesh
-from .mesh_files import read_tetrahedra, write_tetrahedra
+from .checks import clean_mesh
+from .files import read_tetrahedra, write_tetrahedra
 
 # Edge length passed to fTetWild, as a fraction of the desired one. fTetWild stops as soon as its
 # elements are well shaped, however small; coarsening then merges edges up to about the length

@@ -30,10 +30,10 @@ from ...common.array_types import Array
 from ...common.validated_classes import validated
 from ...common.validated_types import Count, Positive
 from ...program.collocation import Collocation
-from ...program.lifted.lifted_collocation import with_lifted_variables
+from ...program.lifted.collocation import with_lifted_variables
 from .. import nlpsol
 from ..callbacks import HessianValues, NlpFunctions
-from ..method_options import MethodOptions
+from ..options import MethodOptions
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import Recorder
 

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from ...common.array_types import Array, Index
 from ...program.collocation import Collocation, convert_variables
-from ...program.lifted.lifted_collocation import with_lifted_variables
+from ...program.lifted.collocation import with_lifted_variables
 from ...program.stopwatch import Stopwatch
 
 

@@ -29,7 +29,7 @@ from ...common.validated_classes import validated
 from ...common.validated_types import AboveOne, AtLeastOne, Count, Positive
 from ...errors import InputError
 from ...program.collocation import Collocation
-from ..method_options import MethodOptions
+from ..options import MethodOptions
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 from .inner import FIRST_ORDER, Inner, minimise_merit

@@ -30,7 +30,7 @@ from ...errors import SimulationError
 from ...program.collocation import Collocation
 from ...program.stopwatch import Stopwatch
 from ..horizon import Horizon
-from ..method_options import MethodOptions
+from ..options import MethodOptions
 from ..solution import Solution, Status, Watch, constraint_multipliers
 from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
 from ..starts.initial_trajectories import complete_variables, simulate_trajectories

@@ -24,7 +24,7 @@ from ..comparison.casadi_nlp import Sleqp, SqpMethod
 from ..comparison.penalty import AugmentedLagrangian, Penalty
 from ..comparison.shooting import Shooting
 from ..interior_point import InteriorPoint
-from ..method_options import SHARES, MethodOptions, Shares, method_from_options, samples_in_share
+from ..options import SHARES, MethodOptions, Shares, method_from_options, samples_in_share
 from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Method, Solution, Status, Watch
 from ..solve_recorder import Recorder

@@ -19,7 +19,7 @@ import scipy.sparse.linalg as spla
 from ...common.array_types import Array
 from ...errors import SimulationError
 from ...program.collocation import Collocation, convert_variables
-from ...program.lifted.lifted_collocation import lifted_count
+from ...program.lifted.collocation import lifted_count
 from ..condensed_program import CondensedCollocation, complete_program
 from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Solution, Status, constraint_multipliers

@@ -31,9 +31,9 @@ from ...model.parameters import Parameter, Parameters, with_widest_bounds
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.forward.newton_solver import NewtonOptions
 from ...program.transcription import Transcription
-from ..method_options import SHARES, samples_in_share
+from ..options import SHARES, samples_in_share
 from .initial_trajectories import simulate_trajectories
-from .memory_start import memory_start
+from .memory import memory_start
 from .power_law import power_law_start
 
 # Largest Young's modulus of the scan [Pa].

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from .depth_camera_model import DepthCameraModel
+from .camera_model import DepthCameraModel
 from .visible_surface import GRAZING, VisibleSurface
 
 # Number of random points of the surface that are associated with the cloud.

@@ -2,7 +2,7 @@
 
     r = (n · (Σ_i ℓ_i(τ) Σ_a N_a x_{a,i} − T (R(a) ((1 + s) p − c) + c + e)) / h − w) / σ,
 
-with n the normal of a plane through the camera and an edge in its image (see `depth_outline`), p a
+with n the normal of a plane through the camera and an edge in its image (see `outline`), p a
 point of that plane, h the width of a pixel there [m], w how many pixels inside the outline of the
 body its silhouette ends all around, and the other symbols as in `depth`. σ is in pixels.
 """
@@ -18,8 +18,8 @@ import numpy as np
 from ...common.array_types import Array
 from ...recording.nuisance import DEPTH_EDGE
 from ..measurement_residual import ResidualExpression, RowStencil
-from .depth_outline import Outline
-from .depth_residual import DepthResidual
+from .outline import Outline
+from .residual import DepthResidual
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..correspondences import Correspondences
 from .camera_alignment import align_camera, thinned
-from .depth_camera_model import DepthCameraModel
-from .depth_outline import Outline
+from .camera_model import DepthCameraModel
+from .outline import Outline
 from .visible_surface import GRAZING, VisibleSurface
 
 # Share of a point's distance that is perpendicular to the normal, above which it lies beyond an

@@ -1,1 +1,1 @@
-"""Markers that cameras track: `marker_association` with elements, and `marker_residual`."""
+"""Markers that cameras track: `association` with elements, and `residual`."""

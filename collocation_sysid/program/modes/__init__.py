@@ -1,5 +1,5 @@
 """Small motions about an equilibrium.
 
-- `natural_modes`: natural frequencies and modes; `stability`: stability of time integration.
+- `natural`: natural frequencies and modes; `stability`: stability of time integration.
 - `modal_prediction`: approximate predictions while the stiffness is unknown.
 """

@@ -20,7 +20,7 @@ from ...model.forces import Forces
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.markers import Markers
-from .natural_modes import natural_modes
+from .natural import natural_modes
 
 # Largest number of natural modes of the prediction.
 MODES = 20

@@ -18,7 +18,7 @@ from ...recording.specimen import is_harmonic, is_relaxation
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI, own_settings
 from ..replay import MotionRecord, damaged_run_refused, read_run
-from .camera_pictures import camera_pictures
+from .cameras import camera_pictures
 from .confidence import (
     Confidence,
     budget_picture,
@@ -27,9 +27,9 @@ from .confidence import (
     correlation_matrix,
 )
 from .field_intervals import field_picture
-from .mesh_pictures import elements_picture, mesh_picture
+from .meshes import elements_picture, mesh_picture
 from .over_time import marker_errors, marker_tracks, sensor_picture
-from .search_pictures import convergence, scan_picture
+from .search import convergence, scan_picture
 from .shapes import obstacle_pictures, shapes_picture
 from .spectrum import spectrum_picture
 from .stress_strain import force_picture, harmonic_picture, relaxation_picture, strain_picture

@@ -14,7 +14,7 @@ from ...common.array_types import Array
 from ...fem.laws.constants import symbol_of
 from ...runs.result_content import Result
 from ...statistics.budget.combined_intervals import NORMAL_95
-from ...statistics.budget.uncertainty_budget import main_sources, source_label
+from ...statistics.budget.variance_sources import main_sources, source_label
 from ...statistics.combinations import WIDE, Direction
 from ...statistics.distributions import chi2_isf, normal_isf
 from ...statistics.estimates import correlation_from_covariance

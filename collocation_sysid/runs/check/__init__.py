@@ -1,8 +1,8 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body_check` (meshes and grasps), `grasp_extent` (nodes that end before their box),
-`measurements`, `modes_check` (natural modes and the time grid), `cost` and
+`body` (meshes and grasps), `grasp_extent` (nodes that end before their box),
+`measurements`, `modes` (natural modes and the time grid), `cost` and
 `derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
@@ -31,33 +31,26 @@ from ...methods.starts.stiffness_scan import (
 from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.lifted.lifted_collocation import lifted_count, with_lifted_variables
+from ...program.lifted.collocation import lifted_count, with_lifted_variables
 from ...program.modes.stability import Instability, find_instabilities
 from ...recording.impact_steps import IMPACT_NOTE
 from ...statistics.assessment import rotation_step_concerns, stability_concerns
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.combinations import Combination, with_something_to_state
 from ...statistics.concerns import Concern
-from ...statistics.misspecification.misspecification_hypothesis import Hypothesis, rank
-from ...statistics.misspecification.modal_misspecifications import find_misspecifications_by_modes
+from ...statistics.misspecification.hypothesis import Hypothesis, rank
+from ...statistics.misspecification.modes import find_misspecifications_by_modes
 from ...statistics.misspecification.plausibility import size_and_density_hypotheses
-from ...statistics.misspecification.track_misspecifications import copied_measurements
+from ...statistics.misspecification.tracks import copied_measurements
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
-from .body_check import (
-    BodyCheck,
-    ElementShape,
-    GraspCheck,
-    check_body,
-    check_grasps,
-    grasp_concerns,
-)
+from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
 from .cost import MethodCost, cost_concerns, cost_notes, estimated_sweeps_s, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
-from .modes_check import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
+from .modes import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
 
 __all__ = [
     "BodyCheck",

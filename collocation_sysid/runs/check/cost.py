@@ -16,7 +16,7 @@ from ...methods.interior_point import InteriorPoint
 from ...methods.reduced_space import ReducedSpace, memory_mb
 from ...problem import Problem
 from ...program.collocation import Collocation
-from ...program.lifted.lifted_collocation import lifted_nonzeros, with_lifted_variables
+from ...program.lifted.collocation import lifted_nonzeros, with_lifted_variables
 from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
 from ...recording.experiment import Experiment

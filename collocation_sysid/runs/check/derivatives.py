@@ -10,10 +10,10 @@ from functools import partial
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.contact.contact_force import contact_terms
+from ...model.contact.force import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
-from ...program.lifted.lifted_collocation import lifted_nonzeros, with_lifted_variables
+from ...program.lifted.collocation import lifted_nonzeros, with_lifted_variables
 from ...recording.experiment import Experiment
 from ...recording.measurement_selection import shortened_experiment
 

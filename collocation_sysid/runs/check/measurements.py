@@ -11,7 +11,7 @@ from ...common.array_types import Array
 from ...recording.experiment import Experiment
 from ...recording.specimen_files import moduli_of
 from ...statistics.concerns import Concern, concern_if
-from .body_check import BodyCheck
+from .body import BodyCheck
 
 # Distance of a marker from the body, in mean edges, above which its place is mostly extrapolated.
 LARGEST_DISTANCE_EDGES = 0.5

@@ -20,7 +20,7 @@ from ...model.parameters import Parameters
 from ..estimates import Estimate, IntervalCoordinate
 from .combined_intervals import NORMAL_95
 from .systematic_effects import ASSUMPTIONS, Assumptions
-from .uncertainty_budget import ALTERNATIVES, BudgetLine, VarianceSources, is_definition
+from .variance_sources import ALTERNATIVES, BudgetLine, VarianceSources, is_definition
 
 # Smallest relative change of an estimate that is reported.
 LEAST_CHANGE = 0.01

@@ -21,7 +21,7 @@ from ...program.linear_algebra.lapack import one_blas_thread
 from ...program.measurement_residual import MeasurementResidual
 from ...program.observable_response import ObservableResponse
 from ...program.observables import ObservedMotion
-from ...program.reactions.reaction_forces import GraspForces
+from ...program.reactions.forces import GraspForces
 from ...program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, SweepColumns
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment

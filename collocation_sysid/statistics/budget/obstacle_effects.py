@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
-from ...model.contact.contact_force import Contact, contact_terms
+from ...model.contact.force import Contact, contact_terms
 from ...model.dynamics import Dynamics
 from ...model.forces import Forces
 from ...program.experiment_iterate import ExperimentIterate

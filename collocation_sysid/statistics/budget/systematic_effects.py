@@ -30,12 +30,12 @@ from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import boundary_of
 from ...fem.rest_shape import RestShape
-from ...model.contact.contact_summary import surface_gaps_and_pressures
+from ...model.contact.summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
 from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
-from ...program.reactions.reaction_forces import forces_on_dofs, reaction_forces
+from ...program.reactions.forces import forces_on_dofs, reaction_forces
 from ...recording.deviation import WIDENING, Deviation
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation

@@ -1,9 +1,9 @@
 """Misspecification hypotheses: mistakes in a description that would explain the misfit.
 
-- `misspecification_hypothesis`: a hypothesis, its strength and how hypotheses are ranked.
-- `plausibility`: contradictions that no simulation is needed for; `modal_misspecifications`:
+- `hypothesis`: a hypothesis, its strength and how hypotheses are ranked.
+- `plausibility`: contradictions that no simulation is needed for; `modes`:
   predictions by natural modes; `initial_motion`: bodies that were not at rest at the beginning.
-- `fit_misspecifications`: hypotheses after a fit.
+- `refits`: hypotheses after a fit.
 
 Hypotheses about force sensors, cameras, specimens and obstacles are in the package `features`.
 """

@@ -14,7 +14,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...recording.experiment import Experiment
 from ..distributions import chi2_sf
-from .misspecification_hypothesis import Hypothesis
+from .hypothesis import Hypothesis
 
 # Fewest samples of the initial interval: third differences need four.
 FEWEST_SAMPLES = 6

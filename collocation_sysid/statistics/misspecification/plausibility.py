@@ -31,7 +31,7 @@ from ...recording.obstacle import Obstacle
 from ...recording.poses import Frame
 from ..concerns import Concern
 from ..thresholds import AGAINST, CLEARLY, DENSITY_DEVIATION, SECTION_RATIO, SUDDEN, TAMED
-from .misspecification_hypothesis import Hypothesis
+from .hypothesis import Hypothesis
 
 # Densities of soft objects [kg/m³].
 DENSITIES_KG_M3 = (10.0, 25_000.0)

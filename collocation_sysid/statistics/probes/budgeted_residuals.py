@@ -17,13 +17,13 @@ import numpy as np
 
 from ..budget.consider_analysis import with_relaxed_assumption
 from ..budget.systematic_effects import DEVIATIONS
-from ..budget.uncertainty_budget import source_label
+from ..budget.variance_sources import source_label
 from ..distributions import chi2_isf, normal_isf
 from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step
 from ..thresholds import GRANTED, RARE
 from ..uncertainty import ErrorBasis
 from .relaxed_assumptions import SolvedFit, assumption_name
-from .routine_probes import prior_widening, significance_limit
+from .routine import prior_widening, significance_limit
 
 
 @dataclass(frozen=True)

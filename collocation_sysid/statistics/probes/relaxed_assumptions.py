@@ -20,7 +20,7 @@ from ...fem.laws.constants import is_modulus
 from ...program.collocation import Collocation, ExperimentIterate
 from ..budget.consider_analysis import ResidualChanges, changes_of_assumptions
 from ..budget.systematic_effects import ExperimentAtAnswer
-from ..budget.uncertainty_budget import BudgetLine, is_definition
+from ..budget.variance_sources import BudgetLine, is_definition
 from ..estimates import Estimate
 from ..linearised import DerivedModuli, LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..residuals.recording_scatter import TELLING

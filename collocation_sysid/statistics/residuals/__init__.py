@@ -1,6 +1,6 @@
 """Analysis of residuals: noise, correlation and differences between recordings.
 
-- `noise_level`: noise of each kind of measurement; `residual_diagnostics`: residuals of each
+- `noise_level`: noise of each kind of measurement; `diagnostics`: residuals of each
   marker.
 - `autocorrelation`, `spatial_correlation`: correlation in time and space.
 - `recording_scatter`: between-recording variance.

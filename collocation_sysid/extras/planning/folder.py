@@ -1,0 +1,340 @@
+"""Folder of a plan: poses for the robot, tensions and pressures, prediction, pictures, report and
+plan.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.display import Line, Picture, Shown, Table, TitledParts
+from ...common.serialisation import as_json
+from ...fem.laws.constants import symbol_of
+from ...recording import write_markers_csv, write_poses_csv
+from ...recording.writers import write_columns_csv
+from ...result.animation import film
+from ...result.pictures.album import save_pictures
+from ...result.replay import MotionRecord
+from ...result.report import report_html
+from ...result.run_writers import replaced_folder
+from ...statistics.remedies import remedy_for
+from ..design.hand_motion import angular_motion
+from .execution_problems import (
+    CHECK_FILE,
+    POSES_FILE,
+    execution_problems,
+    problem_text,
+    write_commands,
+)
+from .motion_plan import UNKNOWN, BandContribution, MotionPlan
+from .pictures import plan_figures
+from .trajectory_log import write_trajectory_mcap
+
+PLAN_FILE = "plan.json"
+HAND_FILE = "hand.csv"
+PREDICTION_FILE = "predicted_points.csv"
+FILM_FILE = "motion.gif"
+TRAJECTORY_FILE = "trajectory.mcap"
+REPORT_FILE = "report.html"
+CAPTIONS = {
+    "hand": "The hand over time",
+    "commands": "Tensions and pressures, with their limits",
+    "tracking": "Displacements of the points with their 95 % band, and their references, dashed",
+}
+# Form of plan.json.
+SCHEMA = 1
+FRAMES_PER_SECOND = 25.0
+
+
+def write_plan(
+    plan: MotionPlan,
+    folder: str | Path,
+    rate_hz: float | None = None,
+    with_film: bool = True,
+    with_mcap: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+) -> Path:
+    """Write the folder of a plan atomically, and return its path.
+
+    It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
+    acceleration), command_<name>.csv of each planned tendon and pressure, predicted_points.csv,
+    pictures, report.html, plan.json, with `with_film` motion.gif, and, if the problem was read from a file,
+    check.toml and identify.toml for a recorded execution.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Folder, which may contain an earlier plan; that is replaced.
+    rate_hz : float, optional
+        Rate of poses, hand and commands; four times that of the samples by default.
+    with_film : bool
+        Whether to render the motion as a film.
+    with_mcap : bool
+        Whether to write trajectory.mcap, see `write_trajectory_mcap`.
+    say : callable
+        Called with the present activity.
+
+    Raises
+    ------
+    InputError
+        If the folder contains anything but an earlier plan, or cannot be written, or a package for
+        the MCAP file is missing.
+    """
+    target = Path(folder)
+    with replaced_folder(target, marker_file=PLAN_FILE, content_word="plan") as place:
+        t_s = command_times_s(plan, rate_hz)
+        write_poses_csv(place / POSES_FILE, plan.poses(t_s))
+        write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
+        write_commands(plan, place, t_s)
+        for name, content in execution_problems(plan, place, target.resolve()).items():
+            (place / name).write_text(problem_text(name, content), encoding="utf-8")
+        if with_mcap:
+            write_trajectory_mcap(plan, place / TRAJECTORY_FILE, t_s)
+        if plan.points_m:
+            write_markers_csv(
+                place / PREDICTION_FILE,
+                plan.t_s,
+                names=[*plan.points_m],
+                positions_m=np.stack([*plan.points_m.values()], axis=1),
+            )
+        figures = plan_figures(plan)
+        save_pictures(place, figures)
+        pictures = (Picture(place / f"{name}.png", CAPTIONS[name]) for name in figures)
+        title = f"Plan for {plan.program.body.template.name!r}"
+        report = TitledParts(title, (*plan_summary(plan), *pictures), level=1)
+        (place / REPORT_FILE).write_text(report_html(report), encoding="utf-8")
+        if with_film:
+            say("rendering the film of the motion")
+            replay = MotionRecord.from_experiment(
+                plan.fine.experiment, (plan.fine.positions_m, _references_m(plan))
+            )
+            film(replay, place / FILM_FILE, fps=FRAMES_PER_SECOND, names=("predicted", "wanted"))
+        (place / PLAN_FILE).write_text(as_json(plan_json(plan)), encoding="utf-8")
+    return target
+
+
+def command_times_s(plan: MotionPlan, rate_hz: float | None = None) -> Array:
+    """Return the times (P,) since the start at which a controller gets poses [s]: at a rate, to the
+    end of the plan.
+    """
+    last_s = plan.t_s[-1]
+    rate = float(4 / plan.t_s[1]) if rate_hz is None else rate_hz
+    return np.arange(int(np.ceil(last_s * rate - 1e-9)) + 1) / rate
+
+
+def hand_columns(plan: MotionPlan, t_s: Array) -> dict[str, Array]:
+    """Return the hand over time, by name of the column: position, rotation vector from the initial
+    orientation, velocity, angular velocity, acceleration and angular acceleration in world axes.
+    """
+    value, rate, growth = plan.motion.derivatives(t_s)
+    spin, spin_rate = angular_motion(value[:, 3:], rate[:, 3:], curvature=growth[:, 3:])
+    blocks = {
+        "{}_m": value[:, :3] + plan.program.frame.position_m,
+        "r{}_rad": value[:, 3:],
+        "v{}_m_s": rate[:, :3],
+        "w{}_rad_s": spin,
+        "a{}_m_s2": growth[:, :3],
+        "alpha_{}_rad_s2": spin_rate,
+    }
+    return {"t_s": t_s} | {
+        name.format(axis): values[:, k]
+        for name, values in blocks.items()
+        for k, axis in enumerate("xyz")
+    }
+
+
+def _references_m(plan: MotionPlan) -> Array:
+    """Return the wanted positions (T, P, 3) of the points of the plan, NaN where free."""
+    wanted = {name: np.full((len(plan.t_s), 3), np.nan) for name in plan.points_m}
+    for each in plan.program.references:
+        wanted[each.name] = np.where(
+            np.isfinite(each.position_m), each.position_m, wanted[each.name]
+        )
+    return np.stack([*wanted.values()], axis=1) if wanted else np.zeros((len(plan.t_s), 0, 3))
+
+
+def plan_json(plan: MotionPlan) -> dict[str, Any]:
+    """Return the content of plan.json, in types that JSON has."""
+    program = plan.program
+    limiting = plan.limiting_constant
+    times_s = command_times_s(plan)
+    commands = plan.commands(times_s)
+    return {
+        "schema": SCHEMA,
+        "experiment": program.body.template.name,
+        "run": None if program.body.run is None else str(program.body.run),
+        "warnings": list(program.body.warnings),
+        "status": plan.answer.status,
+        "duration_s": program.task.duration_s,
+        "samples": len(plan.t_s),
+        "time_steps": len(program.grid_since_s) - 1,
+        "unknowns": program.space.size,
+        "seconds": plan.seconds,
+        "objective": program.objective_parts(plan.answer.c, plan.answer.x),
+        "history": plan.answer.history,
+        "references": [
+            {"point": each.name, **vars(plan.tracking_error(each))} for each in program.references
+        ],
+        "lowest_frequency_hz": program.lowest_hz if np.isfinite(program.lowest_hz) else None,
+        "residual_vibration_m": plan.residual_vibration_m,
+        "time_step_error_m": plan.time_step_error_m,
+        "description_std_m": program.body.description_std_m,
+        "half_width_after_recording_m": plan.half_width_after_recording_m,
+        "limiting_constant": None
+        if limiting is None
+        else {"name": limiting[0], "share": limiting[1]},
+        "band_contributions": [each._asdict() for each in plan.band_contributions],
+        "limits": {}
+        if not program.task.hand.free
+        else {
+            name: {"limit": getattr(program.limits, name), "share_used": float(share)}
+            for name, share in plan.shares.items()
+        },
+        "limits_reached": plan.list_active_limits(),
+        "binding_limits": [each._asdict() for each in plan.binding_limits],
+        "body": plan.body_extremes,
+        "largest_error_m": plan.largest_error_m,
+        "accepted_error_m": program.task.largest_error_m,
+        "sufficient_duration_s": plan.sufficient_duration_s,
+        "signals": [
+            {
+                "name": each.name,
+                "unit": each.unit,
+                "lowest": float(values.min()),
+                "highest": float(values.max()),
+                "largest_rate": float(np.abs(np.gradient(values, times_s)).max()),
+            }
+            for each, values in zip(program.signals, commands.values(), strict=True)
+        ],
+        "hand": {
+            "intervals": program.space.intervals,
+            "coefficients": plan.motion.coefficients,
+            "initial_position_m": program.frame.position_m,
+        },
+    }
+
+
+def _limit_lines(plan: MotionPlan) -> list[Shown]:
+    """Return the lines about limits, and about an error that is larger than accepted."""
+    lines: list[Shown] = []
+    task = plan.program.task
+    if task.shortest:
+        lines.append(f"shortest duration: {task.duration_s:.3g} s")
+    for each, values in zip(plan.program.signals, plan.commands(plan.t_s).values(), strict=True):
+        lines.append(
+            f"{each.name}: {values.min():.4g} to {values.max():.4g} {each.unit} "
+            f"(limits {each.lowest:.4g} to {each.highest:.4g} {each.unit})"
+        )
+    if plan.exceeds_error:
+        enough_s = plan.sufficient_duration_s
+        longer = (
+            ""
+            if enough_s is None
+            else f"duration_s = {enough_s:.3g} with the times of references in proportion, or "
+        )
+        lines.append(
+            Line(
+                f"the largest error is {1e3 * plan.largest_error_m:.3g} mm, more than "
+                f"largest_error_m; expected {longer}wider limits",
+                "check",
+            )
+        )
+    units = {
+        "largest_stretch": ("largest stretch", 1.0, ""),
+        "clearance_m": ("clearance", 1e3, " mm"),
+    }
+    for key, value in plan.body_extremes.items():
+        words, factor, unit = units[key]
+        limit = factor * getattr(task.avoid, key)
+        lines.append(f"{words}: {factor * value:.4g}{unit} (limit {limit:.4g}{unit})")
+    if plan.exceeds_body_limits:
+        lines.append(
+            Line("no motion was found that keeps the limits of the body; see [avoid]", "check")
+        )
+    if not plan.binding_limits:
+        lines.append(f"limits reached: {', '.join(plan.list_active_limits()) or 'none'}")
+    for each in plan.binding_limits:
+        spans = ", ".join(f"{first:.3g}–{last:.3g}" for first, last in each.spans_s)
+        lines.append(
+            f"{each.name} binds at {spans} s; 1 % more would improve the objective by "
+            f"{100 * each.gain_per_percent:.2g} %"
+        )
+    return lines
+
+
+def _improvement(largest: BandContribution) -> str:
+    """Return the line about the largest contribution to the band, and what reduces it."""
+    percent = f"{100 * largest.share:.0f} % of the band's variance"
+    if largest.constant is None:
+        return f"{percent} come from errors of the description: a finer mesh or another law may reduce them"
+    of_constant = f"the uncertainty of {symbol_of(largest.constant)}"
+    if largest.source == UNKNOWN:
+        return f"{percent} come from {of_constant}"
+    remedy = remedy_for(largest.source)
+    return f"{percent} come from {of_constant} by {largest.source}; to reduce it, {remedy}"
+
+
+def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
+    """Return a plan on one screen, and where it is, if it was written to a folder."""
+    notes: list[Shown] = [Line(f"warning: {text}", "check") for text in plan.program.body.warnings]
+    if plan.interrupted:
+        notes.append(Line("interrupted: the best plan so far", "check"))
+    elif plan.answer.status not in ("converged", "flat"):
+        notes.append(Line(f"the search ended early: {plan.answer.status}", "check"))
+    rows = []
+    for each in plan.program.references:
+        error = plan.tracking_error(each)
+        if not np.isfinite(error.rms_m):
+            continue
+        rows.append(
+            (
+                each.name,
+                f"{1e3 * error.rms_m:.3g}",
+                f"{1e3 * error.largest_m:.3g}",
+                "" if error.band_m is None else f"{1e3 * error.band_m:.3g}",
+            )
+        )
+    shown: list[Shown] = [*notes]
+    if rows:
+        heads = ("point", "RMS error [mm]", "largest [mm]", "95 % band ± [mm]")
+        shown.append(Table("", heads, rows=tuple(rows)))
+    if plan.residual_vibration_m is not None:
+        shown.append(f"residual vibration: {1e3 * plan.residual_vibration_m:.3g} mm")
+    if (limiting := plan.limiting_constant) is not None:
+        shown.append(
+            f"the uncertainty of {symbol_of(limiting[0])} contributes most to the band "
+            f"({100 * limiting[1]:.0f} % of the constants' variance)"
+        )
+    if plan.band_contributions:
+        shown.append(_improvement(plan.band_contributions[0]))
+    if plan.half_width_after_recording_m is not None:
+        shown.append(
+            "if this motion is recorded with the same markers, and identified from too, the band "
+            f"becomes ± {1e3 * plan.half_width_after_recording_m:.3g} mm"
+        )
+    if plan.fine.experiment.is_static:
+        shown.append("static: each sample is an equilibrium")
+    else:
+        shown.append(f"time steps change the points by {1e3 * plan.time_step_error_m:.2g} mm")
+    if (change := plan.fine.branch_change) is not None:
+        shown.append(
+            Line(
+                f"the body does not reach the equilibrium at {change.time_s:.4g} s along a path of "
+                f"stable ones; expected a shorter sample_s, or a task with less load",
+                "check",
+            )
+        )
+    shown += _limit_lines(plan)
+    if folder is None:
+        return shown
+    shown.append(f"written to {folder}; the page is {REPORT_FILE}")
+    if (folder / CHECK_FILE).is_file():
+        shown.append(
+            "next: execute the plan, replace poses.csv and predicted_markers.csv with the recorded "
+            f"files, and run collocation-sysid solve {folder / CHECK_FILE}"
+        )
+    return shown

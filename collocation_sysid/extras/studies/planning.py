@@ -1,0 +1,372 @@
+"""Planning of studies: every run is a problem file with overrides and a method.
+
+Each run can therefore be repeated with ``collocation-sysid solve PROBLEM --method M --set …``. Use
+`plan_comparison` for methods and starts, `plan_sweep` for values of keys, and `plan_models` for
+models.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.installation import package_version
+from ...common.validated_classes import validated
+from ...common.validated_types import AtLeastOne, Count, OneOrMore
+from ...errors import InputError
+from ...problem import Problem
+from ...problem.reading import read_problem_file
+from ...problem.schema import ParameterSection, ProblemFile
+from ...recording.formats.logs import stored_files
+from .arguments import require_few
+from .model_variants import ModelVariant
+
+# Kinds of studies: the names of their commands, which are in summary.json and in folder names.
+METHOD_STUDY = "compare-methods"
+MODEL_STUDY = "compare-models"
+SWEEP_STUDY = "sweep"
+STUDY_TITLES = {
+    METHOD_STUDY: "Comparison of methods",
+    MODEL_STUDY: "Comparison of models",
+    SWEEP_STUDY: "Sweep",
+}
+# Hexadecimal digits of a run's key: 80 bits, so that two of 10,000 runs never agree.
+KEY_LENGTH = 20
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a study."""
+
+    # Hash of everything that determines the result: problem, data files, method, start, options,
+    # version.
+    key: str
+    problem: str  # absolute path of the problem file
+    method: str
+    start: int = 0  # number of the start; 0 is the file's guess
+    overrides: tuple[str, ...] = ()  # overrides "key=value"
+    # mapping of str to float or None: guesses of the estimated parameters; None where there is
+    # none.
+    guess: Mapping[str, float | None] = field(default_factory=dict)
+    # mapping of str to str: values of the swept keys as text; for a comparison of models, "model"
+    # and its label.
+    varied_values: Mapping[str, str] = field(default_factory=dict)
+    allow_code: bool = False  # whether to run the Python files that the problem names
+    # For a comparison of models, the recording that is predicted; "" if all are fitted. None for
+    # other studies.
+    test_name: str | None = None
+
+    def make_label(self) -> str:
+        """Return the short description of the run for the user: model and held-out recording, swept
+        values, or method and start.
+        """
+        if self.test_name is not None:
+            what = f" without '{self.test_name}'" if self.test_name else ""
+            return f"{self.varied_values['model']}{what}"
+        if not self.varied_values:
+            return f"{self.method}, start {self.start}"
+        return ", ".join(
+            f"{short}={self.varied_values[key]}"
+            for key, short in shortened_keys(self.varied_values)
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields of the run as a dictionary, which JSON can represent."""
+        return asdict(self)
+
+
+def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield each dotted key with the shortest ending that distinguishes it from the others, in
+    order; of parameters at least two parts, name and key: "parameters.mu_pa.guess" with
+    "mu_pa.guess". If no ending does, it is the complete key. Of a mapping the keys are used.
+    """
+    for key in keys:
+        parts = key.split(".")
+        fewest_parts = 2 if parts[0] == "parameters" else 1
+        ends = [".".join(parts[-count:]) for count in range(fewest_parts, len(parts) + 1)]
+        unique_ends = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
+        yield key, next(unique_ends, key)
+
+
+@validated
+class Starts:
+    """Starts of the runs: the first at the file's guess, the others around the truth, or the guess
+    without one.
+
+    A start depends only on the seed, its number and the estimated parameters, so that more of them
+    can be added later.
+
+    Attributes
+    ----------
+    starts : int
+        Number of initial guesses; the first is that of the problem file.
+    spread : float
+        Largest factor between an initial guess and the guess of the problem file.
+    seed : int
+        Seed of the random initial guesses.
+    """
+
+    starts: AtLeastOne = 1
+    spread: OneOrMore = 10.0
+    seed: Count = 0
+
+    def __post_init__(self) -> None:
+        require_few(self.starts, "starts", noun="starts")
+
+    def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
+        """Yield the overrides "parameters.NAME.guess=VALUE" of one start: guesses of the estimated
+        parameters, log-uniform around truth or guess within the factor `spread`, limited to the
+        bounds.
+
+        Parameters
+        ----------
+        problem : Problem
+            Problem with its parameters.
+        truth : mapping of str to float
+            True values by name; parameters that it lacks are distributed around their guess.
+        start : int
+            Number of the start; 0 yields nothing.
+
+        Raises
+        ------
+        InputError
+            For a parameter with neither a guess nor a true value.
+        """
+        free = problem.parameters.free if start else ()
+        exponents = np.random.default_rng([self.seed, start]).uniform(-1, 1, len(free))
+        for item, exponent in zip(free, exponents, strict=True):
+            centre = truth.get(item.name, item.guess)
+            if centre is None:
+                raise InputError(
+                    "this parameter has neither a guess nor a true value around which initial guesses "
+                    "could be distributed; expected one of them, or --starts 1",
+                    problem.path,
+                    where=f"parameters.{item.name}",
+                )
+            inside = float(np.clip(centre * self.spread**exponent, item.lower, item.upper))
+            yield f"parameters.{item.name}.guess={inside!r}"
+
+
+def plan_comparison(
+    problem: Problem,
+    methods: Sequence[str],
+    overrides: Sequence[str] = (),
+    starts: Starts | None = None,
+    truth: Mapping[str, float] | None = None,
+    allow_code: bool = False,
+) -> list[PlannedRun]:
+    """Return a run of every method from every start; all methods have the same starts and time
+    grid.
+
+    An automatic number of substeps is replaced by the problem's first one, so that the methods do
+    not choose their own. Runs are ordered by start, then by method.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem read from its file with the same overrides.
+    overrides : sequence of str
+        Overrides "key=value".
+    starts : Starts, optional
+        Starts; the file's guess alone by default.
+    truth : mapping of str to float, optional
+        True values by name.
+    allow_code : bool
+        Whether to run the Python files that the problem names.
+
+    Raises
+    ------
+    InputError
+        For starts around a parameter without guess and true value, and for a problem without a
+        file.
+    """
+    starts = starts or Starts()
+    if problem.path is None:
+        raise InputError(
+            "this problem has no file, but the processes of a study read the problem from a "
+            "file; write one, and use Problem.read"
+        )
+    if problem.substeps == "auto":  # or each method would choose for itself
+        overrides = [*overrides, f"transcription.substeps={problem.choose_first_substeps()}"]
+    planned = []
+    for start in range(starts.starts):
+        start_overrides = [*overrides, *starts.overrides(problem, truth or {}, start=start)]
+        file, _ = read_problem_file(problem.path, start_overrides)
+        details = {"start": start, "allow_code": allow_code}
+        planned += [
+            _planned_run(problem.path, file, method=method, overrides=start_overrides, **details)
+            for method in methods
+        ]
+    return planned
+
+
+def plan_sweep(
+    path: Path,
+    over: Mapping[str, Sequence[str]],
+    overrides: Sequence[str] = (),
+    method: str | None = None,
+    allow_code: bool = False,
+) -> list[PlannedRun]:
+    """Return a run of every combination of the swept values; the last key changes fastest.
+
+    Parameters
+    ----------
+    path : Path
+        Problem file.
+    over : mapping of str to sequence of str
+        Values as text by key.
+    overrides : sequence of str
+        Further overrides "key=value".
+    method : str, optional
+        Name of the method; the file's own by default.
+    allow_code : bool
+        Whether to run the Python files that the problem names.
+
+    Raises
+    ------
+    InputError
+        For a key or value that the problem file does not accept.
+    """
+    read_problem_file(path, overrides)
+    planned = []
+    for values in itertools.product(*over.values()):
+        varied_values = dict(zip(over, values, strict=True))
+        run_overrides = [*overrides, *(f"{key}={value}" for key, value in varied_values.items())]
+        try:
+            file, _ = read_problem_file(path, run_overrides)
+        except InputError as error:
+            where = "--over" if error.source == "--set" else error.source
+            raise InputError(error.message, where, where=error.where) from error
+        details = {"varied_values": varied_values, "allow_code": allow_code}
+        planned.append(_planned_run(path, file, method=method, overrides=run_overrides, **details))
+    return planned
+
+
+def plan_models(
+    problem: Problem,
+    variants: Sequence[ModelVariant],
+    method: str | None = None,
+    allow_code: bool = False,
+) -> list[PlannedRun]:
+    """Return runs that fit every model to all recordings, and to all but each one.
+
+    Of a single recording, the last third is held out.
+
+    Runs are ordered by the held-out recording, first "" (all are fitted), then by model.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with the recordings.
+    method : str, optional
+        Name of the method; the file's own by default.
+    allow_code : bool
+        Whether to run the Python files that the problem names.
+
+    Raises
+    ------
+    InputError
+        For a model that its problem file does not accept, and for a fitted recording that has
+        neither markers nor a measured force, and is no test of a specimen.
+    """
+    require_predictable(problem)
+    planned = []
+    for test_name in ("", *fitted_recordings(problem)):
+        for variant in variants:
+            file, _ = read_problem_file(variant.path, variant.overrides)
+            details = {"varied_values": {"model": variant.label}, "test_name": test_name}
+            details |= {"allow_code": allow_code}
+            planned.append(
+                _planned_run(
+                    variant.path, file, method=method, overrides=variant.overrides, **details
+                )
+            )
+    return planned
+
+
+def require_predictable(problem: Problem) -> None:
+    """Raise an `InputError` for a fitted recording that has neither markers nor a measured force,
+    and is no test of a specimen: models are compared by their predictions of these.
+    """
+    for each in problem.experiments:
+        is_compared = (
+            each.markers.count_samples() or each.sensors_by_grasp or each.specimen is not None
+        )
+        if not (each.validation or is_compared):
+            raise InputError(
+                f"'{each.name}' has neither markers nor a measured force; expected one of these, "
+                "because models are compared by their predictions of these, not of images "
+                "or readings"
+            )
+
+
+def fitted_recordings(problem: Problem) -> list[str]:
+    """Return the names of the experiments of a problem that are fitted, in its order; those for
+    validation are left out.
+    """
+    return [e.name for e in problem.experiments if not e.validation]
+
+
+def _planned_run(
+    path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
+) -> PlannedRun:
+    """Return the run of a file with its overrides, with a key that depends on all that decides its
+    result.
+
+    The key is a hash of the content of the file (with only the solver's options for this method),
+    the start, for a comparison of models the held-out recording, the data files, and the version of
+    this package; not of the path.
+    """
+    method = method or file.solver.method
+    start = more.get("start", 0)
+    guess = {
+        name: section.guess
+        for name, section in file.parameters.items()
+        if isinstance(section, ParameterSection)
+        and section.fixed is None
+        and section.tied_to is None
+    }
+    content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
+    solver = content.get("solver", {})
+    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
+    content["solver"]["method"] = method
+    of_study = start if more.get("test_name") is None else f"without {more['test_name']}"
+    hashes = _file_hashes(content, path.parent)
+    decisive = [content, of_study, hashes, package_version()]
+    text = json.dumps(decisive, sort_keys=True)
+    key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
+    return PlannedRun(
+        key, str(path.resolve()), method=method, overrides=tuple(overrides), guess=guess, **more
+    )
+
+
+def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
+    """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
+    problem names, so that changed data give another run. A topic of a log with several files has
+    their hashes, separated by spaces. Names of missing files and of folders are left out.
+    """
+    hashes = {}
+    for text in _texts(content):
+        with suppress(OSError, ValueError):  # a text that is no file's name
+            if files := stored_files(folder / text):
+                each = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+                hashes[text] = " ".join(each)
+    return hashes
+
+
+def _texts(content: Any) -> Iterator[str]:
+    """Yield all texts in nested mappings, lists and tuples; keys are not included."""
+    if isinstance(content, str):
+        yield content
+    elif isinstance(content, Mapping):
+        yield from itertools.chain.from_iterable(map(_texts, content.values()))
+    elif isinstance(content, (list, tuple)):
+        yield from itertools.chain.from_iterable(map(_texts, content))

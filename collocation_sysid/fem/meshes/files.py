@@ -1,0 +1,358 @@
+"""Mesh files, read and written through meshio as plain arrays.
+
+`mesh.TetMesh.read` and `TetMesh.write` use these functions.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.files import require_regular
+from ...errors import InputError
+from .checks import straightening_notes
+from .meshio_reader import MeshContent, read_content
+
+METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
+
+_TETRAHEDRA = ("tetra", "tetra10")
+_TRIANGLES = ("triangle", "triangle6")
+_SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
+
+
+def length_in_metres(length_unit: str) -> float:
+    """Return the length of one "m", "cm", "mm", "um" or "in" in metres.
+
+    Raises
+    ------
+    InputError
+        For an unknown unit.
+    """
+    if length_unit not in METRES_PER_UNIT:
+        known = ", ".join(f'"{unit}"' for unit in METRES_PER_UNIT)
+        raise InputError(f"length unit {length_unit!r} is unknown; use one of {known}")
+    return METRES_PER_UNIT[length_unit]
+
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class TetrahedraContent:
+    """Tetrahedra of a mesh file, with the data on them."""
+
+    # (n, 3) float64: all points of the file [m], also those that no tetrahedron has.
+    points_m: np.ndarray
+    tetrahedra: np.ndarray  # (E, 4): node indices, E > 0, in the order of the file
+    # dict of name to (n, ...): point data of the file, and as booleans its point sets and the nodes
+    # of its cell sets and physical groups, whatever the dimension of their cells.
+    point_arrays: Arrays
+    # dict of name to (E, ...): cell data, cell sets and physical groups of the tetrahedra.
+    cell_arrays: Arrays
+    # dict of name to (k, 3): triangles of the file, by their cell sets and physical groups, and by
+    # cell data that are 1 on them and 0 on others.
+    face_sets: Arrays
+    notes: tuple[str, ...]  # sentences about omitted cells and straightened sides, if any
+
+
+def read_tetrahedra(path: str | Path, length_unit: str = "m") -> TetrahedraContent:
+    """Read the tetrahedra of a file, quadratic ones by their corners; other cells are omitted.
+
+    The mesh is not checked beyond its sides, see `checks`.
+
+    Parameters
+    ----------
+    path : str or Path
+        File whose extension states the format.
+    length_unit : {"m", "cm", "mm", "um", "in"}
+        Unit of the coordinates in the file.
+
+    Raises
+    ------
+    InputError
+        If the unit is unknown, the file cannot be read, contains no tetrahedra, or their sides are
+        strongly curved.
+    """
+    metres = length_in_metres(length_unit)
+    with _read_with_meshio(path) as data:
+        return _tetrahedra(data, metres)
+
+
+def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
+    """Return the same as `read_tetrahedra` from the data of meshio."""
+    counts = _cell_counts(data)
+    points_m = np.asarray(data.points, dtype=float) * metres
+    blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
+    if not blocks:
+        filled = (
+            "; a closed surface can be filled with tetrahedra: state it as surface, with "
+            "edge_length_m, in [object] (in Python TetMesh.from_surface)"
+        )
+        hint = filled if "triangle" in counts else ""
+        raise InputError(
+            f"found {_listed(counts)}, but no tetrahedra; expected a mesh of the volume with cells "
+            f"of meshio's type tetra or tetra10{hint}"
+        )
+    notes = _note_omitted_cells(counts)
+    quadratic = [block.data for block in blocks if block.type == "tetra10"]
+    if quadratic:
+        notes += straightening_notes(points_m, np.concatenate(quadratic))
+    # Where a cell is in several groups, the sets of a .msh file tell all, its tags only the first.
+    groups = {**_physical_groups(data), **_cell_sets(data)}
+    nodes = {name: _nodes_of(data, per_block) for name, per_block in groups.items()}
+    cell_arrays = {**groups, **data.cell_data}
+    return TetrahedraContent(
+        points_m,
+        np.concatenate([block.data[:, :4] for block in blocks]),
+        point_arrays={**nodes, **_point_sets(data), **data.point_data},
+        cell_arrays=_of_tetrahedra(data, cell_arrays),
+        face_sets=_triangle_sets(data, cell_arrays),
+        notes=notes,
+    )
+
+
+def read_triangles(path: str | Path, length_unit: str = "m") -> tuple[np.ndarray, np.ndarray]:
+    """Read the vertices (p, 3) in metres and triangles (F, 3) of a surface file.
+
+    Quadrilaterals and polygons are split into triangles, as fans about their first corner; other
+    cells are ignored. The surface is not checked.
+
+    Parameters
+    ----------
+    path : str or Path
+        File whose extension states the format.
+    length_unit : {"m", "cm", "mm", "um", "in"}
+        Unit of the coordinates in the file.
+
+    Raises
+    ------
+    InputError
+        If the unit is unknown, the file cannot be read or contains no triangles.
+    """
+    metres = length_in_metres(length_unit)
+    with _read_with_meshio(path) as data:
+        faces = [
+            np.asarray(block.data, dtype=np.int64)
+            for block in data.cells
+            if block.type in ("triangle", "quad", "polygon") and len(block.data)
+        ]
+        # A face of fewer than three corners, of which there is nothing to join, is a damaged file.
+        fans = [
+            np.concatenate([face[:, [0, k, k + 1]] for k in range(1, face.shape[1] - 1)])
+            for face in faces
+        ]
+        if not fans:
+            raise InputError(
+                f"found {_listed(_cell_counts(data))}, but no triangles; expected a surface of "
+                "triangles, quadrilaterals or polygons"
+            )
+        # An OBJ vertex may carry a colour after its coordinates.
+        return np.asarray(data.points, dtype=float)[:, :3] * metres, np.concatenate(fans)
+
+
+def write_tetrahedra(
+    path: str | Path,
+    points_m: np.ndarray,
+    tetrahedra: np.ndarray,
+    point_arrays: Mapping[str, np.ndarray] | None = None,
+    cell_arrays: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Write a mesh, in metres, to any format that meshio knows by the file's extension; booleans
+    become integers.
+
+    Parameters
+    ----------
+    path : str or Path
+        Replaced if it exists.
+    points_m : (n, 3)
+    tetrahedra : (E, 4) int
+    point_arrays, cell_arrays : mapping of name to array, optional
+        Values of each point and each tetrahedron; none by default.
+
+    Raises
+    ------
+    InputError
+        If the format is unknown or cannot hold the mesh.
+    OSError
+        If the file cannot be created.
+    """
+    import meshio  # slow to import
+
+    point_data: dict[str, Any] = {n: _without_booleans(v) for n, v in (point_arrays or {}).items()}
+    cell_data: dict[str, Any] = {n: [_without_booleans(v)] for n, v in (cell_arrays or {}).items()}
+    mesh = meshio.Mesh(points_m, [("tetra", tetrahedra)], point_data, cell_data)
+    with _as_input_error(path, "written"):
+        meshio.write(path, mesh)
+
+
+def _without_booleans(values: np.ndarray) -> np.ndarray:
+    """Return booleans as uint8, because few formats have a boolean type; other arrays unchanged."""
+    return values.astype(np.uint8) if values.dtype == bool else values
+
+
+@contextlib.contextmanager
+def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
+    """Context that gives the content of a file."""
+    if not Path(path).is_file():
+        raise InputError("there is no such file", path)
+    require_regular(path)
+    try:
+        content = read_content(path)
+    except InputError as error:
+        raise _unreadable_error("read", error.message, path=path) from error
+    with _as_input_error(path, "read"):
+        yield content
+
+
+@contextlib.contextmanager
+def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
+    """Turn a failure on an invalid file into one `InputError`, and print nothing."""
+    captured = io.StringIO()
+    try:
+        with (
+            contextlib.redirect_stdout(captured),
+            contextlib.redirect_stderr(captured),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
+            yield
+    except InputError as error:
+        raise error.located(path) from None
+    except (Exception, SystemExit) as error:
+        if isinstance(error, OSError) and done == "written":  # it tells its file itself
+            raise
+        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
+        raise _unreadable_error(done, reason, path=path) from error
+
+
+def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
+    """Return the error for a file that cannot be read or written as a mesh."""
+    if missing := re.search(r"No module named '(\w+)'", reason):
+        package = missing[1]
+        return InputError(
+            f"the format {Path(path).suffix} needs the package {package}, which is not installed: "
+            f"pip install {package}; or convert the mesh to .vtu",
+            path,
+        )
+    return InputError(
+        f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, .mesh "
+        "and .inp are known, recognised by the file's ending",
+        path,
+    )
+
+
+def _point_sets(data: MeshContent) -> dict[str, np.ndarray]:
+    """Return the point sets of a file as boolean arrays."""
+    sets = {}
+    for name, nodes in (data.point_sets or {}).items():
+        sets[name] = np.zeros(len(data.points), dtype=bool)
+        sets[name][np.asarray(nodes, dtype=np.int64)] = True
+    return sets
+
+
+def _cell_sets(data: MeshContent) -> dict[str, list[np.ndarray]]:
+    """Return the cell sets of a file as boolean arrays, block by block."""
+    sets = {}
+    for name, per_block in (data.cell_sets or {}).items():
+        if name == "gmsh:bounding_entities":  # numbers of entities, not of cells
+            continue
+        sets[name] = [np.zeros(len(block.data), dtype=bool) for block in data.cells]
+        for mask, cells in zip(sets[name], per_block, strict=False):
+            if cells is not None:
+                mask[np.asarray(cells, dtype=np.int64)] = True
+    return sets
+
+
+def _physical_groups(data: MeshContent) -> dict[str, list[np.ndarray]]:
+    """Return the physical groups of a .msh file by name, as boolean arrays block by block."""
+    tags = [np.asarray(block).ravel() for block in data.cell_data.get("gmsh:physical", ())]
+    if not tags:
+        return {}
+    names = {tuple(map(int, key)): name for name, key in (data.field_data or {}).items()}
+    masks: dict[tuple[int, int], list[np.ndarray]] = {}
+    for dimension in range(4):
+        tags_of_dimension = [
+            np.where(b.dim == dimension, t, 0) for b, t in zip(data.cells, tags, strict=True)
+        ]
+        for tag in np.unique(np.concatenate(tags_of_dimension)):
+            if tag > 0:
+                masks[int(tag), dimension] = [block == tag for block in tags_of_dimension]
+    nameless = Counter(tag for tag, dimension in masks if (tag, dimension) not in names)
+    return {
+        names.get(key) or _group_name(*key, nameless[key[0]] > 1): m for key, m in masks.items()
+    }
+
+
+def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
+    """Return "physical_3", or "physical_3_surface" if other dimensions have this tag too."""
+    kind = ("points", "lines", "surface", "volume")[dimension]
+    return f"physical_{tag}_{kind}" if ambiguous else f"physical_{tag}"
+
+
+def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
+    """Return the mask (n,) of the nodes of cells selected by one mask for each block."""
+    chosen = np.zeros(len(data.points), dtype=bool)
+    for block, mask in zip(data.cells, masks, strict=True):
+        chosen[np.asarray(block.data)[mask].ravel()] = True
+    return chosen
+
+
+def _of_tetrahedra(data: MeshContent, arrays: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the values (E, …) on tetrahedra of arrays given block by block, by name."""
+    tetrahedra = [block.type in _TETRAHEDRA and len(block.data) > 0 for block in data.cells]
+    selected = {}
+    for name, per_block in arrays.items():
+        parts = [
+            np.asarray(p)
+            for p, is_selected in zip(per_block, tetrahedra, strict=True)
+            if is_selected
+        ]
+        values = np.concatenate(parts)
+        if values.dtype != bool or values.any():
+            selected[name] = values
+    return selected
+
+
+def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
+    """Return the triangles (k, 3) on which arrays of only 0 and 1, by block, are 1."""
+    blocks = [k for k, block in enumerate(data.cells) if block.type in _TRIANGLES]
+    sets = {}
+    for name, per_block in arrays.items():
+        masks = [np.asarray(per_block[k]) for k in blocks]
+        if masks and all(m.ndim == 1 and np.isin(m, (0, 1)).all() for m in masks):
+            chosen = [data.cells[k].data[m == 1, :3] for k, m in zip(blocks, masks, strict=True)]
+            if any(map(len, chosen)):
+                sets[name] = np.concatenate(chosen)
+    return sets
+
+
+def _cell_counts(data: MeshContent) -> Counter[str]:
+    """Return the number of cells by their type."""
+    counts: Counter[str] = Counter()
+    for block in data.cells:
+        counts[block.type] += len(block.data)
+    return counts
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    """Return counts as text, such as "12 tetra, 3 line"; "no cells at all" if empty."""
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
+
+
+def _note_omitted_cells(counts: Mapping[str, int]) -> tuple[str, ...]:
+    """Return a note on cells other than tetrahedra, which are omitted; empty if there are none."""
+    others = {name: count for name, count in counts.items() if name not in _TETRAHEDRA and count}
+    if not others:
+        return ()
+    solid = any(name.startswith(_SOLID_CELLS) for name in others)
+    warning = ": this part of the body is missing. Mesh it with tetrahedra" if solid else ""
+    return (f"Cells other than tetrahedra were left out ({_listed(others)}){warning}.",)

@@ -1,0 +1,120 @@
+"""Pressures of a complementarity problem as variables of the program, with their equations.
+
+For evaluations k with an equation of motion, in the unit δ of the pressures,
+
+    (b_k + g(ξ_k) − √((b_k − g(ξ_k))² + 4 r δ²)) / δ = 0,   variables b_k / δ,
+
+with the pressure variable b, the gap g and the relaxation r of a
+`model.point_forces.ComplementarityForce`. The structure is that of a force history
+(`force_histories`), but b belongs to the evaluation itself instead of the one before. The
+variables are not negative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...model.point_forces import ComplementarityForce
+from ..experiment_iterate import ExperimentIterate
+from ..linear_algebra.sparse_assembly import EntryBlock
+from ..motion_transcription import WeightedHistory
+from .force_histories import LiftedForceHistory
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedPressure(LiftedForceHistory):
+    """Lifted pressure variables b of one force of one experiment; their lower bound is 0."""
+
+    kind = "pressure"
+    lower_bound = 0.0  # type: ignore[override]
+
+    @property
+    def first_evaluation(self) -> int:  # type: ignore[override]
+        """Index of the evaluation that the first variables belong to: the first with an equation of
+        motion.
+        """
+        return self.transcription.dynamics.first_row
+
+    @property
+    def unit_m(self) -> float:
+        """Unit δ of the variables and of the equations [m]."""
+        return self._find_force().pressure_unit_m
+
+    def _find_force(self) -> ComplementarityForce:
+        """Return the force that has the pressures."""
+        term = self.transcription.dynamics.forces.external_terms[self.force_index]
+        assert isinstance(term, ComplementarityForce)
+        return term
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (1, evaluations, I): evaluations with an equation
+        of motion, and I points.
+        """
+        return 1, self.transcription.constraint_times, self._points.count
+
+    def consistent_values(self, iterate: ExperimentIterate) -> Array:
+        """Return the scaled variables (count,) that satisfy the equations at the iterate's
+        positions.
+        """
+        xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
+        return self._find_force().scaled_pressures(xi).ravel() / self.unit_m
+
+    def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
+        """Return a copy of the iterate with the scaled pressures b (1, N, I) [m] of this force
+        taken from z; b is zero at a stated initial state.
+        """
+        b = np.zeros((1, self.transcription.grid_times, self._points.count))
+        b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(self.shape)
+        return replace(iterate, lifted_pressures={**iterate.lifted_pressures, self.force_index: b})
+
+    def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:
+        """Return the scaled complementarity equations (count,) at an iterate; z is not used,
+        because the iterate contains b.
+        """
+        return (
+            self._history_of(iterate).internal_variables(slice(self.first_evaluation, None)).ravel()
+            / self.unit_m
+        )
+
+    def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
+        """Return the history and its weights μ (1, N, I) in the Lagrangian, such that multipliers ·
+        equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k; `multipliers` are
+        those of all constraints g.
+        """
+        mu = np.zeros((1, self.transcription.grid_times, self._points.count))
+        mu[:, self.first_evaluation :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
+        return self._history_of(iterate), mu
+
+    def _jacobian_blocks(self) -> Iterator[EntryBlock]:
+        """Yield the entries of the equations by b and by x, then those of the motion by b."""
+        rows = self.offsets.row + self._indices
+        columns = self.offsets.variable + self._indices
+        instance = self._points.nonzero_weights[0]
+        yield EntryBlock([rows], [columns])
+        for here, x, *_ in self._position_lags(self.first_evaluation):
+            yield EntryBlock([rows[:, here][..., instance]], [x])
+        for pairs, k, row, _ in self._motion_entries():
+            yield EntryBlock(
+                [row], [columns[:, k[:, None] - self.first_evaluation, instance[pairs]]]
+            )
+
+    def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
+        """Return the scaled equations (count,) at an iterate, and the values of `jacobian_entries`;
+        z is not used.
+        """
+        history = self._history_of(iterate)
+        d = self._points.dofs
+        slopes = history.derivatives(slice(None))
+        by = type(slopes)(*(each[d:, :, self.first_evaluation :] / self.unit_m for each in slopes))
+        blocks = [self.unit_m * by.b]
+        blocks += [
+            self.transcription.length_m * each
+            for each in self._position_derivatives(self.first_evaluation, by)
+        ]
+        blocks += self._motion_derivatives(slopes)
+        return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])

@@ -1,0 +1,286 @@
+"""Check of natural modes: oscillation of the body in its grasps, and its resolution by the time
+grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.array_types import Array
+from ...errors import SimulationError
+from ...model.forces import Forces
+from ...model.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
+from ...model.schemes import Scheme
+from ...program.forward.initial_equilibrium import equilibrium
+from ...program.forward.newton_solver import NewtonSolver
+from ...program.modes.natural import Modes, natural_modes
+from ...recording.experiment import Experiment
+from ...statistics.concerns import Concern, concern_if
+
+# Number of modes.
+MODE_COUNT = 6
+# Largest numerical damping ratio, as a share of the material's.
+DAMPING_SHARE = 0.1
+# Largest numerical damping ratio of a mode with little damping.
+LEAST_DAMPING_LIMIT = 0.005
+# Fewest grid steps per period with which the motion of a mode is computed well.
+FEW_STEPS = 8
+# Fewest samples per period with which the motion of a mode is measured well.
+FEW_SAMPLES = 3
+# Scheme without numerical damping.
+UNDAMPED = "midpoint"
+# Decimals of numerical damping ratios: further ones are rounding.
+ROUNDING = 12
+
+
+@dataclass(frozen=True)
+class ModeCheck:
+    """One natural mode."""
+
+    frequency_hz: float  # undamped natural frequency
+    # Samples of the recording, and steps of the time grid.
+    samples_per_period: float
+    steps_per_period: float
+    damping_ratio: float  # damping ratio of the mode by the material; 1 or more if it is overdamped
+    # Damping ratio that the scheme adds; negative where it takes some away.
+    numerical_damping_ratio: float
+    period_error: float  # relative lengthening of the undamped period by the scheme
+
+
+@dataclass(frozen=True)
+class ModesCheck:
+    """Natural modes of the body in one experiment, and errors of the time scheme."""
+
+    experiment: str
+    about: str  # state about which the body oscillates: "rest state" or "undeformed shape"
+    modes: tuple[ModeCheck, ...]
+    scheme: str  # name of the time scheme
+    timestep_s: float  # step of the time grid
+    duration_s: float  # duration of the recording
+    # The fewest with which the scheme damps and slows the first mode little; None if too many.
+    substeps_needed: int | None
+    not_oscillating: int  # number of rigid modes that were left out
+
+    @property
+    def first_mode(self) -> ModeCheck | None:
+        """Mode of the lowest frequency; None if there is none."""
+        return self.modes[0] if self.modes else None
+
+
+def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Array) -> ModesCheck:
+    """Return the natural modes of an experiment about the sample with fewest prescribed dofs, and
+    the errors of the scheme.
+
+    Of several such samples the last counts, when all point masses have joined. The state is the
+    equilibrium if it can be found, else the undeformed shape.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Experiment that moves.
+    scheme : Scheme
+        Time scheme of the solve.
+    step_s : float
+        Step of the time grid [s].
+    theta : array
+        Constants θ of the body.
+
+    Raises
+    ------
+    SimulationError
+        If the body has no stress-free shape at θ, or a factorisation fails.
+    """
+    is_prescribed = experiment.is_prescribed(experiment.t_s)
+    count = is_prescribed.sum(axis=(1, 2))
+    least = int(np.flatnonzero(count == count.min())[-1])
+    time_s = float(experiment.t_s[least])
+    x, about = _reference_state(experiment, is_prescribed[least], time_s=time_s, theta=theta)
+    free = np.flatnonzero(~is_prescribed[least])
+    modes = natural_modes(
+        Forces.from_experiment(experiment, time_s, theta=theta), x, free_dofs=free, count=MODE_COUNT
+    )
+    findings = _mode_findings(modes, experiment, scheme=scheme, step_s=step_s)
+    needed = None
+    if findings:
+        omega = float(modes.compute_angular_frequencies_rad_s()[0])
+        limit = _damping_limit(findings[0])
+        ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
+        needed = substeps_needed(
+            scheme,
+            omega,
+            timestep_s=experiment.timestep_s,
+            damping_limit=limit,
+            damping_ratio=ratio,
+        )
+    return ModesCheck(
+        experiment.name,
+        about,
+        modes=findings,
+        scheme=scheme.name,
+        timestep_s=step_s,
+        duration_s=experiment.duration_s,
+        substeps_needed=needed,
+        not_oscillating=modes.omitted_count,
+    )
+
+
+def _reference_state(
+    experiment: Experiment, is_prescribed: NDArray[np.bool_], time_s: float, theta: Array
+) -> tuple[Array, str]:
+    """Return positions about which the body oscillates, and the name of this state: the equilibrium
+    if nodes are held and it can be found ("rest state"), else the undeformed shape, placed rigidly
+    ("undeformed shape").
+    """
+    if is_prescribed.any():
+        try:
+            solver = NewtonSolver(experiment, prescribed=is_prescribed)
+            return equilibrium(experiment, theta, time_s=time_s, solver=solver), "rest state"
+        except SimulationError:
+            pass
+    return experiment.rigid_positions([time_s])[0], "undeformed shape"
+
+
+def _mode_findings(
+    modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
+) -> tuple[ModeCheck, ...]:
+    """Return frequency, samples and steps per period, damping ratio, and the errors of the scheme
+    in period and damping, for each mode, lowest first.
+    """
+    findings = []
+    for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
+        omega = 2 * np.pi * frequency
+        undamped = numerical_mode(scheme, omega, timestep_s=step_s)
+        damped = numerical_mode(
+            scheme, omega, timestep_s=step_s, damping_ratio=_oscillating_damping_ratio(float(ratio))
+        )
+        findings.append(
+            ModeCheck(
+                float(frequency),
+                float(1 / frequency / experiment.timestep_s),
+                steps_per_period=float(1 / frequency / step_s),
+                damping_ratio=float(ratio),
+                numerical_damping_ratio=round(damped.damping_ratio, ROUNDING) + 0.0,  # no −0
+                period_error=undamped.period_error,
+            )
+        )
+    return tuple(findings)
+
+
+def _oscillating_damping_ratio(damping_ratio: float) -> float:
+    """Return the damping ratio of an oscillating mode; 0 for an overdamped one.
+
+    The scheme's change of the damping of an overdamped mode does not matter.
+    """
+    return damping_ratio if damping_ratio < 1 else 0.0
+
+
+def _damping_limit(mode: ModeCheck) -> float:
+    """Return the largest numerical damping ratio that is accepted for a mode: a share of its own
+    damping ratio, or a small absolute value if that is larger.
+    """
+    return max(DAMPING_SHARE * mode.damping_ratio, LEAST_DAMPING_LIMIT)
+
+
+def mode_concerns(motion: ModesCheck) -> list[Concern]:
+    """Return concerns about the time grid and the recording at the first mode; none without a mode.
+
+    There is at most one about the grid (numerical damping, or too few steps per period), one if the
+    period has too few samples, and one if the recording is shorter than the period.
+    """
+    mode = motion.first_mode
+    if mode is None:
+        return []
+    first = _first_mode_data(motion, mode)
+    samples = mode.samples_per_period
+    rate_data = {"samples": samples, "needed_hz": FEW_STEPS * mode.frequency_hz}
+    is_short = motion.duration_s * mode.frequency_hz < 1
+    duration_data = {"duration_s": motion.duration_s}
+    return [
+        *_grid_concerns(motion, mode),
+        *concern_if(samples < FEW_SAMPLES, False, code="information/rate", **first, **rate_data),
+        *concern_if(is_short, False, code="information/short", **first, **duration_data),
+    ]
+
+
+def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
+    """Return at most one concern about the scheme and the step at the first mode `mode`.
+
+    It is that the scheme adds or takes too much damping; otherwise, that there are fewer than
+    `FEW_STEPS` steps per period. The list is empty if neither is the case.
+    """
+    first = _first_mode_data(motion, mode)
+    added = mode.numerical_damping_ratio
+    if abs(added) > _damping_limit(mode):
+        remedy = _step_remedy(motion)
+        if motion.scheme != UNDAMPED:
+            or_finer = "" if motion.substeps_needed is None else f", or {_substeps_setting(motion)}"
+            remedy = f'set transcription.scheme = "{UNDAMPED}"{or_finer}'
+        grid = {"scheme": motion.scheme, "step_ms": 1e3 * motion.timestep_s, "ratio": abs(added)}
+        code = "scheme/adds" if added > 0 else "scheme/takes"
+        return [Concern(code, data=first | grid | {"remedy": remedy})]
+    steps = {
+        "steps": mode.steps_per_period,
+        "error": mode.period_error,
+        "remedy": _step_remedy(motion),
+    }
+    few = mode.steps_per_period < FEW_STEPS
+    return concern_if(few, False, code="scheme/coarse", **first, **steps)
+
+
+def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
+    """Return the name of the experiment of `motion` and the frequency of `mode` [Hz], as data of a
+    concern under the keys "experiment" and "frequency_hz".
+    """
+    return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
+
+
+def mode_notes(motion: ModesCheck) -> list[str]:
+    """Return notes on the modes of a recording; empty if there is nothing to note.
+
+    There may be one on rigid modes, one if the first mode is overdamped at the guess, and one if
+    the scheme lengthens the first period by more than `PERIOD_ERROR`, unless a concern about the
+    grid says more.
+    """
+    notes = []
+    mode = motion.first_mode
+    name = motion.experiment
+    if motion.not_oscillating:
+        notes.append(
+            f"{motion.not_oscillating} modes of '{name}' are rigid motions that no grasp "
+            "prevents; they do not oscillate and are not listed"
+        )
+    if mode is None:
+        return notes
+    if mode.damping_ratio >= 1:
+        notes.append(
+            f"the first mode of '{name}' is overdamped at the guess (damping ratio "
+            f"{mode.damping_ratio:.2g}): if the recording oscillates, state a guess with less "
+            "damping"
+        )
+    if mode.period_error > PERIOD_ERROR and not _grid_concerns(motion, mode):
+        notes.append(
+            f"{motion.scheme} lengthens the first period of '{name}' by {mode.period_error:.1%}, "
+            f"so that the estimated stiffness will be about {2 * mode.period_error:.1%} too high: "
+            f"{_step_remedy(motion)}"
+        )
+    return notes
+
+
+def _step_remedy(motion: ModesCheck) -> str:
+    """Return the remedy for too few steps as a sentence without an end: a setting of the substeps,
+    or a higher rate if too many would be needed.
+    """
+    if motion.substeps_needed is None:
+        return "record at a higher rate"
+    return f"set transcription.{_substeps_setting(motion)}"
+
+
+def _substeps_setting(motion: ModesCheck) -> str:
+    """Return the setting of the substeps that are needed, "substeps = 4" for example, without its
+    table; `motion.substeps_needed` must not be None.
+    """
+    return f"substeps = {motion.substeps_needed}"

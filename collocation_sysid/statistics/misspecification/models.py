@@ -1,0 +1,427 @@
+"""Misspecification hypotheses about the model of a body: its laws, its mesh, and how the mesh was
+made.
+
+Each hypothesis is one more column of the linearised fit: the change of the residuals along the
+motion of the fit if the body had another law, another width along an axis of the mesh, a round
+section in place of a square one or the reverse, a finer mesh, or if its mesh had been made under its
+weight. The decrease of χ² by one Gauss–Newton step says which are worth a refit (`screened_bodies`);
+of a finer mesh this step is the only test. Mirror images of the mesh are too different for a linear
+step.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...common.array_types import Array
+from ...errors import InputError, SimulationError
+from ...fem.body import Body
+from ...fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
+from ...fem.meshes.mesh import TetMesh
+from ...fem.rest_shape import UnderGravity
+from ...methods.solution import Solution
+from ...recording.deviation import Deviation
+from ...recording.experiment import Experiment
+from ..budget.consider_analysis import changed_residuals
+from ..budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
+from ..budget.shape_error import GRAVITY_M_S2, other_section, sag_m
+from ..budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect, shape_effect
+from ..linearised import LinearisedFit, linearise_fit
+from ..thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
+from .hypothesis import Correction, Hypothesis, corrected_hypothesis
+
+AXES = "xyz"
+# Most hypotheses of a screening that are fitted again.
+MOST_REFITS = 5
+# The same of one kind.
+MOST_OF_A_KIND = 2
+# Distance of the nodes of a mirrored mesh from the mesh, over the largest extent, up to which they
+# are the same shape.
+SAME_SHAPE = 0.02
+# Smallest and largest error of a mesh over the change to half the edge lengths: with the order of
+# convergence n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
+MESH_AMPLITUDES = (0.5, 3.5)
+# Share of the weight in a scan that is taken as the whole weight.
+WHOLE_WEIGHT = (0.4, 2.0)
+
+
+@dataclass(frozen=True)
+class LinearCorrection:
+    """Correction of the description whose effect is known to first order only."""
+
+    share: float  # χ² of the fit with the correction over that without
+
+
+def other_materials(body: Body) -> tuple[str, ...]:
+    """Return the names of materials with the same constants as all parts of a body have."""
+    own = {part.material for part in body.parts}
+    if len(own) > 1 or body.has_memory:
+        return ()
+    (material,) = own
+    names = [constant.name for constant in material.constants]
+    return tuple(
+        name
+        for name, each in MATERIALS.items()
+        if each is not material
+        and name != "linear"
+        and [constant.name for constant in each.constants] == names
+    )
+
+
+def other_dampings(body: Body) -> tuple[str, ...]:
+    """Return the names of damping laws with the same constants as all parts of a body have."""
+    own = {part.damping for part in body.parts}
+    if len(own) > 1 or not own <= {*DAMPINGS.values()}:
+        return ()
+    (damping,) = own
+    return tuple(
+        name
+        for name, each in DAMPINGS.items()
+        if each is not damping and each.constants == damping.constants
+    )
+
+
+def with_laws(body: Body, material: Material | None, damping: DampingLaw | None) -> Body:
+    """Return a body with another material or damping law in all parts; None keeps the law."""
+    laws = {"material": material, "damping": damping}
+    changed = {name: law for name, law in laws.items() if law is not None}
+    return body.with_parts(tuple(replace(part, **changed) for part in body.parts))
+
+
+def _likely_mistakes(body: Body) -> Iterator[Deviation]:
+    """Yield the likely mistakes about a body; the name of a row is its hypothesis' code."""
+    materials = ("", *other_materials(body))
+    dampings = ("", *other_dampings(body))
+    for laws in [(m, d) for m in materials for d in dampings][1:]:
+        yield _other_laws(*laws)
+    if not _is_uniform(body):
+        return
+    if other_section(body.mesh, body.nodes.points_m) is not None:
+        yield SECTION
+    yield from map(_other_width, range(3))
+    if not isinstance(body.rest_shape, UnderGravity):
+        yield REST_SHAPE
+
+
+def _other_laws(material: str, damping: str) -> Deviation:
+    """Return the row of other laws with the same constants, by their names, "" for the stated one."""
+
+    def effect(at: ExperimentAtAnswer, _: int) -> Effect:
+        other = with_laws(at.stress_free_body, MATERIALS.get(material), DAMPINGS.get(damping))
+        return Effect(at.internal_n(body=other) - at.internal_force_n)
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        laws = MATERIALS.get(material), DAMPINGS.get(damping)
+        other = with_body(experiment, with_laws(experiment.body, *laws))
+        return other and (other, {"material": material, "damping": damping})
+
+    which = "/both" if material and damping else "" if material else "/damping"
+    return Deviation(f"law{which}", "1", effect=effect, corrected=corrected, is_whole=True)
+
+
+def _other_width(axis: int) -> Deviation:
+    """Return the row of a body that is wider along an axis, as a share of the width."""
+
+    def effect(at: ExperimentAtAnswer, _: int) -> Effect:
+        moved_m = np.zeros_like(at.body.nodes_m)
+        points_m = at.body.nodes_m
+        dofs = at.iterate.equations.prescribed.dofs
+        moved_m[:, axis] = points_m[:, axis] - points_m[np.unique(dofs // 3), axis].mean()
+        return shape_effect(at, moved_m)
+
+    def corrected(experiment: Experiment, amplitudes: Array) -> Correction:
+        (width,) = amplitudes.tolist()
+        factors = np.ones(3)
+        factors[axis] += width
+        other = None if abs(width) > WIDEST else with_shape(experiment, factors)
+        way = "narrow" if width > 0 else "wide"
+        return other and (other, {"axis": AXES[axis], "percent": 100 * abs(width), "way": way})
+
+    return Deviation("mesh-width", "1", effect=effect, corrected=corrected)
+
+
+def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
+    """Return the effect of a mesh made under the whole weight along an axis (index)."""
+    sag = sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
+    return Effect(at.force_change_by_reference(sag))
+
+
+def _stress_free(experiment: Experiment, amplitudes: Array) -> Correction:
+    """Return the experiment with the mesh made under gravity; None unless of the whole weight."""
+    share = float(np.linalg.norm(amplitudes))
+    if not WHOLE_WEIGHT[0] < share < WHOLE_WEIGHT[1]:
+        return None
+    down = amplitudes / share
+    held = np.unique(np.concatenate([grasp.nodes for grasp in experiment.body_grasps]))
+    scanned = UnderGravity(held, gravity_m_s2=GRAVITY_M_S2 * down)
+    other = with_shape(experiment, np.ones(3), rest_shape=scanned)
+    return other and (other, {"down": ", ".join(f"{each:.2f}" for each in down)})
+
+
+def _of_other_section(experiment: Experiment, _: Array) -> Correction:
+    """Return the experiment with a round section in place of a square one, or the reverse."""
+    other = with_other_section(experiment)
+    if other is None:
+        return None
+    is_round = other.body.mesh.volume_m3 < experiment.body.mesh.volume_m3
+    real, meshed = ("round", "square") if is_round else ("square", "round")
+    return other, {"real": real, "meshed": meshed}
+
+
+SECTION = Deviation(
+    "mesh-section",
+    "1",
+    effect=lambda at, _: section_effect(at),
+    corrected=_of_other_section,
+    is_whole=True,
+)
+REST_SHAPE = Deviation("rest-shape", "1", axes="x y z", effect=_scan_effect, corrected=_stress_free)
+
+
+def _is_uniform(body: Body) -> bool:
+    """Return whether a body consists of one part without a field, so that it can be made again."""
+    return len(body.parts) == 1 and all(part.field is None for part in body.parts)
+
+
+def screened_bodies(
+    solution: Solution, experiment: Experiment, *, is_far: bool = False
+) -> Iterator[Hypothesis]:
+    """Yield hypotheses of other bodies, those first that decrease χ² most by one linear step, with
+    the experiment with the other body as `corrected`.
+
+    Parameters
+    ----------
+    solution : Solution
+        The fit.
+    experiment : Experiment
+        The experiment that is changed.
+    is_far : bool
+        Whether the fit moved the body so far from its stated pose that a linear step from there says
+        little: other materials come first then, whatever it says.
+
+    Notes
+    -----
+    At most `MOST_OF_A_KIND` of each kind and `MOST_REFITS` in all are yielded; nothing that
+    decreases χ² by less than `LEAST_DECREASE`, and nothing with obstacles, whose frames are nodes
+    of the body, or without a grasp.
+    """
+    collocation = solution.collocation
+    if experiment.obstacles or experiment.specimen is not None or not experiment.body_grasps:
+        return
+    rows = [*_likely_mistakes(experiment.body)]
+    if not rows:
+        return
+    columns = changed_residuals(collocation, solution.z, [(row, 1.0) for row in rows])
+    gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
+    found: list[tuple[float, Hypothesis]] = []
+    first = 1
+    for row in rows:
+        own = range(first, first + len(row.list_components()))
+        first = own.stop
+        decrease, amplitudes = linear_step(gram, own, np.ones(len(own)) if row.is_whole else None)
+        if is_far and row.name == "law":
+            decrease = np.inf
+        hypothesis = corrected_hypothesis(row, experiment, amplitudes)
+        if decrease >= LEAST_DECREASE and hypothesis is not None:
+            found.append((decrease, hypothesis))
+    found.sort(key=lambda each: -each[0])
+    count = Counter[str]()
+    for _, hypothesis in found:
+        if count[hypothesis.code] < MOST_OF_A_KIND and count.total() < MOST_REFITS:
+            count[hypothesis.code] += 1
+            yield hypothesis
+
+
+def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
+    """Yield the hypothesis, about the subject `of`, that a finer mesh explains the residuals, with a
+    `LinearCorrection`; nothing if it is smaller than noise or hardly decreases χ², for large bodies,
+    or if its effect cannot be computed.
+    """
+    collocation = solution.collocation
+    bodies = [each.body for each in collocation.transcriptions if each.experiment.specimen is None]
+    if max((len(body.nodes.points_m) for body in bodies), default=0) > LARGEST_NODE_COUNT:
+        return
+    try:
+        blocks = mesh_residual_changes(collocation, solution.z)
+    except (InputError, SimulationError, np.linalg.LinAlgError):
+        return
+    gram = projected_gram(linearise_fit(collocation, solution.z), blocks)
+    least, most = MESH_AMPLITUDES
+    amplitude = min(most, float(linear_step(gram, [1])[1][0]))
+    if amplitude < least:
+        return
+    decrease, _ = linear_step(gram, [1], np.array([amplitude]))
+    sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.count_measurements()))
+    if decrease > LEAST_DECREASE and sigmas > LEAST_SIGMAS:
+        linear = any(body.element.name == "tet4" for body in bodies)
+        data = {
+            "sigmas": sigmas,
+            "remedy": 'set object.element = "tet10", or refine the mesh'
+            if linear
+            else "refine the mesh",
+        }
+        corrected = LinearCorrection(1 - decrease / gram[0, 0])
+        yield Hypothesis("mesh-coarse", of, data=data, corrected=corrected)
+
+
+def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
+    """Return the Gram matrix (1 + c, 1 + c) of the residuals of a fit and of c changes of them, less
+    what a step of its parameters explains.
+    """
+    free = ~fit.at_bound
+    stacked = []
+    slopes = []
+    for block, change in zip(fit.blocks, blocks, strict=True):
+        weight = (block.compute_root_weight() * block.is_measured)[..., None]
+        both = np.concatenate([block.residual[..., None], change * weight], axis=3)
+        stacked.append(both.reshape(-1, both.shape[-1]))
+        slopes.append(block.jacobian.reshape(len(stacked[-1]), block.jacobian.shape[-1]))
+    values = np.concatenate(stacked)
+    jacobian = np.concatenate(slopes)[:, free]
+    of_prior = np.zeros((len(fit.prior_residual), values.shape[1]))
+    of_prior[:, 0] = fit.prior_residual
+    values = np.concatenate([values, of_prior])
+    jacobian = np.concatenate([jacobian, np.diag(fit.prior_jacobian)[:, free]])
+    explained = np.linalg.lstsq(jacobian, values, rcond=1e-10)[0]
+    return (remaining := values - jacobian @ explained).T @ remaining
+
+
+def linear_step(
+    gram: Array, columns: Iterable[int], amplitudes: Array | None = None
+) -> tuple[float, Array]:
+    """Return the decrease of χ² by changes of the residuals, and their amplitudes, by default those
+    that decrease it most.
+
+    `gram` is the result of `projected_gram`, in which changes are `columns` from 1 on.
+    """
+    own = [*columns]
+    among = gram[np.ix_(own, own)]
+    if amplitudes is None:
+        amplitudes = -np.linalg.lstsq(among, gram[own, 0], rcond=1e-8)[0].astype(np.float64)
+    return float(-2 * amplitudes @ gram[own, 0] - amplitudes @ among @ amplitudes), amplitudes
+
+
+def mirrored_meshes(experiment: Experiment) -> Iterator[Deviation]:
+    """Yield the rows of a mesh that is a mirror image along an axis about the middle of its grasps,
+    if that is another shape.
+    """
+    body = experiment.body
+    if (
+        experiment.obstacles
+        or experiment.specimen is not None
+        or not experiment.body_grasps
+        or not _is_uniform(body)
+    ):
+        return
+    points_m = body.mesh.points_m
+    size_m = float(np.ptp(points_m, axis=0).max())
+    middle_m = _middle_of_grasps_m(experiment)
+    surface = points_m[np.unique(body.mesh.surface)]
+    tree = KDTree(surface)
+    is_filmed = any(each.counts_pixels for each in experiment.measurements)
+    code = "mesh-mirrored/or-images" if is_filmed else "mesh-mirrored"
+    for axis, factors in enumerate(np.ones((3, 3)) - 2 * np.eye(3)):
+        away_m = tree.query(middle_m + factors * (surface - middle_m))[0]
+        if away_m.max() >= SAME_SHAPE * size_m:
+            yield _mirrored(axis, factors, code)
+
+
+def _mirrored(axis: int, factors: Array, code: str) -> Deviation:
+    """Return the row of a mesh that is mirrored along an axis: multiplied by factors (3,)."""
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        other = with_shape(experiment, factors)
+        return other and (other, {"axis": AXES[axis]})
+
+    return Deviation(code, "1", corrected=corrected, is_whole=True)
+
+
+def _middle_of_grasps_m(experiment: Experiment) -> Array:
+    """Return the mean position (3,) of the grasped nodes in the mesh [m]."""
+    nodes = np.unique(np.concatenate([grasp.nodes for grasp in experiment.body_grasps]))
+    return experiment.body.nodes_m[nodes].mean(axis=0)
+
+
+def with_shape(
+    experiment: Experiment, factors: Array, rest_shape: UnderGravity | None = None
+) -> Experiment | None:
+    """Return the experiment with a mesh that is multiplied by factors (3,) about the middle of its
+    grasps, or also made under gravity; None if it is not valid.
+
+    The mass stays, and so do stated places of markers.
+    """
+    middle_m = _middle_of_grasps_m(experiment)
+    return _made_again(
+        experiment,
+        lambda points_m: middle_m + factors * (points_m - middle_m),
+        mass_kg=experiment.body.mass_kg,
+        rest_shape=rest_shape,
+    )
+
+
+def with_other_section(experiment: Experiment) -> Experiment | None:
+    """Return the experiment with a round mesh in place of a square one of the same width or the
+    reverse, see `other_section`; None if it is not valid. A declared mass stays, else the density;
+    stated places of markers move with the mesh.
+    """
+    body = experiment.body
+    own = other_section(body.mesh, body.mesh.points_m)
+    if own is None:
+        return None
+    mapped = TetMesh(body.mesh.points_m + own.moved_m, body.mesh.tetrahedra)
+    wider = np.sqrt(own.volume_ratio * body.mesh.volume_m3 / mapped.volume_m3)
+    factors = np.where(own.is_across, wider, 1.0)
+
+    def reshaped(points_m: Array) -> Array:
+        other = other_section(body.mesh, points_m)
+        assert other is not None
+        return own.middle_m + factors * (points_m + other.moved_m - own.middle_m)
+
+    ratio = 1.0 if body.has_declared_mass else own.volume_ratio
+    return _made_again(experiment, reshaped, mass_kg=ratio * body.mass_kg)
+
+
+def _made_again(
+    experiment: Experiment,
+    reshaped: Callable[[Array], Array],
+    mass_kg: float,
+    rest_shape: UnderGravity | None = None,
+) -> Experiment | None:
+    """Return the experiment with points (n, 3) of the mesh elsewhere; None if it is not valid."""
+    body = experiment.body
+    (part,) = body.parts
+    try:
+        other = Body(
+            TetMesh(reshaped(body.mesh.points_m), body.mesh.tetrahedra),
+            part.material,
+            mass_kg=mass_kg,
+            element=body.element.name,
+            damping=part.damping,
+            prony=part.prony,
+            forces=body.forces,
+            rest_shape=rest_shape or "stress_free",
+        )
+    except InputError:
+        return None
+    index = np.asarray(KDTree(other.nodes_m).query(reshaped(body.nodes.points_m))[1])
+    grasps = [replace(grasp, nodes=np.unique(index[grasp.nodes])) for grasp in experiment.grasps]
+    return with_body(experiment, other, grasps=grasps)
+
+
+def with_body(experiment: Experiment, body: Body, **changes: object) -> Experiment | None:
+    """Return the experiment with another body, on which markers without a stated place are
+    placed again; None if it is not valid.
+    """
+    markers = experiment.markers
+    places_m = np.array(markers.predict_positions(experiment.body.nodes_m))
+    places_m[~markers.located] = np.nan
+    unplaced = replace(markers, placement=None, located=None, places_m=places_m)
+    try:
+        return replace(experiment, body=body, markers=unplaced, **changes)
+    except InputError:
+        return None

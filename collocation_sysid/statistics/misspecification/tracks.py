@@ -1,0 +1,147 @@
+"""Misspecification hypotheses about measured values that are copies of others, and about filtered
+ones, as by the software of cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ...common.array_types import Array
+from ...program.measured_motion import Predicted
+from ...recording.experiment import Experiment
+from ...recording.markers import Markers
+from ...recording.measurement import Measurement
+from .hypothesis import Hypothesis
+
+# RMS distance of two tracks over that of independent noise at one place, up to which they are the
+# same.
+SAME_TRACK = 1.4
+# Distance of two tracks at one sample, over σ, up to which they are compared.
+NEAR = 10.0
+# Distance of two stated places over that of the tracks, from which on the places are different.
+OTHER_PLACE = 5.0
+# Fewest different values of a series that can be a copy of another one.
+FEWEST_VALUES = 5
+# Largest difference of the intervals between samples, over their mean, of a series with a spectrum.
+EVEN = 0.01
+# Fewest samples whose spectrum is examined.
+FEWEST_SAMPLES = 32
+# Largest amplitude of noise over σ above twice the cutoff of a filter.
+STOPPED = 0.15
+# Amplitude of filtered noise over σ at the cutoff; the largest frequency with more is the cutoff.
+PASSED = 0.5
+# Largest amplitude in the highest quarter of the band over that in the quarter below: a filter
+# falls, noise is flat.
+FALLING = 0.5
+
+
+def same_tracks(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield the pair of markers whose tracks are the same up to noise, if their stated places are
+    not; nothing if there is none.
+    """
+    markers = experiment.markers
+    tracks_m = markers.positions_at_samples_m
+    names = markers.names
+    if len(names) < 2:
+        return
+    fullest_m = tracks_m[int(np.isfinite(tracks_m[..., 0]).sum(axis=1).argmax())]
+    seen = np.flatnonzero(np.isfinite(fullest_m[:, 0]))
+    near = KDTree(fullest_m[seen]).query_pairs(NEAR * float(np.max(markers.sigma_m)))
+    for i, j in sorted((int(seen[a]), int(seen[b])) for a, b in near):
+        away_m = np.linalg.norm(tracks_m[:, i] - tracks_m[:, j], axis=1)
+        noise_m = float(np.sqrt(3 * (markers.sigma_m[i] ** 2 + markers.sigma_m[j] ** 2)))
+        if np.isfinite(away_m).sum() < 2:
+            continue
+        rms_m = float(np.sqrt(np.nanmean(away_m**2)))
+        if rms_m > SAME_TRACK * noise_m:
+            continue
+        is_placed = bool(markers.located[i] and markers.located[j])
+        places_m = markers.predict_positions(experiment.body.nodes_m)
+        apart_m = float(np.linalg.norm(places_m[i] - places_m[j]))
+        if is_placed and apart_m < OTHER_PLACE * max(rms_m, noise_m):
+            continue
+        code = "markers-same" if is_placed else "markers-same/unplaced"
+        data = {"first": names[i], "second": names[j], "by_mm": 1e3 * rms_m}
+        yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=OTHER_PLACE)
+        return
+
+
+def copied_measurements(experiments: Iterable[Experiment]) -> list[Hypothesis]:
+    """Return each pair of measurements, of the same or of two recordings, with a series of values
+    that is exactly the same in both; noise excludes this. Constant series do not count, and of
+    markers only those of two recordings, see `same_tracks`.
+    """
+    first: dict[bytes, tuple[Experiment, Measurement, str]] = {}
+    pairs: dict[tuple[Experiment, Measurement, Experiment, Measurement], Hypothesis] = {}
+    for experiment in experiments:
+        for measurement in experiment.measurements:
+            for name, values in measurement.series():
+                if len(np.unique(values[np.isfinite(values)])) < FEWEST_VALUES:
+                    continue
+                found = experiment, measurement, f"{name} of '{experiment.name}'"
+                earlier = first.setdefault(values.tobytes(), found)
+                is_track = isinstance(measurement, Markers) and earlier[0] is experiment
+                if earlier is not found and not is_track:
+                    data = {"first": earlier[2], "second": found[2]}
+                    twice = Hypothesis("measured-twice", data=data)
+                    pairs.setdefault((*earlier[:2], *found[:2]), twice)
+    return [*pairs.values()]
+
+
+def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that values of a fitted experiment were low-passed, for each measurement
+    whose residuals have a spectrum of noise at low frequencies that falls far below it at high ones.
+    """
+    for measurement, predicted in zip(experiment.measurements, fitted, strict=True):
+        t_s = measurement.sample_times_s
+        if experiment.is_static or not isinstance(predicted, np.ndarray):
+            continue
+        scaled = (predicted - measurement.measured_values) / measurement.sample_sigmas
+        used = np.isfinite(scaled).any(axis=1)
+        complete = np.isfinite(scaled[used]).all(axis=0)
+        if used.sum() < FEWEST_SAMPLES or not complete.any():
+            continue
+        intervals_s = np.diff(t_s[used])
+        if np.ptp(intervals_s) > EVEN * intervals_s.mean():
+            continue
+        frequency_hz, amplitude = _amplitudes(scaled[used][:, complete], float(intervals_s.mean()))
+        cutoff = _cutoff(amplitude)
+        if cutoff is None:
+            continue
+        high = float(np.sqrt(np.mean(amplitude[2 * cutoff :] ** 2)))
+        data = {"frequency_hz": float(frequency_hz[cutoff]), "percent": 100 * high}
+        code = "tracks-filtered"
+        if not isinstance(measurement, Markers):
+            code = "sensor-filtered"
+            data |= {"what": measurement.title, "stated": measurement.sigma_text}
+        yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=1 / STOPPED)
+
+
+def _amplitudes(values: Array, interval_s: float) -> tuple[Array, Array]:
+    """Return frequencies (F,) [Hz] and amplitudes of detrended values, 1 for white noise."""
+    count = len(values)
+    ramp = np.linspace(-1.0, 1.0, count)
+    basis = np.column_stack([np.ones(count), ramp])
+    detrended = values - basis @ np.linalg.lstsq(basis, values, rcond=None)[0]
+    window = np.hanning(count)[:, None]
+    spectrum = np.fft.rfft(window * detrended, axis=0)
+    power = np.mean(np.abs(spectrum) ** 2, axis=1) / np.sum(window**2)
+    return np.array(np.fft.rfftfreq(count, interval_s), dtype=float), np.sqrt(power)
+
+
+def _cutoff(amplitude: Array) -> int | None:
+    """Return the index of the cutoff of a low-pass in amplitudes (F,) over σ; None without."""
+    count = len(amplitude)
+    passed = np.flatnonzero(amplitude >= PASSED)
+    if not len(passed) or not 2 < passed[-1] < 2 * count // 5:
+        return None
+    cutoff = int(passed[-1])
+
+    def level(first: int, last: int) -> float:
+        return float(np.sqrt(np.mean(amplitude[first:last] ** 2)))
+
+    falls = level(3 * count // 4, count) < FALLING * level(count // 2, 3 * count // 4)
+    return cutoff if level(2 * cutoff, count) < STOPPED and falls else None
