@@ -354,9 +354,7 @@ def _linearised_trajectory(
         iterate, swept.by_p, swept.grasp_forces, step=swept.step
     )
     matches = zip(response.linearise(), iterate.transcription.residuals, strict=True)
-    residuals_and_slopes = [
-        huber_as_least_squares(*each, reading.huber) for each, reading in matches
-    ]
+    residuals_and_slopes = [huber_as_least_squares(*each, kind.huber) for each, kind in matches]
     residual = np.concatenate([values.ravel() for values, _ in residuals_and_slopes])
     slope = np.concatenate(
         [by.reshape(values.size, by.shape[-1]) for values, by in residuals_and_slopes]

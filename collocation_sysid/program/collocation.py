@@ -214,9 +214,9 @@ class Collocation:
     def count_measurements(self) -> int:
         """Return the number of scalar measurements that are compared, of all fitted experiments."""
         return sum(
-            int(reading.is_compared.sum())
+            int(residual.is_compared.sum())
             for transcription in self.transcriptions
-            for reading in transcription.residuals
+            for residual in transcription.residuals
         )
 
     def count_associated(self) -> int:
@@ -225,9 +225,9 @@ class Collocation:
         crease.
         """
         return self.count_measurements() + sum(
-            reading.uncompared_count
+            residual.uncompared_count
             for transcription in self.transcriptions
-            for reading in transcription.residuals
+            for residual in transcription.residuals
         )
 
     @property

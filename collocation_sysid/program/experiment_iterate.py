@@ -102,8 +102,8 @@ class ExperimentIterate:
         return [
             self.lifted_observables[k]
             if k in self.lifted_observables
-            else reading.observable.evaluate(self.motion_for(reading.observable), self.phi)
-            for k, reading in enumerate(self.transcription.residuals)
+            else residual.observable.evaluate(self.motion_for(residual.observable), self.phi)
+            for k, residual in enumerate(self.transcription.residuals)
         ]
 
     def residuals_of(self, kind: type[R]) -> list[tuple[R, Array]]:
@@ -117,7 +117,7 @@ class ExperimentIterate:
     def loss(self) -> float:
         """Loss Σ ρ of all measurements of this experiment, without priors."""
         pairs = zip(self.transcription.residuals, self.observables, strict=True)
-        return sum(reading.loss(observation, self.phi) for reading, observation in pairs)
+        return sum(residual.loss(observation, self.phi) for residual, observation in pairs)
 
     @cached_property
     def loss_gradients(self) -> list[tuple[Array, Array]]:
@@ -125,7 +125,7 @@ class ExperimentIterate:
         at constant values, by φ (k,).
         """
         pairs = zip(self.transcription.residuals, self.observables, strict=True)
-        return [reading.loss_gradient(observation, self.phi) for reading, observation in pairs]
+        return [residual.loss_gradient(observation, self.phi) for residual, observation in pairs]
 
     def gradient(self) -> tuple[Array, Array]:
         """Return the gradient of the loss by x (N, 3n) [1/m] and by (q, φ) (nq + k,), including the
@@ -140,11 +140,11 @@ class ExperimentIterate:
         by_p = np.zeros(nq + len(phi))
         by_reaction = None
         pairs = zip(self.transcription.residuals, self.loss_gradients, strict=True)
-        for k, (reading, (by_observables, by_phi)) in enumerate(pairs):
+        for k, (residual, (by_observables, by_phi)) in enumerate(pairs):
             by_p[nq:] += by_phi
             if k not in self.lifted_observables:
-                own_x, own_reaction, own_phi = reading.observable.vjp(
-                    self.motion_for(reading.observable), phi, by_values=by_observables
+                own_x, own_reaction, own_phi = residual.observable.vjp(
+                    self.motion_for(residual.observable), phi, by_values=by_observables
                 )
                 by_x = by_x + own_x
                 by_p[nq:] = by_p[nq:] + own_phi
@@ -187,9 +187,9 @@ class ExperimentIterate:
             reactions = replace(self.reactions, reaction_by=nothing, position_by=nothing)
         motion = ObservedMotion(self.x, reactions)
         linearised = []
-        for reading in self.transcription.residuals:
-            values_and_slopes = reading.observable.linearise(motion, self.phi, none, count)
-            linearised.append(reading.linearise(*values_and_slopes, self.phi, count))
+        for residual in self.transcription.residuals:
+            values_and_slopes = residual.observable.linearise(motion, self.phi, none, count)
+            linearised.append(residual.linearise(*values_and_slopes, self.phi, count))
         return linearised
 
     @cached_property

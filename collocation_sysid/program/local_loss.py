@@ -36,9 +36,9 @@ class LocalLoss:
         """
         none = np.zeros(self.nuisance_count)
         codes = []
-        for reading, points in self.residuals:
+        for residual, points in self.residuals:
             slopes = points.derivative_matrix(None, none, position_count=self.position_count)
-            codes.append(self._codes(*reading.hessian_structure(slopes)))
+            codes.append(self._codes(*residual.hessian_structure(slopes)))
         columns, rows = np.divmod(unique_codes(codes), self.position_count + self.nuisance_count)
         return rows, columns
 
@@ -70,7 +70,9 @@ class LocalLoss:
 
     def _is_quadratic(self) -> bool:
         """Return whether the values do not depend on x and φ."""
-        return all(reading.is_quadratic and points.is_linear for reading, points in self.residuals)
+        return all(
+            residual.is_quadratic and points.is_linear for residual, points in self.residuals
+        )
 
     @cached_property
     def _constant(self) -> Array:
@@ -100,16 +102,16 @@ class LocalLoss:
         """Iterate over the contributions of the measurements, and of the curvature of
         observables.
         """
-        for reading, points in self.residuals:
+        for residual, points in self.residuals:
             values = points.evaluate_positions(x, phi)
-            yield reading.hessian(
+            yield residual.hessian(
                 values,
                 phi,
                 derivatives=points.derivative_matrix(x, phi, position_count=self.position_count),
                 has_observation_curvature=has_observation_curvature,
             )
             if has_observation_curvature and not points.is_linear:
-                by_values, _ = reading.loss_gradient(values, phi)
+                by_values, _ = residual.loss_gradient(values, phi)
                 yield points.curvature(
                     x, phi, by_values=by_values, position_count=self.position_count
                 )

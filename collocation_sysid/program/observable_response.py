@@ -64,7 +64,7 @@ class ObservableResponse:
         ValueError
             If an observable is not observed at any of the rows.
         """
-        channels = [reading.observable for reading in iterate.transcription.residuals]
+        channels = [residual.observable for residual in iterate.transcription.residuals]
         operators = [channel.operator(iterate.phi) for channel in channels]
         needed_rows = [frozenset(channel.rows.tolist()) for channel in channels]
         observed: list[list[Array]] = [[] for _ in channels]
@@ -97,8 +97,8 @@ class ObservableResponse:
         """
         changes = []
         _, dofs, count = changes_m.shape
-        for reading in iterate.transcription.residuals:
-            channel = reading.observable
+        for residual in iterate.transcription.residuals:
+            channel = residual.observable
             rows = channel.rows[channel.rows < len(changes_m)]
             columns = changes_m[rows].transpose(1, 0, 2).reshape(dofs, len(rows) * count)
             at = channel.operator(iterate.phi) @ columns
@@ -119,11 +119,11 @@ class ObservableResponse:
         x = iterate.x
         moved = x if self.step is None else x + self.step
         motions = []
-        for reading, changes in zip(
+        for residual, changes in zip(
             iterate.transcription.residuals, self.observed_changes, strict=True
         ):
             reactions = None
-            if reading.observable.measures_reactions:
+            if residual.observable.measures_reactions:
                 reactions = linearised_reactions(
                     iterate.equations,
                     x,
@@ -151,9 +151,9 @@ class ObservableResponse:
         phi = self.iterate.phi
         size = transcription.nq + len(phi)
         linearisations = []
-        for reading, motion in zip(transcription.residuals, self.motions(), strict=True):
-            values_and_slopes = reading.observable.linearise(
+        for residual, motion in zip(transcription.residuals, self.motions(), strict=True):
+            values_and_slopes = residual.observable.linearise(
                 motion, phi, transcription.dynamic_parameters, size
             )
-            linearisations.append(reading.linearise(*values_and_slopes, phi, size))
+            linearisations.append(residual.linearise(*values_and_slopes, phi, size))
         return linearisations

@@ -70,7 +70,7 @@ class StreamStencil(NamedTuple):
 class StreamInstrument(NamedTuple):
     """Instrument whose samples come with frames: a custom sensor, or the sensor of a grasp."""
 
-    reading: MeasurementResidual  # sensor model
+    residual: MeasurementResidual  # sensor model
     stencil: StreamStencil  # rows that its samples need
     # Slice of its points among all observed points, those of the markers first; or the index of the
     # resultant in `StreamingModel.reaction_sensors`.
@@ -280,9 +280,9 @@ class StreamingModel:
         place = len(self.experiment.markers.names)
         step_s = self.transcription.dynamics.step_s
         sensors = self.transcription.residuals_of(CustomSensorResidual)
-        for reading in (*sensors, *self.transcription.residuals_of(WrenchResidual)):
-            channel = reading.observable
-            is_custom = isinstance(reading, CustomSensorResidual)
+        for residual in (*sensors, *self.transcription.residuals_of(WrenchResidual)):
+            channel = residual.observable
+            is_custom = isinstance(residual, CustomSensorResidual)
             stencil = StreamStencil(GAUGE_NEIGHBOURS)
             if isinstance(channel, ReactionResultant):
                 observable = [other for other, _ in self.reaction_sensors].index(channel)
@@ -293,14 +293,14 @@ class StreamingModel:
             else:
                 observable = slice(place, place + channel.vector_count)
                 place += channel.vector_count
-            instruments.append(StreamInstrument(reading, stencil, observable=observable))
+            instruments.append(StreamInstrument(residual, stencil, observable=observable))
         return tuple(instruments)
 
     def huber_of(self, instrument: int) -> float | None:
         """Return the threshold of Huber's loss of an instrument, 0 for the markers."""
         if not instrument:
             return self.collocation.huber
-        return self.instruments[instrument - 1].reading.huber
+        return self.instruments[instrument - 1].residual.huber
 
     @cached_property
     def judged_instruments(self) -> Sequence[int]:
@@ -313,7 +313,7 @@ class StreamingModel:
     def judged_residuals(self) -> Sequence[MeasurementResidual]:
         """Sensor models of `judged_instruments`."""
         each = (
-            self.instruments[k - 1].reading if k else self.marker_model
+            self.instruments[k - 1].residual if k else self.marker_model
             for k in self.judged_instruments
         )
         return tuple(each)
@@ -341,7 +341,7 @@ class StreamingModel:
         """Resultants of reactions that sensors observe, each with the index of its grasp, from 0:
         those of force–torque sensors, then of custom sensors.
         """
-        channels = [reading.observable for reading in self.transcription.residuals]
+        channels = [residual.observable for residual in self.transcription.residuals]
         grasps = [id(grasp) for grasp in self.transcription.experiment.grasps]
         resultants = (channel for channel in channels if isinstance(channel, ReactionResultant))
         return tuple((channel, grasps.index(id(channel.grasp))) for channel in resultants)

@@ -602,7 +602,7 @@ class StreamingSweep:
     ) -> Iterator[tuple[Array, Array]]:
         """Yield residuals over σ and ∂p of each sample, or NaN."""
         model = self.model
-        reading, stencil, observable = self.model.instruments[of - 1]
+        kind, stencil, observable = self.model.instruments[of - 1]
         at = [self.row - 1 - sample.rows_back - rows for sample, rows in pairs]
         needed_rows = range(
             stencil.rows_of_sample(min(at)).start, stencil.rows_of_sample(max(at)).stop
@@ -614,7 +614,7 @@ class StreamingSweep:
         step_s = model.experiment.timestep_s / model.collocation.substeps
         begins_s = float(model.experiment.t_s[0])
         known_s, t_s = (begins_s + step_s * np.array(rows) for rows in (needed_rows, at))
-        sensor = reading.with_samples(
+        sensor = kind.with_samples(
             known_s, x, t_s, measurements=np.array([sample.values for sample, _ in pairs])
         )
         points = sensor.observable
@@ -637,7 +637,7 @@ class StreamingSweep:
             np.where(sensor.compared_with(len(needed_rows)), residual, np.nan), slope, strict=True
         )
 
-    def _marker_residuals(self, reading: Sample, rows: int) -> tuple[Array, Array]:
+    def _marker_residuals(self, sample: Sample, rows: int) -> tuple[Array, Array]:
         """Return residuals (M, 3) of a marker sample, in standard deviations, and their derivatives
         (M, 3, P) with respect to p.
 
@@ -646,7 +646,7 @@ class StreamingSweep:
         model = self.model
         neighbours = self.model.neighbouring_samples
         markers = self.model.marker_model
-        back = reading.rows_back + rows
+        back = sample.rows_back + rows
         backs = [back - k * model.collocation.substeps for k in range(-neighbours, neighbours + 1)]
         x, point_columns = (
             np.array(part) for part in zip(*map(self._interpolated_row, backs), strict=True)
@@ -661,7 +661,7 @@ class StreamingSweep:
         residual, slope = markers.linearise(
             values, slopes, phi=self.phi, size=model.parameter_count
         )
-        return residual[0] - reading.values / markers.sigmas[:, None], slope[0]
+        return residual[0] - sample.values / markers.sigmas[:, None], slope[0]
 
     def _interpolated_row(self, back: float) -> tuple[Array, Array]:
         """Return positions (3n,) [m] and observed points (3M + …, 1 + m) at, or between, stored

@@ -93,9 +93,9 @@ class Transcription(MotionTranscription):
         positions (`local` observables with at least one point); resultants of reactions are not
         among them.
         """
-        pairs = ((reading, reading.observable.local) for reading in self.residuals)
+        pairs = ((residual, residual.observable.local) for residual in self.residuals)
         local = tuple(
-            (reading, points) for reading, points in pairs if points and points.vector_count
+            (residual, points) for residual, points in pairs if points and points.vector_count
         )
         return LocalLoss(
             local, self.variable_count, nuisance_count=self.nuisance.size, dof_count=self.dof_count

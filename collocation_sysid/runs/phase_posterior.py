@@ -389,11 +389,11 @@ def exact_residuals(
     residuals = []
     for iterate in collocation.iterates(collocation.pack(p, positions)):
         linearised = iterate.linearise_fixed_motion()
-        for reading, (values, by_phi) in zip(
+        for residual, (values, by_phi) in zip(
             iterate.transcription.residuals, linearised, strict=True
         ):
-            weighted, _ = huber_as_weights(values, by_phi, huber=reading.huber)
-            residuals.append(reading.pool_values(weighted).ravel())
+            weighted, _ = huber_as_weights(values, by_phi, huber=residual.huber)
+            residuals.append(residual.pool_values(weighted).ravel())
     return np.concatenate(residuals)
 
 

@@ -296,29 +296,29 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         experiment = transcription.experiment
         relaxed = transcription.body.has_memory and bool(np.isinf(experiment.loaded_since_s))
         linearised = response.linearise()
-        for reading, (misfit, by_own) in zip(transcription.residuals, linearised, strict=True):
-            residual, by_own = huber_as_weights(misfit, by_own, huber=reading.huber)
-            residual, misfit, by_own = map(reading.pool_values, (residual, misfit, by_own))
+        for kind, (misfit, by_own) in zip(transcription.residuals, linearised, strict=True):
+            residual, by_own = huber_as_weights(misfit, by_own, huber=kind.huber)
+            residual, misfit, by_own = map(kind.pool_values, (residual, misfit, by_own))
             slope = np.zeros((*residual.shape, len(p)))
             slope[..., transcription.list_parameter_indices()] = by_own
             blocks.append(
                 ResidualBlock(
                     name=experiment.name,
-                    t_s=reading.t_s,
-                    marker_names=reading.pooled_groups.names,
-                    is_present=np.asarray(reading.pooled_groups.is_compared.any(axis=2)),
+                    t_s=kind.t_s,
+                    marker_names=kind.pooled_groups.names,
+                    is_present=np.asarray(kind.pooled_groups.is_compared.any(axis=2)),
                     residual=residual,
                     jacobian=slope,
-                    sigma_m=reading.pooled_groups.sigmas,
+                    sigma_m=kind.pooled_groups.sigmas,
                     misfit=misfit,
-                    components=reading.pooled_groups.is_compared,
-                    sigma_key=reading.sigma_key,
+                    components=kind.pooled_groups.is_compared,
+                    sigma_key=kind.sigma_key,
                     is_static=experiment.is_static,
                     is_relaxed_at_start=relaxed,
-                    places_m=reading.pooled_groups.places_m,
-                    has_noise_floor=reading.has_noise_floor,
-                    sigma_ratios=reading.sigma_ratios,
-                    errs_slowly=reading.errs_slowly,
+                    places_m=kind.pooled_groups.places_m,
+                    has_noise_floor=kind.has_noise_floor,
+                    sigma_ratios=kind.sigma_ratios,
+                    errs_slowly=kind.errs_slowly,
                 )
             )
     prior_residual, prior_slope = collocation.prior_residuals(p)

@@ -151,12 +151,12 @@ def _residual_samples(
     solver = Sweep(transcription)
     changes = []
     columns = SweepColumns.from_prescribed(solver, iterate.equations, changes_m=displacements_m)
-    for reading, motion, values, by_noise in propagate_columns(iterate, solver, columns=columns):
+    for residual, motion, values, by_noise in propagate_columns(iterate, solver, columns=columns):
         for grasp, shifts, rotations in pose_errors:
-            by_noise = by_noise + reading.observable.frame_changes(
+            by_noise = by_noise + residual.observable.frame_changes(
                 grasp, motion, phi=iterate.phi, shifts=shifts, rotations=rotations
             )
-        residual_changes = reading.residual_changes(values, by_noise, phi=iterate.phi)
+        residual_changes = residual.residual_changes(values, by_noise, phi=iterate.phi)
         changes.append(np.moveaxis(residual_changes, 3, 0))
     return changes
 

@@ -548,7 +548,7 @@ class LiveEstimator:
 
     def _add_samples(
         self,
-        readings: Sequence[Sample],
+        samples: Sequence[Sample],
         squares: list[Array],
         pixel_squares: list[Array],
         rows: int = 0,
@@ -562,28 +562,26 @@ class LiveEstimator:
         notes = []
         sigma_m = self.model.transcription.experiment.markers.sigma_m[:, None]
         if first_pass.has_failed:
-            self.log[-1].samples.extend(readings)
+            self.log[-1].samples.extend(samples)
             return notes
-        all_linearised = first_pass.sweep.linearise_samples(
-            [(reading, rows) for reading in readings]
-        )
-        for reading, linearised in zip(readings, all_linearised, strict=True):
-            if not reading.instrument:
+        all_linearised = first_pass.sweep.linearise_samples([(sample, rows) for sample in samples])
+        for sample, linearised in zip(samples, all_linearised, strict=True):
+            if not sample.instrument:
                 residual = linearised.evaluate_at(self.model.transformed(self.p))
                 outliers = self._outliers(residual)
                 if outliers.any():
                     notes.append(self._note_outliers(outliers))
-                    remaining = np.where(outliers[:, None], np.nan, reading.values)
-                    reading = reading._replace(values=remaining)
+                    remaining = np.where(outliers[:, None], np.nan, sample.values)
+                    sample = sample._replace(values=remaining)
                     linearised.at_zero[outliers] = residual[outliers] = np.nan
                 squared = np.sum((residual * sigma_m) ** 2, axis=1)
                 squares.append(squared)
             elif (
-                sensor := self.model.instruments[reading.instrument - 1].reading
+                sensor := self.model.instruments[sample.instrument - 1].residual
             ).measurement.counts_pixels:
                 residual = linearised.evaluate_at(self.model.transformed(self.p))[:, :2]
                 pixel_squares.append(np.ravel((residual * sensor.sigmas[:, None]) ** 2))
-            self.log[-1].samples.append(reading)
+            self.log[-1].samples.append(sample)
         first_pass.add_residuals(all_linearised)
         return notes
 
@@ -630,9 +628,9 @@ class LiveEstimator:
         no_markers[:1] = 0.0
         # Points in the middle of the rows that they need.
         pixels = [
-            Sample(each.stencil.neighbours // 2, np.zeros(each.reading.measured[0, :, :2].size), k)
+            Sample(each.stencil.neighbours // 2, np.zeros(each.residual.measured[0, :, :2].size), k)
             for k, each in enumerate(self.model.instruments, 1)
-            if each.reading.measurement.counts_pixels
+            if each.residual.measurement.counts_pixels
         ]
         try:
             trial = WindowPass(self.model, self.p, prior=self.prior, block_rows=self._block_rows)

@@ -117,10 +117,10 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
     for part in solution.parts:
         if not any(
             _misses_surface(
-                reading.signed_distances_m(observation, part.phi)
-                / reading.correspondences.camera.depth.sigma_m
+                residual.signed_distances_m(observation, part.phi)
+                / residual.correspondences.camera.depth.sigma_m
             )
-            for reading, observation in depth_residuals(part)
+            for residual, observation in depth_residuals(part)
         ):
             continue
         experiment = part.transcription.experiment
@@ -150,8 +150,8 @@ def _part_concerns(part: ExperimentIterate) -> Iterator[Concern]:
     for camera in range(len(experiment.depths)):
         pose = nuisance.indices_of_rows(DEPTH_TURN, DEPTH_SHIFT, component=camera)
         yield from camera_pose_concerns([nuisance.names[k] for k in pose], part.phi[pose].tolist())
-    for reading, distance_px in outline_distances_px(part):
-        name = reading.correspondences.camera.depth.name
+    for residual, distance_px in outline_distances_px(part):
+        name = residual.correspondences.camera.depth.name
         yield from outline_concerns(f"'{name}' of '{experiment.name}'", distance_px)
 
 
@@ -224,9 +224,9 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
     first on all points, then on all outlines.
     """
     name = part.transcription.experiment.name
-    for reading, observation in depth_residuals(part):
-        distance_m = reading.signed_distances_m(observation, part.phi)
-        correspondences = reading.correspondences
+    for residual, observation in depth_residuals(part):
+        distance_m = residual.signed_distances_m(observation, part.phi)
+        correspondences = residual.correspondences
         excluded = ", ".join(
             f"{count} {EXCLUSION_WORDS[why]}"
             for why, count in correspondences.excluded_counts.items()

@@ -66,13 +66,13 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
     simulated or fitted motion; none for cameras with few images.
     """
     name = part.transcription.experiment.name
-    for reading in camera_residuals(part.transcription):
-        times_s = reading.correspondences.camera.depth.sample_times_s
-        within = times_s <= reading.observable_s[-1] + 1e-9
+    for residual in camera_residuals(part.transcription):
+        times_s = residual.correspondences.camera.depth.sample_times_s
+        within = times_s <= residual.observable_s[-1] + 1e-9
         if np.count_nonzero(within) < FEWEST_IMAGES:
             continue
         positions_m = part.x.reshape(len(part.x), -1, 3)
-        comparison = _MotionComparison(reading, positions_m, is_simulated=within)
+        comparison = _MotionComparison(residual, positions_m, is_simulated=within)
         yield from comparison.hypotheses(name)
 
 
@@ -81,7 +81,7 @@ class _MotionComparison:
 
     Parameters
     ----------
-    reading : DepthResidual
+    residual : DepthResidual
         Measurement model of the camera.
     positions_m : (T, n, 3) array
         Nodes of the body at the times of the observable [m].
@@ -90,12 +90,12 @@ class _MotionComparison:
     """
 
     def __init__(
-        self, reading: DepthResidual, positions_m: Array, is_simulated: NDArray[np.bool_]
+        self, residual: DepthResidual, positions_m: Array, is_simulated: NDArray[np.bool_]
     ) -> None:
-        self.camera = reading.correspondences.camera
-        surface = reading.correspondences.surface
+        self.camera = residual.correspondences.camera
+        surface = residual.correspondences.surface
         depth = self.camera.depth
-        self.at_s = reading.observable_s
+        self.at_s = residual.observable_s
         images = np.array(
             [k for k in np.flatnonzero(is_simulated).tolist() if len(depth.clouds[k])]
         )

@@ -54,23 +54,23 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
         experiment = part.transcription.experiment
         name = experiment.name
         pairs = zip(part.transcription.residuals, part.observables, strict=True)
-        for reading, values in pairs:
-            if isinstance(reading, ImageTrackResidual):
-                predicted = reading.predict(values, part.phi)[..., :2]
-                of = f"'{reading.sensor.name}' of '{name}'"
-                missing = [*stated_cameras.missing_image_hypotheses(experiment, reading.sensor)]
+        for residual, values in pairs:
+            if isinstance(residual, ImageTrackResidual):
+                predicted = residual.predict(values, part.phi)[..., :2]
+                of = f"'{residual.sensor.name}' of '{name}'"
+                missing = [*stated_cameras.missing_image_hypotheses(experiment, residual.sensor)]
                 if missing:
                     yield from missing
                     continue
-                yield from places_off_body(reading, part.phi, of)
-                yield from track_hypotheses(reading, predicted, of)
+                yield from places_off_body(residual, part.phi, of)
+                yield from track_hypotheses(residual, predicted, of)
 
 
-def places_off_body(reading: ImageTrackResidual, phi: Array, of: str) -> Iterator[Hypothesis]:
+def places_off_body(residual: ImageTrackResidual, phi: Array, of: str) -> Iterator[Hypothesis]:
     """Yield the point of one camera whose estimated place at φ (k,) is farthest from the body, if it
     is off the body.
     """
-    places, body = reading.correspondences, reading.experiment.body
+    places, body = residual.correspondences, residual.experiment.body
     corners = body.nodes_m[body.mesh.surface]
     size_m = float(np.linalg.norm(np.ptp(body.nodes_m, axis=0)))
     places_m = places.places_m(phi)
@@ -80,13 +80,13 @@ def places_off_body(reading: ImageTrackResidual, phi: Array, of: str) -> Iterato
         off_m[k] = np.linalg.norm(nearest - places_m[k], axis=1).min()
     worst = int(off_m.argmax())
     if off_m[worst] > OFF_BODY * size_m:
-        data = {"point": reading.sensor.names[worst], "off_mm": 1e3 * float(off_m[worst])}
+        data = {"point": residual.sensor.names[worst], "off_mm": 1e3 * float(off_m[worst])}
         strength = float(off_m[worst]) / (OFF_BODY * size_m)
         yield Hypothesis("image-track/off-body", of, data=data, strength=strength)
 
 
 def track_hypotheses(
-    reading: ImageTrackResidual, predicted: Array, of: str
+    residual: ImageTrackResidual, predicted: Array, of: str
 ) -> Iterator[Hypothesis]:
     """Yield hypotheses about the tracks of one camera.
 
@@ -97,10 +97,10 @@ def track_hypotheses(
     of : str
         Camera and experiment, for messages.
     """
-    sigma = reading.sensor.sigma_px
-    names = reading.sensor.names
-    compared = np.asarray(reading.is_compared[: len(predicted), :, :2].all(axis=2))
-    measured = np.where(compared[..., None], reading.measured[: len(predicted), :, :2], np.nan)
+    sigma = residual.sensor.sigma_px
+    names = residual.sensor.names
+    compared = np.asarray(residual.is_compared[: len(predicted), :, :2].all(axis=2))
+    measured = np.where(compared[..., None], residual.measured[: len(predicted), :, :2], np.nan)
     used = np.flatnonzero(compared.any(axis=0)).tolist()
     off = (measured - predicted) / sigma
     rms = {k: float(np.sqrt(np.nanmean(off[:, k] ** 2))) for k in used}
@@ -123,11 +123,11 @@ def track_hypotheses(
     for k in used:
         if k in exchanged or rms[k] < SUSPICIOUS or rms[k] < EXPLAINED * usual:
             continue
-        yield _track_hypothesis(reading, k, measured[:, k], predicted[:, k], of, rms[k], usual)
+        yield _track_hypothesis(residual, k, measured[:, k], predicted[:, k], of, rms[k], usual)
 
 
 def _track_hypothesis(
-    reading: ImageTrackResidual,
+    residual: ImageTrackResidual,
     k: int,
     measured: Array,
     predicted: Array,
@@ -136,7 +136,7 @@ def _track_hypothesis(
     usual: float,
 ) -> Hypothesis:
     """Return what is wrong with a track that deviates."""
-    name = reading.sensor.names[k]
+    name = residual.sensor.names[k]
     known = np.flatnonzero(np.isfinite(measured).all(axis=1))
     strength = rms / max(usual, 1.0)
     ranges = [float(np.linalg.norm(np.ptp(v[known], axis=0))) for v in (measured, predicted)]
@@ -151,7 +151,7 @@ def _track_hypothesis(
         if rest < best:
             best, at, jump = rest, cut, means[1] - means[0]
     if best * EXPLAINED**2 < np.sum((off - off.mean(axis=0)) ** 2):
-        t_s = float(reading.t_s[known[at]])
+        t_s = float(residual.t_s[known[at]])
         data = {"point": name, "jump_px": float(np.linalg.norm(jump)), "t_s": t_s}
         return Hypothesis("image-track/jumps", of, data=data, strength=strength)
     data = {"point": name, "sigmas": rms, "others": usual}
@@ -162,12 +162,12 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
     """Yield a note for each camera: how many pixels are compared, and what is left out."""
     experiment = part.transcription.experiment
     pairs = zip(part.transcription.residuals, part.observables, strict=True)
-    for reading, values in pairs:
-        if not isinstance(reading, ImageTrackResidual):
+    for residual, values in pairs:
+        if not isinstance(residual, ImageTrackResidual):
             continue
-        places, tracks = reading.correspondences, reading.sensor
-        off = (reading.predict(values, part.phi) - reading.measured[: len(values)])[..., :2]
-        compared = reading.is_compared[: len(off), :, :2]
+        places, tracks = residual.correspondences, residual.sensor
+        off = (residual.predict(values, part.phi) - residual.measured[: len(values)])[..., :2]
+        compared = residual.is_compared[: len(off), :, :2]
         known = compared.all(axis=2)
         rms = float(np.sqrt(np.mean(off[compared] ** 2))) if compared.any() else np.nan
         left = []
@@ -177,7 +177,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
         hidden = tracks.is_seen & places.is_placed & ~places.is_visible
         if hidden.any():
             left.append(f"{hidden.sum()} samples of points that the body or an obstacle hides")
-        lost = np.isfinite(reading.measured[..., 0]) & ~tracks.is_followed
+        lost = np.isfinite(residual.measured[..., 0]) & ~tracks.is_followed
         if lost.any():
             names = [name for name, of in zip(tracks.names, lost.T, strict=True) if of.any()]
             left.append(
@@ -192,7 +192,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
         if not tracks.has_known_pose:
             rows = [
                 "[" + ", ".join(f"{number:.4f}" for number in row) + "]"
-                for row in reading.estimated_pose(part.phi).tolist()
+                for row in residual.estimated_pose(part.phi).tolist()
             ]
             yield f"pose of '{tracks.name}' as found: pose = [{', '.join(rows)}]"
         if places.mirror_ratio < stated_cameras.SIMILAR_POSES:

@@ -61,12 +61,12 @@ class _Table:
         if specimen is None or len(experiment.body.parts) != 1 or not experiment.body.has_memory:
             return None
         (part,) = experiment.body.parts
-        t_s, reading = experiment.t_s, experiment.readings[0]
+        t_s, gauge = experiment.t_s, experiment.readings[0]
         strain, _ = specimen_strains(experiment)
         if specimen.test not in SMALL_STRAIN or len(experiment.readings) > 1 or len(strain) < 3:
             return None
-        stress = np.ravel(reading.measured_values)
-        sigma = np.broadcast_to(np.ravel(reading.sigma), stress.shape)
+        stress = np.ravel(gauge.measured_values)
+        sigma = np.broadcast_to(np.ravel(gauge.sigma), stress.shape)
         if part.oscillates:
             rates = 0.5 * np.pi / np.diff(t_s)[::2]
             amplitudes = np.tile(strain[1::2], 2)

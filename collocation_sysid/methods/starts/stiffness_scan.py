@@ -418,19 +418,15 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     residuals = []
     slopes = []
     predictions = iterate.linearise_fixed_motion()
-    for reading, (residual, slope) in zip(
-        iterate.transcription.residuals, predictions, strict=True
-    ):
-        rough = reading.rough_residuals(iterate.x, iterate.phi)
+    for kind, (residual, slope) in zip(iterate.transcription.residuals, predictions, strict=True):
+        rough = kind.rough_residuals(iterate.x, iterate.phi)
         if rough is not None:
             residuals.append(rough)
             slopes.append(np.zeros((len(rough), slope.shape[-1])))
             continue
-        is_compared = reading.compared_with(len(iterate.observables[len(residuals)]))[
-            : len(residual)
-        ]
+        is_compared = kind.compared_with(len(iterate.observables[len(residuals)]))[: len(residual)]
         residuals.append(residual[is_compared])
-        slopes.append(slope[is_compared] * reading.has_offsets)
+        slopes.append(slope[is_compared] * kind.has_offsets)
     residual = np.concatenate(residuals)
     slope = np.concatenate(slopes)
     offset_slopes = slope[:, slope.any(axis=0)]
@@ -451,9 +447,9 @@ def _compared_samples(transcription: Transcription, share: float) -> int:
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.find_first_visible_sample()]
     first_samples += [
-        int(np.searchsorted(t_s, reading.first_needed_s)) + reading.observable.delay_steps
-        for reading in transcription.residuals
-        if reading is not transcription.markers
+        int(np.searchsorted(t_s, residual.first_needed_s)) + residual.observable.delay_steps
+        for residual in transcription.residuals
+        if residual is not transcription.markers
     ]
     return min(len(t_s), max(samples_in_share(len(t_s), share), max(first_samples) + 1))
 

@@ -191,12 +191,12 @@ class MarkerResidual(MeasurementResidual):
         """
         place, t_s = ca.vertsplit(data)
         own = self.own_parameters[0] if len(self.own_parameters) else np.zeros(0, dtype=np.int64)
-        reading = values[:, 0]
+        value = values[:, 0]
         if self._neighbour_count > 1:
             late = self.nuisance.marker_delay_s(phi, own, t_s=t_s) / self.nuisance.interval_s
             places = [ca.SX(k) for k in range(self._neighbour_count)]
-            reading = values @ ca.vertcat(*lagrange_weights(place + late, places))
-        return self.nuisance.marker_measurement(reading, phi, places=own, t_s=t_s)
+            value = values @ ca.vertcat(*lagrange_weights(place + late, places))
+        return self.nuisance.marker_measurement(value, phi, places=own, t_s=t_s)
 
     # Of positions -----------------------------------------------------------------------------
 

@@ -317,10 +317,10 @@ def _changes_by_effects(
         forces_n=forces,
         rows_n=rows,
     )
-    for reading, _, values, changes in propagate_columns(
+    for residual, _, values, changes in propagate_columns(
         part, solver, columns=columns, inertia_n=rows[:, transcription.sensed_dofs]
     ):
-        yield reading.residual_changes(values, changes, phi=part.phi)
+        yield residual.residual_changes(values, changes, phi=part.phi)
 
 
 def propagate_columns(
@@ -354,12 +354,12 @@ def propagate_columns(
     columns_numbered = np.arange(columns.count)
     size = columns.count + len(phi)
     motions = response.motions(is_by_parameters=False)
-    for reading, motion in zip(transcription.residuals, motions, strict=True):
+    for residual, motion in zip(transcription.residuals, motions, strict=True):
         motion = _without_row_changes(motion, inertia_n)
-        values, slopes = reading.observable.linearise(
+        values, slopes = residual.observable.linearise(
             motion, phi, columns=columns_numbered, size=size
         )
-        yield reading, motion, values, slopes.by_common[..., : columns.count]
+        yield residual, motion, values, slopes.by_common[..., : columns.count]
 
 
 def _without_row_changes(motion: ObservedMotion, inertia_n: Array | float) -> ObservedMotion:
