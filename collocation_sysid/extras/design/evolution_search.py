@@ -1,8 +1,8 @@
 """Minimisation of an expensive function without derivatives.
 
 Random samples are followed by an evolution strategy that adapts the diagonal of a covariance
-(sep-CMA-ES: Hansen, The CMA evolution strategy: a tutorial, 2016, and Ros and Hansen 2008). It
-converges in a few hundred evaluations and uses only the order of values. Use `minimise`.
+(sep-CMA-ES: Ros and Hansen 2008, in the package `cmaes`). It converges in a few hundred evaluations
+and uses only the order of values. Use `minimise`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from cmaes import SepCMA
 
 from ...common.array_types import Array
 
@@ -20,6 +21,8 @@ EXPLORED = 0.2
 FIRST_DEVIATION = 0.5
 # Initial standard deviation about a start, which is known to be good.
 SMALLEST_DISTANCE = 0.15
+# Smallest number of coefficients of the strategy; it has one more if the function has only one.
+LEAST_DIMENSION = 2
 
 # Function that returns the value at coefficients (d,); beyond the bound, the second argument, it
 # need not be exact.
@@ -103,84 +106,20 @@ def minimise(
             for _ in range(max(1, round(EXPLORED * evaluations))):
                 evaluate(rng.normal(size=dimension), best.value)
         assert best.coefficients is not None
-        strategy = EvolutionStrategy(
-            best.coefficients, FIRST_DEVIATION if start is None else SMALLEST_DISTANCE
-        )
+        deviation = FIRST_DEVIATION if start is None else SMALLEST_DISTANCE
+        mean = np.zeros(max(dimension, LEAST_DIMENSION))
+        mean[:dimension] = best.coefficients
+        strategy = SepCMA(mean, deviation, seed=seed)
         bar = np.inf
         while len(best.history) < evaluations:
-            count = min(strategy.offspring, evaluations - len(best.history))
-            steps = rng.normal(size=(count, dimension))
-            sizes = np.array([evaluate(strategy.point(step), bar) for step in steps])
-            if count == strategy.offspring:
-                strategy.update(steps[np.argsort(sizes, kind="stable")])
+            count = min(strategy.population_size, evaluations - len(best.history))
+            points = [strategy.ask() for _ in range(count)]
+            sizes = [evaluate(point[:dimension], bar) for point in points]
+            if count == strategy.population_size:
+                strategy.tell([*zip(points, sizes, strict=True)])
             bar = float(np.median(sizes))
     except KeyboardInterrupt:
         if best.coefficients is None:
             raise
         best.is_interrupted = True
     return best
-
-
-class EvolutionStrategy:
-    """State of sep-CMA-ES: mean, deviations and paths, with the constants of the tutorial.
-
-    Parameters
-    ----------
-    mean : (d,) array
-        Initial mean; it is copied.
-    deviation : float
-        Initial standard deviation, equal for all coefficients.
-
-    Attributes
-    ----------
-    offspring : int
-        Number of samples per update.
-    """
-
-    def __init__(self, mean: Array, deviation: float) -> None:
-        n = len(mean)
-        self.mean = mean.copy()
-        self.deviation = deviation
-        self.offspring = 4 + int(3 * np.log(n))
-        weights = np.log((self.offspring + 1) / 2) - np.log(np.arange(self.offspring // 2) + 1)
-        self.weights = weights / weights.sum()
-        effective = self.effective = 1 / float(np.sum(self.weights**2))
-        self.c_path = (effective + 2) / (n + effective + 5)
-        self.damping = 1 + 2 * max(0.0, np.sqrt((effective - 1) / (n + 1)) - 1) + self.c_path
-        self.c_rank = (4 + effective / n) / (n + 4 + 2 * effective / n)
-        faster = (n + 2) / 3  # for a diagonal
-        self.c_one = min(0.5, faster * 2 / ((n + 1.3) ** 2 + effective))
-        several = 2 * (effective - 2 + 1 / effective) / ((n + 2) ** 2 + effective)
-        self.c_mu = min(1 - self.c_one, faster * several)
-        self.usual = np.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
-        self.variances = np.ones(n)
-        self.path = np.zeros(n)
-        self.drift = np.zeros(n)
-
-    def point(self, step: Array) -> Array:
-        """Return the coefficients (d,) for a sample `step` (d,) of the standard normal
-        distribution, at the present mean and deviations; the strategy is not changed.
-        """
-        return self.mean + self.deviation * np.sqrt(self.variances) * step
-
-    def update(self, steps: Array) -> None:
-        """Update mean, deviation, variances and paths, in place, from the standard normal samples
-        (`offspring`, d) whose points were evaluated, sorted from best to worst.
-        """
-        best = steps[: len(self.weights)]
-        scale = np.sqrt(self.variances)
-        mean_step = self.weights @ best
-        self.mean = self.mean + self.deviation * scale * mean_step
-        c = self.c_path
-        r = self.c_rank
-        self.path = (1 - c) * self.path + np.sqrt(c * (2 - c) * self.effective) * mean_step
-        length = float(np.linalg.norm(self.path))
-        is_path_short = length < (1.4 + 2 / (len(mean_step) + 1)) * self.usual * np.sqrt(2)
-        drift_step = np.sqrt(r * (2 - r) * self.effective) * scale * mean_step
-        self.drift = (1 - r) * self.drift + is_path_short * drift_step
-        spread = self.weights @ (scale * best) ** 2
-        previous_weight = 1 - self.c_one - self.c_mu
-        self.variances = (
-            previous_weight * self.variances + self.c_one * self.drift**2 + self.c_mu * spread
-        )
-        self.deviation *= float(np.exp(min(1.0, c / self.damping * (length / self.usual - 1))))
