@@ -83,7 +83,7 @@ TOLERANCE = 1e-2
 LEAST_DECREASE = 1e-2
 # Loss of a part of the samples over that of all samples without a correction, above which a
 # correction is refuted: more samples have no smaller loss.
-REFUTED = 4.0
+REFUTED = 10.0
 # Change of the lag that ends the search [s].
 SAME_LAG_S = 5e-4
 # Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
@@ -404,7 +404,7 @@ class _Refitter:
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
-        self.stated_loss = UNLIMITED
+        self.stated_loss = UNLIMITED / REFUTED
         self.near_answer: set[Experiment] = set()
         # Experiments whose fits may take twice the sweeps: that of another direction of gravity than
         # the one to which a fit turned the body begins far from its answer.
@@ -456,11 +456,12 @@ class _Refitter:
         """
         if self.sweeps <= 0:
             return None
+        is_far = experiment in self.longer
         method = ReducedSpace(
-            max_iterations=min(self.each * (1 + (experiment in self.longer)), self.sweeps),
+            max_iterations=min(self.each * (1 + is_far), self.sweeps),
             tolerance=TOLERANCE,
             least_decrease=LEAST_DECREASE,
-            largest_loss=min(UNLIMITED, REFUTED * self.stated_loss),
+            largest_loss=UNLIMITED if is_far else REFUTED * self.stated_loss,
         )
         start = None
         try:
