@@ -288,6 +288,27 @@ def test_the_iteration_limit_is_a_status():
     assert solution.parameters == solution.history[-1].parameters
 
 
+def test_a_search_whose_loss_hardly_decreases_ends_early():
+    problem = Collocation([noisy(hung_cube(15))], GUESS)
+    complete = ReducedSpace()(problem)
+    early = ReducedSpace(least_decrease=1e-2)(problem)
+    assert early.status is Status.CONVERGED
+    assert early.iterations < complete.iterations
+    assert complete.history[-1].loss <= early.history[-1].loss < 1.05 * complete.history[-1].loss
+
+
+def test_a_part_of_the_recording_with_too_large_a_loss_ends_the_search():
+    problem = Collocation([noisy(hung_cube(15))], GUESS)
+    complete = ReducedSpace()(problem)
+    loss = complete.history[-1].loss
+    hopeless = ReducedSpace(largest_loss=1e-3 * loss)(problem)
+    assert hopeless.status is Status.STALLED
+    assert hopeless.iterations < complete.iterations
+    possible = ReducedSpace(largest_loss=loss)(problem)
+    assert possible.status is Status.CONVERGED
+    np.testing.assert_allclose(possible.q, complete.q, rtol=1e-12)
+
+
 @pytest.mark.parametrize("number", [2, 5])
 def test_an_interruption_keeps_the_best_iterate(number: int):
     def interrupt(iteration: Iteration) -> None:
