@@ -93,7 +93,18 @@ class SymmetricPattern:
         entries = values[source]
         if skew is not None and skew.size:
             entries = entries + np.sign(rows - columns) * skew[source]
-        return sp.csc_array((entries, (rows, columns)), shape=(self.size, self.size))
+        return sp.csc_array((entries, *self._compressed), shape=(self.size, self.size))
+
+    @cached_property
+    def _compressed(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Rows of the entries of `full`, and the first entry of each column and their number; all
+        matrices share them.
+        """
+        rows, columns, _ = self.full
+        starts = np.searchsorted(columns, np.arange(self.size + 1))
+        indices, pointers = rows.astype(np.int32), starts.astype(np.int32)
+        indices.flags.writeable = pointers.flags.writeable = False
+        return indices, pointers
 
     def products(self, values: Array, vectors: Array) -> Array:
         """Return for each t the product of the symmetric matrix with lower-triangle values (T, m)
