@@ -301,7 +301,7 @@ def test_faultless_twins_are_good(seed):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fault", ["gravity", slow("clock 100 ms late"), slow("markers exchanged")])
+@pytest.mark.parametrize("fault", ["gravity", slow("clock 100 ms late"), "markers exchanged"])
 def test_faults_that_spoil_the_answer_are_doubtful(fault):
     found = judged(fault)
     assert found.trust.verdict == "doubtful"

@@ -234,6 +234,22 @@ def exchanged(problem: Problem, rows: slice, gap: int = 0) -> Problem:
     return replace(problem, experiments=[with_markers(experiment, tracks)])
 
 
+def test_markers_that_a_fit_puts_at_places_of_each_other_are_named():
+    given = soft("block")
+    cycle = (0, 1, 2)
+    (experiment,) = given.experiments
+    order = np.arange(len(experiment.markers.names))
+    order[[*cycle]] = [2, 0, 1]
+    tracks_m = experiment.markers.positions_m[:, order]
+    solution = solve(replace(given, experiments=[with_markers(experiment, tracks_m)]))
+    (found,) = find_misspecifications(solution)
+    assert found.cause == "markers-exchanged"
+    names = np.array(experiment.markers.names)
+    pairs = [f"{names[k]} is {names[order[k]]}" for k in cycle]
+    assert found.data["names"] == ", ".join(pairs)
+    assert not find_misspecifications(solve(given))
+
+
 @pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("gap", [0, 5])
 def test_names_exchanged_midway_are_reported_with_their_time(name: str, gap: int):

@@ -62,7 +62,7 @@ from .hypothesis import (
 from .models import LinearCorrection, coarse_mesh_hypotheses, mirrored_meshes, screened_bodies
 from .modes import ModalComparison, find_misspecifications_by_modes, gravity_hypotheses
 from .sensors import sensor_hypotheses, sensor_misfits
-from .tracks import filtered_signals, same_tracks
+from .tracks import exchanged_places, filtered_signals, same_tracks
 
 # Largest number of samples of a refit.
 MOST_SAMPLES = 100
@@ -117,6 +117,7 @@ def motion_misspecifications(
         for experiment in fitted
         for each in filtered_signals(experiment, solution.fitted_values[experiment.name])
     ]
+    hypotheses += [each for part in solution.parts for each in exchanged_places(part)]
     discrepancies = [_discrepancy(solution, k) for k in range(len(fitted))]
     if max(discrepancies) <= 1.0 or hypotheses:
         return hypotheses

@@ -1,5 +1,5 @@
-"""Misspecification hypotheses about measured values that are copies of others, and about filtered
-ones, as by the software of cameras.
+"""Misspecification hypotheses about measured values that are copies of others, about filtered ones,
+as by the software of cameras, and about markers that have each other's names.
 """
 
 from __future__ import annotations
@@ -7,13 +7,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from ...common.array_types import Array
+from ...common.array_types import Array, root_mean
+from ...program.experiment_iterate import ExperimentIterate
 from ...program.measured_motion import Predicted
 from ...recording.experiment import Experiment
 from ...recording.markers import Markers
 from ...recording.measurement import Measurement
+from ...recording.nuisance import PLACE
+from ..distributions import normal_isf
+from ..thresholds import RARE
 from .hypothesis import Hypothesis
 
 # RMS distance of two tracks over that of independent noise at one place, up to which they are the
@@ -21,7 +26,8 @@ from .hypothesis import Hypothesis
 SAME_TRACK = 1.4
 # Distance of two tracks at one sample, over σ, up to which they are compared.
 NEAR = 10.0
-# Distance of two stated places over that of the tracks, from which on the places are different.
+# Distance of two stated places over that of the tracks, from which on the places are different; the
+# same of fitted places from the stated ones of their markers, over that from those of others.
 OTHER_PLACE = 5.0
 # Fewest different values of a series that can be a copy of another one.
 FEWEST_VALUES = 5
@@ -36,6 +42,36 @@ PASSED = 0.5
 # Largest amplitude in the highest quarter of the band over that in the quarter below: a filter
 # falls, noise is flat.
 FALLING = 0.5
+
+
+def exchanged_places(part: ExperimentIterate) -> Iterator[Hypothesis]:
+    """Yield the markers that a fit puts at the stated places of each other, as far from their own as
+    no error of a place is: their names are exchanged.
+    """
+    markers = part.transcription.experiment.markers
+    estimated = part.transcription.nuisance.indices_of_rows(PLACE)
+    if len(markers.names) < 2 or not len(estimated):
+        return
+    if np.abs(part.phi[estimated]).max() <= float(normal_isf(RARE / 2 / len(estimated))):
+        return
+    stated_m = part.transcription.marker_places_m(np.zeros(len(part.phi)))
+    fitted_m = part.transcription.marker_places_m(part.phi)
+    distances_m = np.linalg.norm(fitted_m[:, None] - stated_m, axis=2)
+    _, chosen = linear_sum_assignment(distances_m**2)
+    exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
+    if not len(exchanged):
+        return
+    own_m, other_m = (
+        root_mean(distances_m[exchanged, k] ** 2) for k in (exchanged, chosen[exchanged])
+    )
+    if own_m > OTHER_PLACE * other_m:
+        names = ", ".join(f"{markers.names[k]} is {markers.names[chosen[k]]}" for k in exchanged)
+        yield Hypothesis(
+            "markers-exchanged",
+            f"'{part.transcription.experiment.name}'",
+            data={"names": names},
+            strength=own_m / max(other_m, 1e-12),
+        )
 
 
 def same_tracks(experiment: Experiment) -> Iterator[Hypothesis]:
