@@ -192,7 +192,7 @@ class MotionRecord:
         places_m : (M, 3), optional
             Estimated places of the markers; the stated ones by default.
         recorded : mapping of attribute to value, optional
-            Further attributes, as the features give them, see `Feature.recorded`.
+            Further attributes, as the features give them, see `recorded_series`.
         """
         body = experiment.body
         markers = experiment.markers

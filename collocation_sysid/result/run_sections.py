@@ -83,7 +83,7 @@ def estimate_sections(result: Result) -> list[Shown]:
 
 def run_report(run: str | Path) -> TitledParts:
     """Return the complete report of a run folder, with all PNG pictures in it, see
-    `_captioned_pictures`; nothing is written.
+    `captioned_pictures`; nothing is written.
 
     Raises
     ------

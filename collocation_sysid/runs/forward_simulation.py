@@ -224,7 +224,7 @@ def simulate_with_parameters(
     experiment : Experiment
         The recording, with which the simulation is compared.
     transcription : Transcription
-        The recording as it was fitted, see `transcription_and_nuisance`.
+        The recording as it was fitted, or as it is predicted.
     phi : (k,) array
         Nuisance parameters of the recording, in units of their prior standard deviations.
     parameters : mapping of name to value

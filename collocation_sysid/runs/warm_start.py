@@ -29,7 +29,7 @@ class WarmStart:
     # in SI units.
     values: Mapping[str, float]
     # mapping of name to value: nuisance parameters by "experiment: label", as in
-    # `Collocation.parameter_names`, in the unit of the label.
+    # `Collocation.list_parameter_names`, in the unit of the label.
     nuisance: Mapping[str, float]
     # mapping of experiment to mapping of marker to (3,): places of the markers on the undeformed
     # body [m].

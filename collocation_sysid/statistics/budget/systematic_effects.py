@@ -643,7 +643,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     behind its frame.
 
     Each grasp that is moved along an axis lags behind by the force of the specimen along it, which
-    is `Experiment.symmetry` times that of the modelled part; the part takes the share
+    is `Experiment.find_symmetry` times that of the modelled part; the part takes the share
     `Grasp.displacement_scale` of it. Specimens are treated by
     `_machine_of_specimen`.
     """
