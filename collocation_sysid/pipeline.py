@@ -459,7 +459,7 @@ def _sources(
         uncertainty=known,
         deviations=problem.assumed_deviations,
         evaluated=_evaluated_deviations(problem),
-        means=problem.uncertainty.assumptions.collect_means(),
+        means=problem.uncertainty.assumptions.means,
         has_rulers=prescribes_no_motion(solution.collocation),
     )
 

@@ -172,9 +172,7 @@ def export(
             if verify:
                 progress.say(f"comparing with predictions of {target.name}")
                 compared = verify_export(body, name, folder=folder)
-    verified = [
-        {**asdict(each), "relative": each.compute_relative_difference()} for each in compared
-    ]
+    verified = [{**asdict(each), "relative": each.relative_difference} for each in compared]
     report = {"warnings": body.warnings, "not_expressed": exported.limitations}
     table = [comparison_table(target.name, compared)] if verify else []
     _print_export(destination, {**report, "verified": verified}, as_json, table)

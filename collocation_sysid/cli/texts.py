@@ -180,7 +180,7 @@ def _word_table(word: str) -> Table:
     sources = {
         component: (each.name, each.description)
         for each in ASSUMPTIONS
-        for component in (each.name, *each.list_components())
+        for component in (each.name, *each.components)
     }
     sources |= {
         name: (name, "contribution to the uncertainty") for name in REMEDIES if name not in sources

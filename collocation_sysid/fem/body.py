@@ -364,8 +364,9 @@ class Body(Discretisation):
             face_sets=mesh.face_sets,
         )
 
-    def list_density_indices(self) -> list[int]:
-        """Return the indices in θ of the free densities, in the order of the parts; empty if all
+    @property
+    def density_indices(self) -> list[int]:
+        """Indices in θ of the free densities, in the order of the parts; empty if all
         are stated.
         """
         pairs = zip(self.parts, self._gamma_m_indices, strict=True)
@@ -409,15 +410,16 @@ class Body(Discretisation):
         )
         return self if free == self.parts else self.with_parts(free)
 
-    def collect_field_lengths_m(self) -> dict[str, float]:
-        """Return the correlation lengths [m] of the fields, by the names of their constants; empty
+    @property
+    def field_lengths_m(self) -> dict[str, float]:
+        """Correlation lengths [m] of the fields, by the names of their constants; empty
         without fields.
         """
         return {part.field_name: part.field.length_m for part in self.parts if part.field}
 
     def with_field_lengths(self, lengths_m: Mapping[str, float]) -> Body:
         """Return a copy of this body with other correlation lengths [m] of its fields, by the names
-        of the fields' constants (keys of `collect_field_lengths_m`).
+        of the fields' constants (keys of `field_lengths_m`).
 
         Other names are ignored; a field without a length is a KeyError.
         """

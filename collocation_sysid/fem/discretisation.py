@@ -154,7 +154,7 @@ class Discretisation(ConstantsModel):
         return None
 
     def point_constants(self, number: int, theta: Theta) -> Array:
-        """Return the constants (`PointLaw.count_constants`,) of the quadrature points of the part
+        """Return the constants (`PointLaw.constant_count`,) of the quadrature points of the part
         with index `number`, at θ (k,).
 
         These are the constants of material and damping law, of a part with memory also the first

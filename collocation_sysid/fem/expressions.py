@@ -58,8 +58,9 @@ class PointLaw:
     # Layout of the data of the stress-free shape; None if the mesh is stress-free.
     rest: RestPointLayout | None = None
 
-    def count_constants(self) -> int:
-        """Return the number of entries of θ at a point: constants of material and damping law, the
+    @property
+    def constant_count(self) -> int:
+        """Number of entries of θ at a point: constants of material and damping law, the
         stiffening by memory, and changes of the inputs of the stress-free shape.
         """
         count = len(self.material.constants) + len(self.damping.constants) + self.has_memory
@@ -134,7 +135,7 @@ def quadrature_point(
     )
     point = QuadraturePoint.from_element(
         element,
-        law.count_constants(),
+        law.constant_count,
         *fields,
         internal_variable_count=count,
         scaled=law.scaled_indices,

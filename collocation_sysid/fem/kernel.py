@@ -41,8 +41,9 @@ class Phase:
     pieces: ca.Function
     contractions: dict[str, Contraction]  # dict of str to Contraction: contraction of each output
 
-    def count_nodes(self) -> int:
-        """Return the number of nodes per element."""
+    @property
+    def node_count(self) -> int:
+        """Number of nodes per element."""
         return self.pieces.nnz_in(0) // 3
 
     @cached_property
@@ -53,7 +54,7 @@ class Phase:
         sx = self.pieces
         names = sx.name_in()
         inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
-        gradients = node_gradients(inputs[names.index("geometry")], self.count_nodes())
+        gradients = node_gradients(inputs[names.index("geometry")], self.node_count)
         outputs = [
             _contracted(piece, how, gradients=gradients)
             for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
@@ -99,8 +100,9 @@ class ElementKernel:
     # phases, then of `coupled`.
     coupling: ca.Function | None = None
 
-    def count_point_data(self) -> int:
-        """Return the number of internal variables and other data of a point; 0 if the kernel has no
+    @property
+    def point_data_count(self) -> int:
+        """Number of internal variables and other data of a point; 0 if the kernel has no
         such input.
         """
         names = self.pieces.name_in()
@@ -129,7 +131,7 @@ class ElementKernel:
         inputs = [ca.MX.sym(n, self.pieces.size1_in(k)) for k, n in enumerate(names)]
         for place in (k for k, name in enumerate(names) if name in OF_POINTS):
             inputs[place] = ca.MX.sym(names[place], self.pieces.size1_in(place), points)
-        size = 3 * self.phases[0].count_nodes()
+        size = 3 * self.phases[0].node_count
         sums = ca.MX(0, 1)
         vectors = ca.MX(size, 0)
         outputs: list[ca.MX] = []
@@ -300,7 +302,7 @@ class QuadraturePoint:
             stretches=tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
             point_data=ca.SX.sym(
                 "carried",
-                internal_variable_count + bool(scaled) + (rest.count_values() if rest else 0),
+                internal_variable_count + bool(scaled) + (rest.value_count if rest else 0),
             ),
             scaled_indices=scaled,
             rest=rest,
@@ -339,7 +341,7 @@ class QuadraturePoint:
     def _expand_rest_values(self) -> ca.SX:
         """Return the values of the stress-free shape at this point, see `RestPointLayout`."""
         assert self.rest is not None
-        data = self.point_data[self.point_data.numel() - self.rest.count_values() :]
+        data = self.point_data[self.point_data.numel() - self.rest.value_count :]
         changes = self.theta[self.theta.numel() - self.rest.input_count :]
         return self.rest.expand(data, changes)
 

@@ -386,7 +386,7 @@ class ConstantsModel:
         }
         for force in forces:
             for constant in force.constants:
-                if constant.name in self.list_parameter_names():
+                if constant.name in self.parameter_names:
                     raise InputError(
                         f"force {force.name!r} has the constant {constant.name!r}, but another "
                         "constant of the body has the same name; expected another name for the "
@@ -394,7 +394,7 @@ class ConstantsModel:
                     )
                 self.constants[constant.name] = constant
         for constant in frictions:
-            if constant.name in self.list_parameter_names():
+            if constant.name in self.parameter_names:
                 raise InputError(
                     f"the coefficient of friction {constant.name!r} has the name of another constant of "
                     "the body; expected another name of the obstacle, which the name of its friction "
@@ -446,13 +446,14 @@ class ConstantsModel:
             coefficients, contrasts, custom forces and coefficients of friction.
         """
         used = {name for source in self.constant_sources(known) for name in source.names.values()}
-        used.update(self.list_field_coefficient_names(), self.find_contrast_deviations())
+        used.update(self.field_coefficient_names, self.find_contrast_deviations())
         used.update(*(part.shift.constants for part in self.parts if part.shift))
         further = (force.constants for force in self.forces)
         return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
 
-    def list_parameter_names(self) -> tuple[str, ...]:
-        """Return all names that a parameter may have, without repetitions: constants of each part,
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """All names that a parameter may have, without repetitions: constants of each part,
         moduli in their place, both with and without the name of the region, those of a shift of
         the relaxation times, and `mass_kg`.
         """
@@ -550,8 +551,9 @@ class ConstantsModel:
         """
         return [theta[a:b] for a, b in pairwise(self.starts)]
 
-    def list_field_coefficient_names(self) -> tuple[str, ...]:
-        """Return the names of all constants of fields that are coefficients of shapes, in the order
+    @property
+    def field_coefficient_names(self) -> tuple[str, ...]:
+        """Names of all constants of fields that are coefficients of shapes, in the order
         of θ.
         """
         return tuple(name for names in self.group_field_coefficients().values() for name in names)
@@ -601,8 +603,8 @@ class ConstantsModel:
             For a name that the model does not have, or an elastic constant that is missing.
         """
         for name in constants:
-            if name not in self.list_parameter_names():
-                hint = hint_at(name, self.list_parameter_names())
+            if name not in self.parameter_names:
+                hint = hint_at(name, self.parameter_names)
                 raise InputError(
                     f"found the constant {name!r}; expected one of {', '.join(self.constants)}{hint}"
                 )

@@ -19,16 +19,18 @@ class RestPointLayout:
     input_count: int  # number k of entries of θ on which X depends
     averages_dilatation: bool  # whether the element averages the dilatation
 
-    def list_input_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""
+    @property
+    def input_pairs(self) -> list[tuple[int, int]]:
+        """Pairs of inputs (i, j), i ≤ j, in the order of the second derivatives."""
         return [(i, j) for j in range(self.input_count) for i in range(j + 1)]
 
-    def count_values(self) -> int:
-        """Return the number D (1 + k + k (k + 1)/2) of data of a point: values, first and second
+    @property
+    def value_count(self) -> int:
+        """Number D (1 + k + k (k + 1)/2) of data of a point: values, first and second
         derivatives.
         """
         return (10 if self.averages_dilatation else 9) * (
-            1 + self.input_count + len(self.list_input_pairs())
+            1 + self.input_count + len(self.input_pairs)
         )
 
     def expand(self, data: ca.SX, changes: ca.SX) -> ca.SX:
@@ -36,17 +38,17 @@ class RestPointLayout:
         order.
 
         `data` contains column after column the D values, their k first derivatives, and their
-        second derivatives in the order of `list_input_pairs`.
+        second derivatives in the order of `input_pairs`.
         """
         columns = ca.reshape(
             data,
             10 if self.averages_dilatation else 9,
-            1 + self.input_count + len(self.list_input_pairs()),
+            1 + self.input_count + len(self.input_pairs),
         )
         values = columns[:, 0]
         for i in range(self.input_count):
             values += columns[:, 1 + i] * changes[i]
-        for number, (i, j) in enumerate(self.list_input_pairs()):
+        for number, (i, j) in enumerate(self.input_pairs):
             factor = 0.5 if i == j else 1.0
             values += factor * changes[i] * changes[j] * columns[:, 1 + self.input_count + number]
         return values

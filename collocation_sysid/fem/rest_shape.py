@@ -310,7 +310,7 @@ class InverseEquilibrium:
             np.arange(size), (3 * grasped_nodes[:, None] + np.arange(3)).ravel()
         )
         self.places: Index = np.array(
-            [*body.elastic_indices, *body.list_density_indices()], dtype=np.int64
+            [*body.elastic_indices, *body.density_indices], dtype=np.int64
         )
         self.layout = RestPointLayout(len(self.places), body.element.mean_dilatation)
         self._shapes: dict[bytes, RestShape] = {}
@@ -358,7 +358,7 @@ class InverseEquilibrium:
                 shifted[place] += offset
                 ends.append(self.solve(shifted).by_input)
             columns.append((ends[0] - ends[1]) / (2 * step))
-        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.list_input_pairs()]
+        pairs = [(columns[j][i] + columns[i][j]) / 2 for i, j in self.layout.input_pairs]
         return np.array(pairs).reshape(-1, *self.points_m.shape)
 
     def point_data(self, theta: ArrayLike, with_second_derivatives: bool = False) -> list[Array]:
@@ -384,7 +384,7 @@ class InverseEquilibrium:
             if with_second_derivatives:
                 fields += [*self.second_derivatives(theta)]
             else:
-                fields += [np.zeros_like(self.points_m)] * len(self.layout.list_input_pairs())
+                fields += [np.zeros_like(self.points_m)] * len(self.layout.input_pairs)
             while len(self._data) >= 2:
                 self._data.pop(next(iter(self._data)), None)
             self._data[key] = self._fields_at_points(fields)
@@ -395,7 +395,7 @@ class InverseEquilibrium:
         `point_data`, for the part of this index.
         """
         count, points = self._parts[part][1].shape[:2]
-        size = self.layout.count_values()
+        size = self.layout.value_count
         return np.arange(count * points * size).reshape(count, points, size)
 
     def weight_sensitivity(self, theta: ArrayLike) -> Array:
@@ -447,7 +447,7 @@ class InverseEquilibrium:
                 - np.einsum("eqab,eqba->eq", relative[:, :, i], relative[:, :, j])
                 + traces[..., k + number]
             )
-            for number, (i, j) in enumerate(layout.list_input_pairs())
+            for number, (i, j) in enumerate(layout.input_pairs)
         ]
         determinants = np.concatenate(
             [ratios[..., None], first, np.stack(second, axis=-1)], axis=-1
@@ -463,7 +463,7 @@ class InverseEquilibrium:
         logarithm = np.empty_like(values)
         logarithm[..., 0] = np.log(values[..., 0])
         logarithm[..., 1 : k + 1] = values[..., 1 : k + 1] / values[..., :1]
-        for number, (i, j) in enumerate(self.layout.list_input_pairs()):
+        for number, (i, j) in enumerate(self.layout.input_pairs):
             column = k + 1 + number
             product = logarithm[..., 1 + i] * logarithm[..., 1 + j]
             logarithm[..., column] = values[..., column] / values[..., 0] - product

@@ -354,7 +354,7 @@ class _DampedHessian:
 
         p is stored, and the damping, at most 1, adapted to the length of the step of q.
         """
-        steps = np.abs(p - self._last_p) / self.collocation.compute_reach_p()
+        steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)
         is_short = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING

@@ -44,8 +44,8 @@ def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
         Iterate after the step, which was evaluated as a trial from `previous`.
     """
     step = after.p - previous.p
-    change = after.fit.compute_score() - previous.fit.compute_score()
-    curvature_step = after.fit.compute_score() - after.previous_slopes_residual  # B · step
+    change = after.fit.score - previous.fit.score
+    curvature_step = after.fit.score - after.previous_slopes_residual  # B · step
     change_dot_step = float(change @ step)
     if change_dot_step <= 0:
         return curvature
@@ -143,7 +143,7 @@ def exact_curvature(
     multipliers = constraint_multipliers(collocation, z, stopwatch=stopwatch)
     directions = tangent_directions(collocation, [each.by_p for each in iterate.trajectories])
     reduced = reduced_hessian(collocation, z, multipliers, directions)
-    return reduced / (2 * collocation.loss_scale) - iterate.fit.compute_information()
+    return reduced / (2 * collocation.loss_scale) - iterate.fit.information
 
 
 def reduced_hessian(
@@ -161,7 +161,7 @@ def tangent_directions(collocation: Collocation, by_p: Sequence[Array]) -> Array
     """Return the changes (variables, np) of all variables, without lifted ones, per unit of each
     parameter along the linearised equations of motion, from the `sensitivities` of the positions.
     """
-    moving = [s.list_parameter_indices()[s.dynamic_parameters] for s in collocation.transcriptions]
+    moving = [s.parameter_indices[s.dynamic_parameters] for s in collocation.transcriptions]
     # The first column, of zeros, is there also where nothing is estimated.
     units = np.eye(collocation.nq + collocation.nphi + 1)[:, 1:]
     return np.column_stack(

@@ -258,13 +258,13 @@ class ReducedSearch:
             ).skyline
             for transcription in collocation.transcriptions
         )
-        self.lower, self.upper = collocation.compute_parameter_bounds()
+        self.lower, self.upper = collocation.parameter_bounds
         self.reassociations = 0
         self.most_measurements = 0
         self.is_associated = True
         self.ended_by_association = False
         self.feasible_length = np.inf
-        self.reach = collocation.compute_reach_p()
+        self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
         self.workers = workers
@@ -680,8 +680,7 @@ class ReducedSearch:
         """
         if (is_first or not self.is_associated) and self.trajectories is not None:
             counts = [
-                transcription.count_rows_to_place()
-                for transcription in self.collocation.transcriptions
+                transcription.rows_to_place for transcription in self.collocation.transcriptions
             ]
             if any(counts):
                 rows = horizon.first_rows(self.trajectories, counts)
@@ -697,7 +696,7 @@ class ReducedSearch:
         """
         self.collocation = self.recorder.collocation = collocation
         horizon.set_collocation(collocation)
-        self.lower, self.upper = collocation.compute_parameter_bounds()
+        self.lower, self.upper = collocation.parameter_bounds
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
@@ -717,8 +716,7 @@ class ReducedSearch:
         else:
             stored = None
             counts = [
-                transcription.count_rows_to_follow()
-                for transcription in self.collocation.transcriptions
+                transcription.rows_to_follow for transcription in self.collocation.transcriptions
             ]
             rows = horizon.first_rows(point.trajectories, counts)
             collocation, p = self.collocation.follow_estimates(point.p, rows)
@@ -734,7 +732,7 @@ class ReducedSearch:
         """Return whether a trial is still acceptable with correspondences found at its estimates.
 
         A point may then belong to another part of the surface, or to none. The number of
-        measurements, with those left out because of a crease (`Collocation.count_associated()`),
+        measurements, with those left out because of a crease (`Collocation.associated_count`),
         must be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement
         at most `EQUAL_MISFIT_RATIO` times that of the point. True without unlabelled points; false if
         the association may not be updated any more.
@@ -748,14 +746,14 @@ class ReducedSearch:
             return True
         if self.reassociations >= REREADINGS:
             return False
-        self.most_measurements = max(self.most_measurements, before.count_associated())
+        self.most_measurements = max(self.most_measurements, before.associated_count)
         after = self._reassociate(horizon, trial)
         if self.collocation is not before:
             self.reassociations -= 1  # it counts when the trial is accepted
         self.reassociated_trial = _ReassociatedTrial(trial, self.collocation, reassociated=after)
-        associated = self.collocation.count_associated()
-        each = after.loss / max(1, self.collocation.count_measurements())
-        before_each = point.loss / max(1, before.count_measurements())
+        associated = self.collocation.associated_count
+        each = after.loss / max(1, self.collocation.measurement_count)
+        before_each = point.loss / max(1, before.measurement_count)
         self._set_collocation(horizon, before, p=point.p)
         return (
             associated >= LEAST_VISIBLE_SHARE * self.most_measurements

@@ -196,7 +196,7 @@ def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: St
         )
     if status in (Status.CONVERGED, Status.STALLED):
         squares = sum(part.loss for part in collocation.iterates(z))
-        misfit = float(np.sqrt(squares / max(1, collocation.count_measurements())))
+        misfit = float(np.sqrt(squares / max(1, collocation.measurement_count)))
         if misfit > MISFIT:
             size = f" ({1e3 * collocation.rms_marker_distance_m(z):.3g} mm rms)"
             measurements, noise_key = main_measurement(

@@ -51,7 +51,7 @@ class StencilTables:
         """Return the tables of rows 0 … `rows` − 1; rows before `first_row` are zero. Row 0 has the
         stencil of statics.
         """
-        p, q, w, s = (np.zeros((rows, scheme.compute_largest_lag() + 1)) for _ in range(4))
+        p, q, w, s = (np.zeros((rows, scheme.largest_lag + 1)) for _ in range(4))
         r = np.zeros(rows)
         for row in range(first_row, rows):
             stencil = scheme.stencil(row)
@@ -231,8 +231,9 @@ class Dynamics:
         nu = self.combine(self.tables.q, x) / self.step_s
         return xi[self.first_row :], nu[self.first_row :]
 
-    def compute_state_weights(self) -> Array:
-        """Return the weights (N, reach + 1) of x_{t−i} in ξ_t, where a given start counts as an
+    @property
+    def state_weights(self) -> Array:
+        """Weights (N, reach + 1) of x_{t−i} in ξ_t, where a given start counts as an
         evaluation.
 
         Rows before `first_row` have weight 1 at lag 0: internal variables begin with the start
@@ -242,8 +243,9 @@ class Dynamics:
         weights[: self.first_row, 0] = 1.0
         return weights
 
-    def compute_intervals_to_next_s(self) -> Array:
-        """Return the time [s] from each evaluation to the next (N,).
+    @property
+    def intervals_to_next_s(self) -> Array:
+        """Time [s] from each evaluation to the next (N,).
 
         The last entry is one step; in a static experiment 1 s.
         """
@@ -271,14 +273,14 @@ class Dynamics:
             Given internal variables of the previous evaluation, by the index of the history in the
             result. Internal variables that are not given are computed from x.
         """
-        if not (self.body.has_memory or self.forces.find_terms_with_internal_variables()):
+        if not (self.body.has_memory or self.forces.terms_with_internal_variables):
             return ()
         first_rows = slice(len(x))
         states = self.all_evaluation_states(x)
         return histories_of_trajectory(
             at_times(self.forces, first_rows),
             states,
-            until_next_s=self.compute_intervals_to_next_s()[first_rows],
+            until_next_s=self.intervals_to_next_s[first_rows],
             loaded_s=self.loaded_since_s,
             previous_states=previous_states or {},
         )
@@ -317,7 +319,7 @@ class Dynamics:
         xi, nu : (N, 3n)
             Positions [m] and velocities [m/s]; before `first_row`, ν is the start velocity.
         """
-        xi = self.combine(self.compute_state_weights()[: len(x)], x)
+        xi = self.combine(self.state_weights[: len(x)], x)
         nu = self.combine(self.tables.q[: len(x)], x) / self.step_s
         nu[: self.first_row] = self.start_velocity_m_s
         return xi, nu

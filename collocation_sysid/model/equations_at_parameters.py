@@ -116,7 +116,7 @@ class EquationsAtParameters:
         step_s = self.dynamics.step_s
         by_xi = force_curvature.position_theta @ self.input_derivatives
         by_nu = force_curvature.velocity_theta @ self.input_derivatives / step_s
-        by_x = dynamics.combine_transposed(dynamics.compute_state_weights(), by_xi)
+        by_x = dynamics.combine_transposed(dynamics.state_weights, by_xi)
         by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu)
         by_u = force_curvature.theta
         inertia = np.zeros_like(force_curvature.theta)

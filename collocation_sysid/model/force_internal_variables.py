@@ -129,8 +129,9 @@ class ForceHistory:
         rests = self.forces.is_static and not term.uses_increments
         return parts._replace(v=np.zeros_like(parts.v)) if rests else parts
 
-    def find_input_columns(self) -> Index:
-        """Return the columns (c,) of the force's constants among all inputs."""
+    @property
+    def input_columns(self) -> Index:
+        """Columns (c,) of the force's constants among all inputs."""
         return self.forces.pointwise_term(self.number)[1]
 
     # Second derivatives of weights · F + μ · h ----------------------------------------------------
@@ -202,7 +203,7 @@ class ForceHistory:
         by_parameters = np.zeros(by_p.shape[2])
         for k in reversed(range(len(self.xi))):
             by_xi[k], by_nu[k] = pulling.state_gradient()
-            by_parameters += pulling.input_gradient() @ by_p[k][self.find_input_columns()]
+            by_parameters += pulling.input_gradient() @ by_p[k][self.input_columns]
             pulling.step_back(force_weights[k])
         return by_xi, by_nu, by_parameters
 
@@ -353,7 +354,7 @@ class ForceForwardColumns(_DerivativeIterator):
             called only if the variables depend on them.
         """
         _, by = self.derivatives()
-        of_inputs = self.by_p(self.next)[self.history.find_input_columns()]
+        of_inputs = self.by_p(self.next)[self.history.input_columns]
         columns = np.einsum("abi,bic->aic", by.b, self.columns)
         columns += np.einsum("abi,bc->aic", by.c, of_inputs)
         for part, state_change in ((by.y, of_state), (by.v, of_rate)):

@@ -411,8 +411,9 @@ class Forces:
         assert isinstance(term, Pointwise)
         return term, term.constant_columns(places)
 
-    def find_air_drag(self) -> CustomForce | None:
-        """Return the drag of the air around the body; None in a vacuum or in a static experiment."""
+    @property
+    def air_drag(self) -> CustomForce | None:
+        """Drag of the air around the body; None in a vacuum or in a static experiment."""
         terms = (
             term
             for term in self.external_terms
@@ -420,12 +421,14 @@ class Forces:
         )
         return next(terms, None)
 
-    def find_terms_with_internal_variables(self) -> list[int]:
-        """Return the indices in `external_terms` of the terms with internal variables."""
+    @property
+    def terms_with_internal_variables(self) -> list[int]:
+        """Indices in `external_terms` of the terms with internal variables."""
         return [k for k, term in enumerate(self.external_terms) if term.internal_variable_count]
 
-    def find_complementarity_terms(self) -> list[int]:
-        """Return the indices in `external_terms` of the forces of a complementarity condition."""
+    @property
+    def complementarity_terms(self) -> list[int]:
+        """Indices in `external_terms` of the forces of a complementarity condition."""
         further = enumerate(self.external_terms)
         return [
             k

@@ -191,7 +191,7 @@ def inputs_from_experiment(
     joining = zip(nuisance.indices_of_rows(JOINING).tolist(), nuisance.timed_loads, strict=True)
     groups += [share(phi, timed) for phi, timed in joining]
     groups += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
-    if rows := experiment.list_stiffness_deviations():
+    if rows := experiment.stiffness_deviations:
         changing = nuisance.stiffness_indices.tolist()
         slopes = {row.name: row.stiffness(experiment, evaluated_s) for row in rows if row.stiffness}
         data = [slopes[nuisance.entries[phi].row.name] for phi in changing]

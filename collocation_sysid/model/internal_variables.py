@@ -59,7 +59,7 @@ def histories_of_trajectory(
                 previous_variables=previous_states.get(0),
             )
         )
-    for number in forces.find_terms_with_internal_variables():
+    for number in forces.terms_with_internal_variables:
         before = previous_states.get(len(collected))
         collected.append(
             ForceHistory.from_states(forces, number, xi=xi, nu=nu, since_s=since_s, before=before)
@@ -100,7 +100,7 @@ def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[P
     """
     states: list[PreviousState] = [
         ForcePreviousState.from_state(forces, number, x=x, v=v)
-        for number in forces.find_terms_with_internal_variables()
+        for number in forces.terms_with_internal_variables
     ]
     if forces.body.has_memory:
         states.insert(

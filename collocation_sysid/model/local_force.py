@@ -99,11 +99,12 @@ class ActivePoints:
         return (
             self.source,
             self.candidates.point_indices[self.indices].tobytes(),
-            self.find_axes().tobytes(),
+            self.axes.tobytes(),
         )
 
-    def find_axes(self) -> NDArray[np.bool_]:
-        """Return a mask (3,) of the axes along which any force on the points acts, or by whose
+    @property
+    def axes(self) -> NDArray[np.bool_]:
+        """A mask (3,) of the axes along which any force on the points acts, or by whose
         coordinates it changes; one of them for a plane without friction that is perpendicular to an
         axis.
         """

@@ -563,7 +563,7 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
     Consecutive kinds of one sort of component are ordered by component, then by kind and axis; the
     unknowns of custom sensors come last. Exact quantities are left out.
     """
-    for _, rows in groupby(experiment.nuisance.list_kinds(), key=lambda row: row.of):
+    for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (
             _components(experiment, applicable[0].of) if applicable else ()
@@ -595,9 +595,7 @@ def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, st
     if of == "marker":
         return enumerate(names)
     if of == "place":
-        return [
-            (m, names[m]) for m in np.flatnonzero(experiment.compute_place_sigma_m() > 0).tolist()
-        ]
+        return [(m, names[m]) for m in np.flatnonzero(experiment.place_sigma_m > 0).tolist()]
     if of == "grasp":
         return [(k, str(k + 1)) for k in range(len(experiment.body_grasps))]
     if of == "obstacle":
@@ -622,7 +620,7 @@ def _component_axes(
     sigma = experiment.nuisance.sigma(row)
     names = row.axes.split() or [""]
     if row == PLACE:
-        sigma = float(experiment.compute_place_sigma_m()[number])
+        sigma = float(experiment.place_sigma_m[number])
         names = ["first", "second"] if experiment.markers.on_surface else names
     if not sigma:
         return []

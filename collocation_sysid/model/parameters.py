@@ -640,8 +640,9 @@ class Parameters:
         scalars = {item.name for item in self.scalars}
         return tuple(k for k, item in enumerate(self.free) if item.name in scalars)
 
-    def list_linear_names(self) -> frozenset[str]:
-        """Return the names of the components with linear scale."""
+    @property
+    def linear_names(self) -> frozenset[str]:
+        """Names of the components with linear scale."""
         return frozenset(item.name for item in self.components if item.scale == "linear")
 
     def scale_and_bounds(self, name: str) -> tuple[bool, tuple[float, float]]:
@@ -653,11 +654,12 @@ class Parameters:
         """
         item = next((each for each in self.free if each.name == name), None)
         if item is None:
-            return name in self.list_linear_names(), (-np.inf, np.inf)
+            return name in self.linear_names, (-np.inf, np.inf)
         return item.scale == "linear", (item.lower, item.upper)
 
-    def list_names_without_guess(self) -> tuple[str, ...]:
-        """Return the names of the estimated parameters without a guess."""
+    @property
+    def names_without_guess(self) -> tuple[str, ...]:
+        """Names of the estimated parameters without a guess."""
         return tuple(item.name for item in self.free if item.guess is None)
 
     @property
@@ -672,8 +674,9 @@ class Parameters:
         """
         return np.array([item.to_coordinate(_guess(item)) for item in self.free])
 
-    def compute_bounds_q(self) -> tuple[Array, Array]:
-        """Return the lower and upper bounds of q, (nq,) each, in the order of `free`; infinite
+    @property
+    def bounds_q(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of q, (nq,) each, in the order of `free`; infinite
         where there is none.
         """
         return (
@@ -813,7 +816,7 @@ class Parameters:
             no region uses, or a fixed stiffness or density of zero.
         """
         bodies = list(bodies)
-        known = [name for body in bodies for name in body.list_parameter_names()]
+        known = [name for body in bodies for name in body.parameter_names]
         for name in self.names:
             if name not in known:
                 parameter, _, key = name.rpartition(".")

@@ -39,8 +39,9 @@ class Recursion:
     constant_count: int  # length C of the constants c
     data_size: int  # length d of the data at each time
 
-    def compute_input_offsets(self) -> list[int]:
-        """Return the end indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of
+    @property
+    def input_offsets(self) -> list[int]:
+        """End indices of h_{k−1}, s_k, s_{k−1} and c in the input vector of
         `step_function`.
         """
         sizes = [self.state_size, self.signal_size, self.signal_size, self.constant_count]
@@ -52,12 +53,10 @@ class Recursion:
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
             """Return h_k from the stacked inputs."""
-            before, now, last, constants = ca.vertsplit(u, [0, *self.compute_input_offsets()])
+            before, now, last, constants = ca.vertsplit(u, [0, *self.input_offsets])
             return self.expression(before, now, last, constants, data)
 
-        return GeneratedFunction(
-            expression, self.compute_input_offsets()[-1], data_size=self.data_size
-        )
+        return GeneratedFunction(expression, self.input_offsets[-1], data_size=self.data_size)
 
     def linear_coefficients(self, constants: ca.SX, data: ca.SX) -> ca.SX:
         """Return ∂R/∂(h_{k−1}, s_k, s_{k−1}) of a recursion that is linear in these, column by
@@ -73,8 +72,8 @@ class Recursion:
         (n (n + 2 i),) SX
             The Jacobian (n, n + 2 i), stacked column by column.
         """
-        u = ca.SX.sym("u", self.compute_input_offsets()[2])
-        before, now, last = ca.vertsplit(u, [0, *self.compute_input_offsets()[:3]])
+        u = ca.SX.sym("u", self.input_offsets[2])
+        before, now, last = ca.vertsplit(u, [0, *self.input_offsets[:3]])
         return ca.vec(ca.jacobian(self.expression(before, now, last, constants, data), u))
 
 
@@ -128,7 +127,7 @@ class RecursionTrajectory:
         step = self.recursion.step_function
         all_times = slice(0, self.signal.shape[1])
         by_u = step.evaluate_with_jacobian(self._stacked_inputs(all_times), self.data)[1]
-        return np.split(by_u, self.recursion.compute_input_offsets()[:-1], axis=1)
+        return np.split(by_u, self.recursion.input_offsets[:-1], axis=1)
 
     def jacobian_vector_product(self, signal_changes: Array, constant_changes: Array) -> Array:
         """Return the changes of the states (n, N, I, c) for c directions at once, including those

@@ -87,8 +87,9 @@ class Scheme:
         stencils = (self.regular, *self.start)
         return all((each.p, each.q) == ((0.5, 0.5), (1.0, -1.0)) for each in stencils)
 
-    def compute_largest_lag(self) -> int:
-        """Return the largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
+    @property
+    def largest_lag(self) -> int:
+        """Largest lag l with ∂c_t/∂x_{t−l} ≠ 0, in time steps."""
         lags = []
         for stencil in (self.regular, *self.start):
             points = max(len(stencil.p), len(stencil.q))

@@ -24,7 +24,7 @@ def stiffness_change_terms(experiment: Experiment, t_s: Array) -> Iterator[Stiff
     """Yield the change of the stiffness at times (T,), if a deviation of the experiment may have
     one; its share is that of the known deviations.
     """
-    if experiment.list_stiffness_deviations():
+    if experiment.stiffness_deviations:
         share = experiment.known_stiffness_change(t_s)[:, None]
         yield StiffnessChange(experiment.body, share, is_static=experiment.is_static)
 

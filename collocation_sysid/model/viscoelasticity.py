@@ -334,7 +334,7 @@ class MemoryHistory:
         _, by = OVERSTRESS.step_function.evaluate_with_jacobian(
             self._overstress_inputs(mu), self.fading.data
         )
-        by_fading = by[0, OVERSTRESS.compute_input_offsets()[2] :]
+        by_fading = by[0, OVERSTRESS.input_offsets[2] :]
         by_q = np.einsum("jbn,jbq->q", by_fading, theta_q[self.fading.places])
         sigma = self.stress_weights(mu)
         for rows, slopes in self.stress_derivatives(theta_q):
@@ -362,7 +362,7 @@ class MemoryHistory:
         inputs = self._overstress_inputs(mu)
         data = self.fading.data
         elastic = self.body.elastic_indices
-        fading_inputs = slice(OVERSTRESS.compute_input_offsets()[2], None)
+        fading_inputs = slice(OVERSTRESS.input_offsets[2], None)
         slopes = OVERSTRESS.step_function.evaluate_with_jacobian(inputs, data)[1]
         second = OVERSTRESS.step_function.weighted_hessian(inputs, data)
         curvature.theta[:, places] += np.moveaxis(slopes[0, fading_inputs], 2, 0)

@@ -33,7 +33,7 @@ def gripper_transforms(
     indices = list(grasps)
     if problem.origin is None:
         return [None] * len(indices)
-    sections = ProblemFile.model_validate(tomllib.loads(problem.origin.text)).list_recordings()
+    sections = ProblemFile.model_validate(tomllib.loads(problem.origin.text)).recordings
     (section,) = (each for each in sections if each.name == experiment)
     transforms: list[Array | None] = []
     for k in indices:

@@ -90,11 +90,11 @@ def problem_arguments(
     mesh_warnings: list[str] = []
     with _locate_in_table(path, "object"):
         cells = SpecimenCells(file.object, code)
-        if file.list_recordings():
+        if file.recordings:
             body, size = _load_object(file, folder, code=code, simulation=simulation, say=say)
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
-            first = file.list_specimens()[0]
+            first = file.specimens[0]
             body = cells.body_for(first)
             unknowns = with_undamped(unknowns, body.constants)
     with _locate_in_table(path, "parameters"):
@@ -103,9 +103,7 @@ def problem_arguments(
         parameters = Parameters.from_mapping(
             {name: _as_parameter(name, each) for name, each in sections.items()}
         )
-        parameters.require_constants_of(
-            [body_with_friction, *map(cells.body_for, file.list_specimens())]
-        )
+        parameters.require_constants_of([body_with_friction, *map(cells.body_for, file.specimens)])
     experiments = []
     notes = []
     specimens: dict[str, Specimen] = {}
@@ -261,8 +259,8 @@ def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """Return the data files that a problem names, existing or not."""
     names = [file.object.mesh, file.object.surface]
-    names += [section.file for section in file.list_specimens()]
-    for section in file.list_recordings():
+    names += [section.file for section in file.specimens]
+    for section in file.recordings:
         names += section.list_measurement_files()
         for table in (each for word in LOADS.values() for each in getattr(section, word)):
             keys = [key.name for _, key in keys_of(table.of) if key.constant is not None]
@@ -401,7 +399,7 @@ def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
     frictions given as numbers are left out, and so are names that do not end with that of a
     coefficient of friction.
     """
-    declared = (each.friction for section in file.list_recordings() for each in section.obstacle)
+    declared = (each.friction for section in file.recordings for each in section.obstacle)
     named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
 

@@ -213,15 +213,12 @@ class Problem:
         """
         return self.uncertainty.assumptions.damping_law == "none"
 
-    def collect_lengths_m(self) -> dict[str, float]:
-        """Return the correlation lengths of spatially varying constants [m], by name of the
+    @property
+    def lengths_m(self) -> dict[str, float]:
+        """Correlation lengths of spatially varying constants [m], by name of the
         constant with its region; empty without fields.
         """
-        return {
-            name: each
-            for body in self.bodies
-            for name, each in body.collect_field_lengths_m().items()
-        }
+        return {name: each for body in self.bodies for name, each in body.field_lengths_m.items()}
 
     def with_lengths(self, lengths_m: Mapping[str, float]) -> Problem:
         """Return the problem with other correlation lengths of spatially varying constants.
@@ -234,7 +231,7 @@ class Problem:
             Correlation length [m] of every such constant, by the names of the property `lengths_m`;
             a missing one is a KeyError, and other names are ignored.
         """
-        if dict(lengths_m) == self.collect_lengths_m():
+        if dict(lengths_m) == self.lengths_m:
             return self
         bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}
         return replace(
@@ -264,12 +261,12 @@ class Problem:
         removed_names = {
             n
             for b in self.bodies
-            for n in (*b.list_field_coefficient_names(), *b.find_contrast_deviations())
+            for n in (*b.field_coefficient_names, *b.find_contrast_deviations())
         }
         removed_names -= {
             n
             for b in bodies.values()
-            for n in (*b.list_field_coefficient_names(), *b.find_contrast_deviations())
+            for n in (*b.field_coefficient_names, *b.find_contrast_deviations())
         }
         return replace(
             self,
@@ -335,7 +332,7 @@ class Problem:
         with_set : bool
             Whether the option --set may state it.
         """
-        if names := self.parameters.list_names_without_guess():
+        if names := self.parameters.names_without_guess:
             key = f"parameters.{names[0]}"
             guess = f"--set {key}.guess=VALUE" if with_set else "a guess"
             raise InputError(
@@ -386,7 +383,7 @@ class Problem:
 
 def _require_plausible_noise(experiment: Experiment) -> None:
     """Raise an `InputError` if the noise of the markers is larger than the body."""
-    if not experiment.markers.count_samples():
+    if not experiment.markers.sample_count:
         return
     sigma_m = float(np.min(experiment.markers.sigma_m))
     size_m = float(np.ptp(experiment.body.nodes_m, axis=0).max())

@@ -46,8 +46,9 @@ class SensorMounting:
         """Origin (3,) of the sensor in `frame` [m]."""
         return self.pose[:3, 3]
 
-    def compute_angle_deg(self) -> float:
-        """Return the angle between the axes of the sensor and those of `frame` [degrees]."""
+    @property
+    def angle_deg(self) -> float:
+        """Angle between the axes of the sensor and those of `frame` [degrees]."""
         rotation = Rotation.from_matrix(self.pose[:3, :3])
         return float(np.degrees(rotation.magnitude()))
 
@@ -63,7 +64,7 @@ class SensorMounting:
         owner = "the body" if self.frame == "grasp" else "the world"
         return (
             f"the force is measured in {self.sensor!r}: by the static transforms of the log its "
-            f"components are rotated by {self.compute_angle_deg():.3g}° to the axes of {owner}, and its "
+            f"components are rotated by {self.angle_deg:.3g}° to the axes of {owner}, and its "
             f"torques are about the point {point_text(self.point_m)} m "
             f"{'of the undeformed body' if self.frame == 'grasp' else 'in the world'}; other "
             "axes are stated by frame and point_m"
@@ -75,7 +76,7 @@ class SensorMounting:
         """
         offset_m = np.linalg.norm(self.point_m - np.array(section.point_m))
         return section.frame == self.frame and bool(
-            self.compute_angle_deg() > LARGEST_ROTATION_DEG or offset_m > LARGEST_OFFSET_M
+            self.angle_deg > LARGEST_ROTATION_DEG or offset_m > LARGEST_OFFSET_M
         )
 
 
@@ -314,14 +315,14 @@ class RecordingFrames:
                 "axes of the world; state sensor_frame, or frame and point_m"
             )
         if not section.states_axes:
-            moves = mounting.compute_angle_deg() or mounting.point_m.any()
+            moves = mounting.angle_deg or mounting.point_m.any()
             is_usual = mounting.frame == "world" and not moves
             return "" if is_usual else f"{file}: {mounting.describe()}"
         if mounting.contradicts(section):
             return (
                 f'{file}: frame = "{section.frame}" and point_m state axes and point, but by the '
                 f"static transforms of the log the sensor's frame {mounting.sensor!r} is rotated "
-                f"by {mounting.compute_angle_deg():.3g}° against these axes, with its origin at "
+                f"by {mounting.angle_deg:.3g}° against these axes, with its origin at "
                 f"{point_text(mounting.point_m)} m; omit frame and point_m to use the transforms"
             )
         return ""

@@ -139,8 +139,8 @@ class RecordingReader:
         )
         for before, after in zip(grasps, experiment.grasps, strict=False):
             if before.wrench is not None and after.wrench is not None:
-                kept = after.wrench.list_component_names()
-                left = [n for n in before.wrench.list_component_names() if n not in kept]
+                kept = after.wrench.component_names
+                left = [n for n in before.wrench.component_names if n not in kept]
                 if left and not self.simulation:
                     self._add_notes(
                         f"{listed(left)} of the sensor are not used: by symmetry, they vanish on the "

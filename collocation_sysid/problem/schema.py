@@ -519,7 +519,7 @@ class ProblemFile(Section):
         """
         if self.object.has_shape:
             return self
-        if self.list_recordings():
+        if self.recordings:
             raise InputError(
                 f"found no {' or '.join(SHAPES)}; expected exactly one of {', '.join(SHAPES)}",
                 where="object",
@@ -533,12 +533,14 @@ class ProblemFile(Section):
                 )
         return self
 
-    def list_recordings(self) -> list[ExperimentSection]:
-        """Return the experiments with the object's mesh, in the order of the file."""
+    @property
+    def recordings(self) -> list[ExperimentSection]:
+        """Experiments with the object's mesh, in the order of the file."""
         return [each for each in self.experiment if isinstance(each, ExperimentSection)]
 
-    def list_specimens(self) -> list[SpecimenSection]:
-        """Return the material tests without a mesh, in the order of the file."""
+    @property
+    def specimens(self) -> list[SpecimenSection]:
+        """Material tests without a mesh, in the order of the file."""
         return [each for each in self.experiment if isinstance(each, SpecimenSection)]
 
 

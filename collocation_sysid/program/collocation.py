@@ -211,20 +211,22 @@ class Collocation:
         """Number of constraints g."""
         return self.transcriptions[-1].next_offsets.row
 
-    def count_measurements(self) -> int:
-        """Return the number of scalar measurements that are compared, of all fitted experiments."""
+    @property
+    def measurement_count(self) -> int:
+        """Number of scalar measurements that are compared, of all fitted experiments."""
         return sum(
             int(residual.is_compared.sum())
             for transcription in self.transcriptions
             for residual in transcription.residuals
         )
 
-    def count_associated(self) -> int:
-        """Return the number of scalar measurements that belong to the body at the present
+    @property
+    def associated_count(self) -> int:
+        """Number of scalar measurements that belong to the body at the present
         estimates: those that are compared, and the points of cameras that are left out because of a
         crease.
         """
-        return self.count_measurements() + sum(
+        return self.measurement_count + sum(
             residual.uncompared_count
             for transcription in self.transcriptions
             for residual in transcription.residuals
@@ -235,7 +237,7 @@ class Collocation:
         """Factor of the loss in the objective: one over the number of measurements, or 1 without
         any.
         """
-        return 1.0 / max(1, self.count_measurements())
+        return 1.0 / max(1, self.measurement_count)
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         """Return the variables z.
@@ -283,7 +285,7 @@ class Collocation:
     @cached_property
     def parameter_indices(self) -> list[Index]:
         """Indices (nq + k,) of (q, φ) of each experiment in p."""
-        return [transcription.list_parameter_indices() for transcription in self.transcriptions]
+        return [transcription.parameter_indices for transcription in self.transcriptions]
 
     @property
     def threads(self) -> int:
@@ -308,8 +310,9 @@ class Collocation:
             for transcription, x in zip(self.transcriptions, positions, strict=True)
         ]
 
-    def list_parameter_names(self) -> tuple[str, ...]:
-        """Return the name of each entry of p: the parameters' names, then the labels of the
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Name of each entry of p: the parameters' names, then the labels of the
         nuisance parameters; of a shared one, the label in the last experiment that has it.
         """
         names = [item.name for item in self.parameters.free] + [""] * self.nphi
@@ -333,11 +336,12 @@ class Collocation:
             np.concatenate([slopes, np.ones(self.nphi)]),
         )
 
-    def compute_parameter_bounds(self) -> tuple[Array, Array]:
-        """Return the lower and upper bounds of p, (nq + nphi,) each; infinite for most φ. For a
+    @property
+    def parameter_bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of p, (nq + nphi,) each; infinite for most φ. For a
         shared φ, the narrowest of all experiments.
         """
-        lower, upper = self.parameters.compute_bounds_q()
+        lower, upper = self.parameters.bounds_q
         low, high = (np.full(self.nphi, bound) for bound in (-np.inf, np.inf))
         for transcription in self.transcriptions:
             indices = transcription.nuisance_indices.indices - self.nq
@@ -401,7 +405,7 @@ class Collocation:
             The program with the new associations, and p in it; self and p if no experiment has
             unknown places or cameras.
         """
-        if not any(transcription.count_rows_to_place() for transcription in self.transcriptions):
+        if not any(transcription.rows_to_place for transcription in self.transcriptions):
             return self, p
         updates = [
             part.transcription.place_unknown_markers(part.phi, part.x, only_poses=only_poses)
@@ -422,7 +426,7 @@ class Collocation:
             s.with_association(c) for s, c in zip(self.transcriptions, associations, strict=True)
         ]
         return self._with_associations(
-            associations, self.guess_p, phis=[s.compute_guess_phi() for s in transcriptions]
+            associations, self.guess_p, phis=[s.guess_phi for s in transcriptions]
         )[0]
 
     def _with_associations(
@@ -448,7 +452,7 @@ class Collocation:
     def guess_p(self) -> Array:
         """Guess of p: that of q, and φ at the centres of the associations."""
         return self._combine_parameters(
-            self.parameters.guess_q, [s.compute_guess_phi() for s in self.transcriptions]
+            self.parameters.guess_q, [s.guess_phi for s in self.transcriptions]
         )
 
     def _combine_parameters(self, q: Array, phis: Sequence[Array]) -> Array:
@@ -458,8 +462,9 @@ class Collocation:
             p[transcription.nuisance_indices.indices] = phi
         return p
 
-    def compute_reach_p(self) -> Array:
-        """Return the scale (nq + nphi,) of p: the change of each entry that a trust region of
+    @property
+    def reach_p(self) -> Array:
+        """Scale (nq + nphi,) of p: the change of each entry that a trust region of
         radius one allows, which is one for q.
         """
         return self._combine_parameters(
@@ -470,7 +475,7 @@ class Collocation:
         """Return lower and upper bounds of z, (variables,) each; equal where a value is prescribed,
         ∓∞ where there is none.
         """
-        lower, upper = self.compute_parameter_bounds()
+        lower, upper = self.parameter_bounds
         lows, highs = zip(
             *(transcription.bounds() for transcription in self.transcriptions), strict=True
         )
@@ -499,7 +504,7 @@ class Collocation:
         for part in parts:
             of_x, of_p = part.gradient()
             by_x.append(of_x.ravel() * part.transcription.length_m)
-            by_p[part.transcription.list_parameter_indices()] += of_p
+            by_p[part.transcription.parameter_indices] += of_p
         return self.loss_scale * np.concatenate(
             [by_p[: self.nq], *by_x, by_p[self.nq :], *self._additional_gradients(parts)]
         )

@@ -130,7 +130,7 @@ class DrivenMotion:
 
     @cached_property
     def _stated(self) -> EquationsAtParameters:
-        return self.transcription.equations_at(self.q, self.transcription.compute_guess_phi())
+        return self.transcription.equations_at(self.q, self.transcription.guess_phi)
 
     @property
     def stated_goals_m(self) -> Array:

@@ -106,12 +106,14 @@ class SquareRootInformation:
         """Residuals r (k,) at p = 0, as the triangle represents them, k ≤ P + 1."""
         return self.triangle[:, -1]
 
-    def compute_information(self) -> Array:
-        """Return the information matrix (P, P), SᵀS."""
+    @property
+    def information(self) -> Array:
+        """Information matrix (P, P), SᵀS."""
         return self.jacobian.T @ self.jacobian
 
-    def compute_score(self) -> Array:
-        """Return the score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares
+    @property
+    def score(self) -> Array:
+        """Score (P,), Sᵀ r with r at p = 0: half the gradient of the sum of squares
         there.
         """
         return self.jacobian.T @ self.residual

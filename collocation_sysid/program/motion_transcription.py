@@ -244,8 +244,9 @@ class MotionTranscription:
         """Slice of its constraints in g."""
         return slice(self.offsets.row, self.offsets.row + self.constraint_count)
 
-    def list_parameter_indices(self) -> Index:
-        """Return the indices (nq + k,) of its (q, φ) in p."""
+    @property
+    def parameter_indices(self) -> Index:
+        """Indices (nq + k,) of its (q, φ) in p."""
         return np.concatenate([np.arange(self.nq), self.nuisance_indices.indices])
 
     @property
@@ -339,9 +340,7 @@ class MotionTranscription:
 
     def has_histories(self) -> bool:
         """Return whether its body (viscoelastic memory) or a force on it has history variables."""
-        return self.body.has_memory or bool(
-            self.dynamics.forces.find_terms_with_internal_variables()
-        )
+        return self.body.has_memory or bool(self.dynamics.forces.terms_with_internal_variables)
 
     def equations_at(self, q: Array, phi: Array) -> EquationsAtParameters:
         """Return the equations of motion, on all N grid times, at shared parameters q (nq,) and
@@ -579,7 +578,7 @@ class MotionTranscription:
             by_xi, by_nu, own = history.vector_jacobian_product(
                 weights, equations.input_derivatives
             )
-            by_x += dynamics.combine_transposed(dynamics.compute_state_weights(), by_xi)
+            by_x += dynamics.combine_transposed(dynamics.state_weights, by_xi)
             by_x += dynamics.combine_transposed(dynamics.tables.q, by_nu) / dynamics.step_s
             by_p += own
         return by_x, by_p
@@ -652,7 +651,7 @@ class MotionTranscription:
 
     def _curvature_terms(self, distance: int, factors: Factors) -> list[BlockTerm]:
         """Terms of the block between rows at a distance in time."""
-        p = self.dynamics.compute_state_weights()
+        p = self.dynamics.state_weights
         q = self.dynamics.tables.q / self.dynamics.step_s
         terms = []
         for i in range(self.dynamics.largest_lag + 1 - distance):

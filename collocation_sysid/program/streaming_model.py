@@ -143,12 +143,12 @@ class StreamingModel:
             }
             seen = still.with_measurements([sampled.get(m, m) for m in still.measurements])
             collocation = replace(collocation, experiments=[seen])
-            rows = np.tile(x, (collocation.transcriptions[0].count_rows_to_place(), 1))
+            rows = np.tile(x, (collocation.transcriptions[0].rows_to_place, 1))
             collocation, _ = collocation.place_unknown_markers(collocation.guess_p, [rows])
         unknown = ~still.markers.located & np.isfinite(tracks_m).all(axis=1)
         if unknown.any():
             transcription = collocation.transcriptions[0]
-            places_m = transcription.marker_places_m(transcription.compute_guess_phi())
+            places_m = transcription.marker_places_m(transcription.guess_phi)
             places_m[unknown] = transcription.association.markers.places_of_points(
                 x.reshape(-1, 3), tracks_m[unknown]
             )
@@ -288,7 +288,7 @@ class StreamingModel:
                 observable = [other for other, _ in self.reaction_sensors].index(channel)
                 stencil = stencil._replace(first=int(channel.known_rows[0]), delay=DELAY_STEPS)
                 if not is_custom:
-                    clock_error = channel.compute_clock_limit_s() / step_s
+                    clock_error = channel.clock_limit_s / step_s
                     stencil = stencil._replace(neighbours=TIMES_PER_SAMPLE, clock_error=clock_error)
             else:
                 observable = slice(place, place + channel.vector_count)

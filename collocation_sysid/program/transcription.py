@@ -133,7 +133,7 @@ class Transcription(MotionTranscription):
         phi : (k,) array
             Nuisance parameters in units of their priors, relative to the present association.
         x : (rows, 3n) array
-            First rows of the motion [m], at least `count_rows_to_follow`; it may have no rows if
+            First rows of the motion [m], at least `rows_to_follow`; it may have no rows if
             there are no unlabelled points.
 
         Returns
@@ -181,7 +181,7 @@ class Transcription(MotionTranscription):
         phi : (k,) array
             Nuisance parameters; they are not modified.
         x : (rows, 3n) array
-            First rows of the motion [m], at least `count_rows_to_place`.
+            First rows of the motion [m], at least `rows_to_place`.
         only_poses : bool
             Whether to keep the correspondences of unlabelled points and align the poses of their
             sensors alone.
@@ -226,8 +226,9 @@ class Transcription(MotionTranscription):
         association = self.association.centred_at(places_m)
         return association, self._with_marker_places(phi, association.markers.centre_coordinates)
 
-    def count_rows_to_place(self) -> int:
-        """Return the number of rows of x that `place_unknown_markers` needs; 0 if all places are
+    @property
+    def rows_to_place(self) -> int:
+        """Number of rows of x that `place_unknown_markers` needs; 0 if all places are
         stated and there are no unlabelled points.
         """
         unknown = ~self.experiment.markers.located
@@ -235,8 +236,9 @@ class Transcription(MotionTranscription):
         rows = [int(self.sample_rows[first].max())] if len(first) else []
         return 1 + max(rows + [each.first_row for each in self.reassociable], default=-1)
 
-    def count_rows_to_follow(self) -> int:
-        """Return the number of rows of x that `follow_estimates` needs: all grid times, or 0
+    @property
+    def rows_to_follow(self) -> int:
+        """Number of rows of x that `follow_estimates` needs: all grid times, or 0
         without unlabelled points.
         """
         return self.grid_times if self.reassociable else 0
@@ -247,8 +249,9 @@ class Transcription(MotionTranscription):
             np.append(phi, 0.0)[self.markers.observable.coordinate_parameters]
         )
 
-    def compute_guess_phi(self) -> Array:
-        """Return the nuisance parameters φ (k,) at the start of a solve: zero, except for the clock
+    @property
+    def guess_phi(self) -> Array:
+        """Nuisance parameters φ (k,) at the start of a solve: zero, except for the clock
         and the poses of sensors in the association.
         """
         phi = np.zeros(self.nuisance.size)

@@ -99,7 +99,7 @@ class WrenchResidual(MeasurementResidual):
         """Time [s] up to which the motion must be known for the first sample that is compared, with
         the largest possible shift of the clock.
         """
-        return super().first_needed_s + self.observable.compute_clock_limit_s()
+        return super().first_needed_s + self.observable.clock_limit_s
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
         """Return the mask (S,) of the samples for which the first `known` times suffice,
@@ -183,7 +183,7 @@ def _is_covered(observable: ReactionResultant, t_s: Array, known: int) -> NDArra
         return np.zeros(len(t_s), dtype=bool)
     first, last = observable.t_s[[0, known - 1]]
     rounding = 1e-6 * observable.reaction_grid.step_s + TIME_TOLERANCE_S
-    limit_s = observable.compute_clock_limit_s()
+    limit_s = observable.clock_limit_s
     return (t_s >= first + limit_s - rounding) & (t_s <= last - limit_s + rounding)
 
 

@@ -315,7 +315,7 @@ class Depth(Measurement):
     @property
     def first_useful_s(self) -> float:
         """Time of its first sample with points [s]."""
-        return float(self.sample_times_s[self.find_first_sample_with_points()])
+        return float(self.sample_times_s[self.first_sample_with_points])
 
     @property
     def point_counts(self) -> list[int]:
@@ -335,8 +335,9 @@ class Depth(Measurement):
             thinned = replace(self, spacing_m=spacing_m)
         return thinned
 
-    def find_first_sample_with_points(self) -> int:
-        """Return the index, from 0, of the first sample that has points."""
+    @property
+    def first_sample_with_points(self) -> int:
+        """Index, from 0, of the first sample that has points."""
         return next(k for k, cloud in enumerate(self.clouds) if len(cloud))
 
 

@@ -237,8 +237,9 @@ class Deviation:
         is_possible = {"estimate": not self.effect, "consider": True, "test": is_tested}
         return tuple(mode for mode in get_args(Mode) if is_possible[mode])
 
-    def list_components(self) -> tuple[str, ...]:
-        """Return the names of the axes, each after that of the deviation and a space; the name
+    @property
+    def components(self) -> tuple[str, ...]:
+        """Names of the axes, each after that of the deviation and a space; the name
         alone without axes.
         """
         return tuple(f"{self.name} {axis}" for axis in self.axes.split()) or (self.name,)

@@ -331,7 +331,7 @@ class Experiment:
         if not (vanishes & wrench.measured_components).any():
             return grasp
         if not (wrench.measured_components & ~vanishes).any():
-            names = listed(wrench.list_component_names())
+            names = listed(wrench.component_names)
             raise InputError(
                 f"{names} of the complete specimen vanish by symmetry across the planes in which "
                 "grasps hold the body; expected the measured force along the load"
@@ -340,8 +340,9 @@ class Experiment:
             grasp, wrench=replace(wrench, values=np.where(vanishes, np.nan, wrench.values))
         )
 
-    def find_symmetry(self) -> int:
-        """Return the ratio of the specimen's loads to those of the modelled part: that of the
+    @property
+    def symmetry(self) -> int:
+        """Ratio of the specimen's loads to those of the modelled part: that of the
         wrenches; 1 if there are no wrenches, or they state different ratios.
         """
         symmetries = {wrench.symmetry for wrench in self.wrenches}
@@ -499,8 +500,9 @@ class Experiment:
             total = total + self.share(force, times)[:, None, None] * force.node_forces_n(times, n)
         return total
 
-    def find_instrumented_grasps(self) -> tuple[int, ...]:
-        """Return the indices in `grasps`, counted from 0, of the grasps and obstacles whose force
+    @property
+    def instrumented_grasps(self) -> tuple[int, ...]:
+        """Indices in `grasps`, counted from 0, of the grasps and obstacles whose force
         or torque is measured by a wrench or a custom sensor.
         """
         grasps_of_gauges = {gauge.grasp - 1 for gauge in self.readings if gauge.grasp is not None}
@@ -516,7 +518,7 @@ class Experiment:
         from zero at a sample, or a point mass or stated force acts on a free dof at a sample. The
         weight of the body itself does not count.
         """
-        if self.find_instrumented_grasps():
+        if self.instrumented_grasps:
             return True
         if any(actuator.energy_amplitude_at(self.t_s).any() for actuator in self.actuators):
             return True
@@ -529,13 +531,14 @@ class Experiment:
         assert self.temperature_difference_k is not None
         return np.interp(t_s, *self.temperature_difference_k.T)
 
-    def list_stiffness_deviations(self) -> list[Deviation]:
-        """Return the deviations that change the stiffness in this experiment: those that are known,
+    @property
+    def stiffness_deviations(self) -> list[Deviation]:
+        """Deviations that change the stiffness in this experiment: those that are known,
         or estimated.
         """
         return [
             row
-            for row in self.nuisance.list_kinds()
+            for row in self.nuisance.kinds
             if row.stiffness is not None
             and row.applies(self)
             and (self.nuisance.sigma(row) or row.name in self.known_deviations)
@@ -544,7 +547,7 @@ class Experiment:
     def known_stiffness_change(self, t_s: Array) -> Array:
         """Return the relative change (T,) of the stiffness by known deviations at times (T,)."""
         change = np.zeros(len(t_s))
-        for row in self.list_stiffness_deviations():
+        for row in self.stiffness_deviations:
             assert row.stiffness is not None
             change += self.known_deviations.get(row.name, 0.0) * row.stiffness(self, t_s)
         return change
@@ -566,7 +569,7 @@ class Experiment:
         couplings = [each.require_measure().couplings for each in self.actuators]
         couplings += [each.couplings_with(self.body) for each in self.obstacles]
         couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
-        couplings += [self.body.pattern] * bool(self.list_stiffness_deviations())
+        couplings += [self.body.pattern] * bool(self.stiffness_deviations)
         return self.body.joint_pattern_with(couplings)
 
     @property
@@ -596,8 +599,9 @@ class Experiment:
             places[:, obstacle.nodes] = obstacle.positions_at(self.body.nodes_m, np.atleast_1d(t_s))
         return places
 
-    def compute_upward_direction(self) -> Array:
-        """Return the unit vector (3,) against gravity; the z axis if there is no gravity."""
+    @property
+    def upward_direction(self) -> Array:
+        """Unit vector (3,) against gravity; the z axis if there is no gravity."""
         pull = np.linalg.norm(self.gravity_m_s2)
         return -self.gravity_m_s2 / pull if pull > 0 else np.array([0.0, 0.0, 1.0])
 
@@ -620,8 +624,9 @@ class Experiment:
         rotations, translations = self.rigid_motion(t_s)
         return np.einsum("mji,mj->mi", rotations, points_m - translations)
 
-    def compute_place_sigma_m(self) -> Array:
-        """Return the prior standard deviation (M,) of each marker's place [m].
+    @property
+    def place_sigma_m(self) -> Array:
+        """Prior standard deviation (M,) of each marker's place [m].
 
         It is that of the marker where `markers.places_sigma_m` has a finite one, and else the
         `marker_offset_m` of the nuisance parameters; zero where the place is exact. Where no place
@@ -670,7 +675,7 @@ class Experiment:
                     f"the deviation {row.name!r} changes the stiffness, and the body has memory; "
                     "expected a body without memory"
                 )
-        listed_names = [row.name for row in self.list_stiffness_deviations()]
+        listed_names = [row.name for row in self.stiffness_deviations]
         for name in self.known_deviations:
             if name not in listed_names:
                 raise InputError(
@@ -702,7 +707,7 @@ class Experiment:
                 "the sample times of the markers differ from t_s of the experiment; expected the same "
                 "times: cs.align brings poses and markers to common times"
             )
-        if self.markers.count_samples() == 0:
+        if self.markers.sample_count == 0:
             self._require_measurements()
         self._check_grasp_times()
         self._check_separate_sensors()
@@ -748,7 +753,7 @@ class Experiment:
 
     def _require_measurements(self) -> None:
         """Refuse an experiment in which nothing is measured."""
-        if self.separate_sensors or self.find_instrumented_grasps():
+        if self.separate_sensors or self.instrumented_grasps:
             return
         if not self.markers.names:
             message = (

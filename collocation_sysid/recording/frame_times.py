@@ -41,8 +41,9 @@ class FrameAssignment:
     offsets_s: Array
     jitter_s: Array  # (F,): deviation of the times of the frames from the line fitted to them [s]
 
-    def compute_interval_s(self) -> float:
-        """Return the time between samples [s]."""
+    @property
+    def interval_s(self) -> float:
+        """Time between samples [s]."""
         return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
 
     def spread(self, values: Array) -> Array:
@@ -117,7 +118,7 @@ def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
     if assignment is None:
         raise _irregularity(t_s)
     rounding_s = printed_rounding_s(t_s)
-    tolerance_s = STEP_TOLERANCE * assignment.compute_interval_s() + rounding_s
+    tolerance_s = STEP_TOLERANCE * assignment.interval_s + rounding_s
     is_jittered = bool(np.abs(assignment.offsets_s).max() > tolerance_s)
     offsets_s = None
     if is_jittered and table.names:
@@ -151,7 +152,7 @@ def _assignment_note(assignment: FrameAssignment, is_jittered: bool, has_markers
         parts.append(
             f"the times of the frames deviate by {np.std(jitter_ms):.2g} ms RMS, at most "
             f"{np.abs(jitter_ms).max():.2g} ms, from an even "
-            f"{1 / assignment.compute_interval_s():.6g} Hz"
+            f"{1 / assignment.interval_s:.6g} Hz"
             + has_markers
             * ": the model is evaluated at the time of each frame"
         )

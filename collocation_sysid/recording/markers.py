@@ -201,9 +201,9 @@ class Markers(Measurement):
             if len(self.names) <= MOST_NAMES_SHOWN
             else (*self.names[:MOST_NAMES_SHOWN], "…")
         )
-        missing = int(self.count_missing().sum())
+        missing = int(self.missing_count.sum())
         gaps = f", {missing} missing" if missing else ""
-        return f"Markers({', '.join(shown)}: {self.count_samples()} samples{gaps})"
+        return f"Markers({', '.join(shown)}: {self.sample_count} samples{gaps})"
 
     def on_body(self, body: Body, undeformed_places: UndeformedPlaces | None = None) -> Markers:
         """Return the markers with their placement on a body, without `places_m`; self if they have
@@ -325,8 +325,9 @@ class Markers(Measurement):
         """Names (3M,) of the coordinates."""
         return [f"{name} {axis}" for name in self.names for axis in "xyz"]
 
-    def find_first_visible_sample(self) -> int:
-        """Return the index, from 0, of the first sample in which a marker is present; 0 if none is."""
+    @property
+    def first_visible_sample(self) -> int:
+        """Index, from 0, of the first sample in which a marker is present; 0 if none is."""
         return int(self.is_present.any(axis=1).argmax())
 
     @cached_property
@@ -352,12 +353,14 @@ class Markers(Measurement):
         """(T, M, 3) mask of measured coordinates."""
         return np.isfinite(self.positions_m)
 
-    def count_missing(self) -> Index:
-        """Return (M,) number of missing samples of each marker."""
+    @property
+    def missing_count(self) -> Index:
+        """(M,) number of missing samples of each marker."""
         return (~self.is_present).sum(axis=0)
 
-    def count_samples(self) -> int:
-        """Return the number of present samples over all markers."""
+    @property
+    def sample_count(self) -> int:
+        """Number of present samples over all markers."""
         return int(self.is_present.sum())
 
     @cached_property

@@ -141,7 +141,7 @@ class Wrench(Measurement):
             vars(self)["sigma_ratios"] = checked_ratios(own, shape, "the wrench")
 
     def __repr__(self) -> str:
-        names = ", ".join(self.list_component_names())
+        names = ", ".join(self.component_names)
         return f"Wrench({len(self.t_s)} samples of {names} in the frame of the {self.frame})"
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike) -> Wrench:
@@ -189,7 +189,7 @@ class Wrench(Measurement):
     def presence(self) -> dict[str, NDArray[np.bool_]]:
         """Mask (S,) of the samples in which each measured component is present, by its name."""
         masks = super().presence
-        return {name: masks[name] for name in self.list_component_names()}
+        return {name: masks[name] for name in self.component_names}
 
     def vectors(self, values: Array) -> Array:
         """Return the forces (S, 1, 3) of the whole specimen among numbers (S, 6)."""
@@ -209,8 +209,9 @@ class Wrench(Measurement):
         """(6,) whether each component is measured at any sample."""
         return np.asarray(self.is_measured.any(axis=0))
 
-    def list_component_names(self) -> tuple[str, ...]:
-        """Return the names of the components that are measured at any sample, such as "fz", in the
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """Names of the components that are measured at any sample, such as "fz", in the
         order of `COMPONENTS`.
         """
         return tuple(COMPONENTS[k] for k in np.flatnonzero(self.measured_components))

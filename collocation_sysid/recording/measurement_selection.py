@@ -138,7 +138,7 @@ def measured_count(experiment: Experiment) -> int:
     """Return how many numbers the markers (coordinates) and force sensors (components) measure."""
     sensors = experiment.sensors_by_grasp.values()
     of_sensors = sum(int(each.is_measured.sum()) for each in sensors)
-    return 3 * experiment.markers.count_samples() + of_sensors
+    return 3 * experiment.markers.sample_count + of_sensors
 
 
 def main_measurement(experiments: Sequence[Experiment]) -> tuple[str, str]:
@@ -157,6 +157,6 @@ def is_load_only(experiment: Experiment) -> bool:
     return bool(
         experiment.is_static
         and experiment.sensors_by_grasp
-        and not experiment.markers.count_samples()
+        and not experiment.markers.sample_count
         and not experiment.separate_sensors
     )

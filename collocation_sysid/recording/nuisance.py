@@ -824,12 +824,12 @@ class Nuisance:
         """Check custom kinds, deviations and scopes."""
         for row in self.own:
             _check_custom_kind(row)
-            if [each.name for each in self.list_kinds()].count(row.name) > 1:
+            if [each.name for each in self.kinds].count(row.name) > 1:
                 raise InputError(
                     f"two nuisance parameters are named {row.name!r}; expected a name that no "
                     "other kind has, custom or built-in"
                 )
-        for row in self.list_kinds():
+        for row in self.kinds:
             value = self.sigma(row)
             if value is not None:
                 value = validate_as(Finite, value, f"the standard deviation of {row.name!r}")
@@ -838,7 +838,7 @@ class Nuisance:
                     f"the standard deviation of the nuisance parameter {row.name!r} is {value:g}; "
                     "expected a value above 0"
                 )
-        names = [row.name for row in self.list_kinds()]
+        names = [row.name for row in self.kinds]
         for name, word in self.scope.items():
             if name not in names:
                 raise InputError(
@@ -848,8 +848,9 @@ class Nuisance:
             if not re.fullmatch(SCOPE, word):
                 raise InputError(f"the scope of {name} is {word!r}; expected {SCOPE_TEXT}")
 
-    def list_kinds(self) -> tuple[Deviation, ...]:
-        """Return all kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""
+    @property
+    def kinds(self) -> tuple[Deviation, ...]:
+        """All kinds of nuisance parameters that may be estimated: `KINDS`, then custom ones."""
         return (*KINDS, *self.own)
 
     def sigma(self, row: Deviation) -> float | None:

@@ -15,7 +15,7 @@ def alternative_sentences(result: Result) -> Iterator[str]:
     """Yield a sentence on each alternative: the values of constants that it defines differently, or
     else the change of a modulus, without its sign where the direction of gravity is not known.
     """
-    known = result.collect_estimates()
+    known = result.estimates
     for each in result.alternatives:
         defined = [name for name in each.values if is_definition(each.assumption, name)]
         if defined:
@@ -37,7 +37,7 @@ def origin_sentences(result: Result) -> Iterator[str]:
     """Yield a sentence for each open question about the origin of the body: the half width of the
     interval of a modulus for each answer.
     """
-    known = result.collect_estimates()
+    known = result.estimates
     for key in dict.fromkeys(each.key for each in result.origin_answers):
         answers = [each for each in result.origin_answers if each.key == key]
         name = _shown_modulus(answers[0].half_widths)

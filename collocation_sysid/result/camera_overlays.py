@@ -212,7 +212,7 @@ def visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str,
     elif isinstance(rollout, ForwardSimulation):
         predicted = rollout.predicted
     return {
-        name: surface_rows(surface, experiment.compute_upward_direction())
+        name: surface_rows(surface, experiment.upward_direction)
         for name, surface in surfaces(experiment, predicted).items()
     }
 
@@ -232,21 +232,17 @@ def undeformed_rows(experiment: Experiment) -> dict[str, Array]:
         skin = VisibleSurface.from_body(experiment.body, depth)
         shape_m = skin.initial_positions_m(experiment, depth)
         shown = DepthProjection.facing_shape(
-            view,
-            skin,
-            phi=np.zeros(nuisance.size),
-            shape_m=shape_m,
-            up=experiment.compute_upward_direction(),
+            view, skin, phi=np.zeros(nuisance.size), shape_m=shape_m, up=experiment.upward_direction
         )
-        points_m = depth.points_m[depth.find_first_sample_with_points()]
+        points_m = depth.points_m[depth.first_sample_with_points]
         rows = shown.point_rows(
-            depth.find_first_sample_with_points(),
+            depth.first_sample_with_points,
             points_m,
-            rays=view.rays[depth.find_first_sample_with_points()],
+            rays=view.rays[depth.first_sample_with_points],
             distances_m=np.full(len(points_m), np.nan),
         )
         by_camera[depth.name] = np.vstack(
-            [rows, shown.outline_rows(depth.find_first_sample_with_points(), shape_m)]
+            [rows, shown.outline_rows(depth.first_sample_with_points, shape_m)]
         )
     return by_camera
 

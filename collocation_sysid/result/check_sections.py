@@ -261,8 +261,8 @@ def _marker_summary(recording: RecordingCheck) -> str:
         besides = "" if recording.test else ", no markers"
         return f"{', '.join(recording.instruments)}{besides}"
     besides = "".join(f", {name}" for name in recording.instruments)
-    farthest = recording.find_farthest_marker()
-    most_missing = recording.find_most_missing_marker()
+    farthest = recording.farthest_marker
+    most_missing = recording.most_missing_marker
     missing = (
         f"{recording.missing} samples missing, most of '{most_missing.name}' "
         f"({most_missing.missing})"

@@ -52,7 +52,7 @@ def probe_section(result: Result) -> TitledParts:
             f"{p.chi_squared:.1f}",
             "" if p.size is None else f"{short(p.size)} ± {short(p.size_error or 0.0)}",
             *(
-                _change_with_ratios(p.moves.get(name), result.collect_estimates()[name].value)
+                _change_with_ratios(p.moves.get(name), result.estimates[name].value)
                 for name in names
             ),
         )
@@ -140,7 +140,7 @@ def is_first_to_correct(result: Result) -> bool:
 
 def _shown_estimates(result: Result) -> list[str]:
     """Return the estimates that the table of probes shows, at most `MAX_ESTIMATES`."""
-    known = [n for n, each in result.collect_estimates().items() if each.statistical95]
+    known = [n for n, each in result.estimates.items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][
         :MAX_ESTIMATES
@@ -225,7 +225,7 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
     """Return symbol and change of an estimate in a refit, such as "λ +1.20 %"."""
-    return f"{symbol_of(name)} {_change_text(probe.moves[name], result.collect_estimates()[name].value)}"
+    return f"{symbol_of(name)} {_change_text(probe.moves[name], result.estimates[name].value)}"
 
 
 def _most_important_assumption(result: Result) -> Iterator[str]:

@@ -212,7 +212,7 @@ class MotionRecord:
             nodes_of_faces(body.cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
             np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
-            experiment.compute_upward_direction(),
+            experiment.upward_direction,
             markers.names,
             declared_m if places_m is None else places_m,
             np.where(markers.located[:, None], declared_m, np.nan),
@@ -478,7 +478,7 @@ def run_headline(result: Result) -> str:
     """
     moduli = {
         symbol_of(n): each
-        for n, each in result.collect_estimates().items()
+        for n, each in result.estimates.items()
         if without_region(n) == "young_pa"
     }
     sentences = []

@@ -152,14 +152,10 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
         before, parameters=corrected(before.parameters), derived=corrected(before.derived)
     )
     budget = {
-        name: _updated_shares(
-            shares, before.collect_estimates()[name], after=after.collect_estimates()[name]
-        )
+        name: _updated_shares(shares, before.estimates[name], after=after.estimates[name])
         for name, shares in before.budget.items()
     }
-    uncertainties = {
-        name: each.combined_std_error for name, each in after.collect_estimates().items()
-    }
+    uncertainties = {name: each.combined_std_error for name, each in after.estimates.items()}
     others = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, MESH_ERROR)]
     concerns = (*others, *numerical_concerns(optimum, uncertainties, refinement=refinement))
     return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
@@ -168,8 +164,8 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
 def _estimates_at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
     """Return the estimates before the correction, by name, without fields."""
     return {
-        name: each.at_optimum(name, linear=name in parameters.list_linear_names())
-        for name, each in result.collect_estimates().items()
+        name: each.at_optimum(name, linear=name in parameters.linear_names)
+        for name, each in result.estimates.items()
     }
 
 

@@ -181,7 +181,7 @@ def parameter_section(result: Result) -> TitledParts:
     The remarks are on fields, on what the intervals contain, on corrections, on estimates that are
     not determined, and on the largest contributions; each is left out if it does not apply.
     """
-    values = result.collect_estimates()
+    values = result.estimates
     rows = tuple(estimate_row(result, name) for name in values)
     heads = ("", "value", "±", "95 % interval", "± stat", "± syst", "guess", "")
     faint = tuple(range(len(result.parameters), len(values)))
@@ -193,11 +193,11 @@ def parameter_section(result: Result) -> TitledParts:
         parts.append(
             "there are no combined intervals, because systematic effects were not evaluated"
         )
-    if "mesh" in result.list_discretisation_kinds():
+    if "mesh" in result.discretisation_kinds:
         parts.append(refinement_table(result))
     elif corrected := [
         f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
-        for name, error in result.collect_numerical_errors().items()
+        for name, error in result.numerical_errors.items()
         if (optimum := values[name].optimum)
         and values[name].statistical95 is not None
         and error.step is not None
@@ -205,7 +205,7 @@ def parameter_section(result: Result) -> TitledParts:
         parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
     if estimated := [
         f"{symbol_of(name)} {-100 * error.estimated_mesh / abs(optimum):+.2g} %"
-        for name, error in result.collect_numerical_errors().items()
+        for name, error in result.numerical_errors.items()
         if error.estimated_mesh is not None and (optimum := values[name].optimum)
     ]:
         parts.append(
@@ -244,9 +244,9 @@ def _undetermined_sentence(result: Result) -> list[str]:
     stated = stated_as_undetermined(result)
     sources = []
     for name, shares in result.budget.items():
-        if name in stated or name not in result.collect_estimates():
+        if name in stated or name not in result.estimates:
             continue
-        if not result.collect_estimates()[name].is_determined:
+        if not result.estimates[name].is_determined:
             source, share = next(iter(shares.items()))
             sources.append(
                 f"{symbol_of(name)} (largest contribution: {source_label(source)}, {share:.0%})"
@@ -263,8 +263,8 @@ def _coverage_sentence(result: Result) -> str:
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
-    known = set(result.list_discretisation_kinds())
-    if any(e.estimated_mesh is not None for e in result.collect_numerical_errors().values()):
+    known = set(result.discretisation_kinds)
+    if any(e.estimated_mesh is not None for e in result.numerical_errors.values()):
         known.add("mesh")
     covered = [f"the {kind} error" for kind in kinds if kind in known]
     missing = [f"the {kind} error" for kind in kinds if kind not in known]
@@ -280,7 +280,7 @@ def _largest_contributions(result: Result) -> list[str]:
     """
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
-        for name, each in result.collect_estimates().items()
+        for name, each in result.estimates.items()
         if each.combined_std_error and each.statistical_std_error and name in result.budget
     }
     systematic = {name: ratio for name, ratio in ratios.items() if ratio > SYSTEMATIC_RATIO}
@@ -328,15 +328,11 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
     these words. Instead of the guess of a fixed or tied parameter the cell is "fixed" or
     "tied".
     """
-    each = result.collect_estimates()[name]
+    each = result.estimates[name]
     factor, unit = _readable_unit(result, name)
     deviation, statistical, systematic = (
         None if size is None else factor * size
-        for size in (
-            each.combined_std_error,
-            each.statistical_std_error,
-            each.compute_systematic_std_error(),
-        )
+        for size in (each.combined_std_error, each.statistical_std_error, each.systematic_std_error)
     )
     place = statistical if deviation is None else deviation
     interval = _interval_text(each.combined95, factor, place)
@@ -383,7 +379,7 @@ def _readable_unit(result: Result, name: str) -> tuple[float, str]:
         return 1.0, unit_of(name)
     return readable_stress(
         each.value
-        for other, each in result.collect_estimates().items()
+        for other, each in result.estimates.items()
         if unit_of(other) == "Pa" and (not each.fixed or other == name)
     )
 
@@ -397,13 +393,13 @@ def refinement_table(result: Result) -> Table | Line:
     error, a sentence is returned that no estimate changed; the result must therefore be that of a
     refinement.
     """
-    if not result.collect_numerical_errors():
+    if not result.numerical_errors:
         return Line(
             "No estimate changes with the step or the mesh: every parameter is fixed or at a bound."
         )
     rows = []
-    for name, error in result.collect_numerical_errors().items():
-        each = result.collect_estimates()[name]
+    for name, error in result.numerical_errors.items():
+        each = result.estimates[name]
         factor, unit = _readable_unit(result, name)
         deviation = each.combined_std_error and factor * each.combined_std_error
         rows.append(
@@ -540,7 +536,7 @@ def notes_section(result: Result) -> TitledParts:
 
 def _cards(result: Result) -> Cards:
     """Return the most important stiffness, or the first estimate, and the misfits."""
-    values = result.collect_estimates()
+    values = result.estimates
     fit = result.fit
     simulated = result.rollout
     name = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))

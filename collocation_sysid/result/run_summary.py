@@ -99,12 +99,8 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
     if result.converged and is_deeper_check_worthwhile(result):
         return f"{solve_command} --probe (refits parts of the data and relaxes each assumption)"
     refinable = _has_mesh(result) and result.budget and result.provenance.problem_file is not None
-    if (
-        result.trust.verdict == "good"
-        and refinable
-        and "mesh" not in (result.list_discretisation_kinds())
-    ):
-        errors = result.collect_numerical_errors().values()
+    if result.trust.verdict == "good" and refinable and "mesh" not in (result.discretisation_kinds):
+        errors = result.numerical_errors.values()
         is_estimated = any(error.estimated_mesh is not None for error in errors)
         in_intervals = "contain as an estimate" if is_estimated else "do not contain"
         return (
@@ -158,7 +154,7 @@ def _details(result: Result) -> list[Shown]:
 
 def _estimates(result: Result) -> Iterator[Shown]:
     """Yield the table of estimates, a line with the fixed parameters, and one for each field."""
-    values = result.collect_estimates()
+    values = result.estimates
     shown = [
         name for name in values if name in result.parameters or without_region(name) in SHOWN_MODULI
     ]
@@ -203,7 +199,7 @@ def _limit(result: Result) -> Iterator[str]:
         yield best.statement(most=1) + more
     stated = stated_as_undetermined(result)
     combined = {name for each in result.combinations for name in each.determined.names}
-    values = result.collect_estimates()
+    values = result.estimates
     known = [name for name in result.budget if name in values and result.budget[name]]
     if not known:
         return
@@ -231,7 +227,7 @@ def effect_of_remedy(result: Result, name: str) -> str:
     """Return the effect on an estimate of knowing what its largest source stands for; "" if it is
     determined anyway.
     """
-    estimate = result.collect_estimates()[name]
+    estimate = result.estimates[name]
     if estimate.is_determined or estimate.combined95 is None or estimate.combined95[0] <= 0:
         return ""
     lower, upper = estimate.combined95

@@ -95,8 +95,9 @@ class CoarseStart:
         """Return on what the search ends, as a phrase."""
         return "on the given mesh" if self.relations else "with all samples"
 
-    def compute_edge_ratio(self) -> float:
-        """Return the mean edge length of the coarse mesh over that of the given one, the smallest
+    @property
+    def edge_ratio(self) -> float:
+        """Mean edge length of the coarse mesh over that of the given one, the smallest
         of all coarsened bodies; mostly above 1.
         """
         return min(
@@ -141,7 +142,7 @@ class CoarseStart:
             Solution on the coarse meshes.
         """
         p, _ = WarmStart.of(solution).apply_to_nuisance(collocation)
-        p = np.clip(p, *collocation.compute_parameter_bounds())
+        p = np.clip(p, *collocation.parameter_bounds)
         _, coarse_positions = solution.collocation.unpack(solution.z)
         rows = [each.grid_times for each in collocation.transcriptions]
         return collocation.pack(p, self.interpolated(coarse_positions, rows))
@@ -324,7 +325,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
     """
     collocation = solution.collocation
     q = solution.q
-    lower, upper = collocation.parameters.compute_bounds_q()
+    lower, upper = collocation.parameters.bounds_q
     is_excluded = (q - lower < BOUND_DISTANCE) | (upper - q < BOUND_DISTANCE)
     p, positions = collocation.unpack(solution.z)
     rows = [transcription.grid_times for transcription in collocation.transcriptions]
@@ -381,8 +382,8 @@ def mesh_error_note(start: CoarseStart, coarse: Solution, given: Solution) -> st
         return None
     before = parameter_values(coarse.collocation, coarse.q)
     after = parameter_values(given.collocation, given.q)
-    share = 1.0 / (start.compute_edge_ratio() ** MESH_ORDER - 1.0)
-    linear = given.collocation.parameters.list_linear_names()
+    share = 1.0 / (start.edge_ratio**MESH_ORDER - 1.0)
+    linear = given.collocation.parameters.linear_names
     errors = []
     for item in given.collocation.parameters.free_scalars:
         name = item.name

@@ -421,12 +421,12 @@ def _extended(
     """
     wide = replace(collocation, experiments=[*experiments])
     p, positions = collocation.unpack(z)
-    by_name = dict(zip(collocation.list_parameter_names(), p.tolist(), strict=True))
+    by_name = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
     known = {
         each.experiment.name: x
         for each, x in zip(collocation.transcriptions, positions, strict=True)
     }
-    of_names = (by_name.get(name, 0.0) for name in wide.list_parameter_names())
+    of_names = (by_name.get(name, 0.0) for name in wide.parameter_names)
     motions = []
     for each in wide.transcriptions:
         if (motion := known.get(each.experiment.name)) is None:

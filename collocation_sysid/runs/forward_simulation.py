@@ -353,8 +353,8 @@ def step_error(
             return None
         differences += residual_changes(part, rollout.trajectory, share)
     change = change_in_observations(fit, differences)[: collocation.nq]
-    q = np.clip(solution.q + change, *collocation.parameters.compute_bounds_q())
-    linear = problem.parameters.list_linear_names()
+    q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
+    linear = problem.parameters.linear_names
     order = as_scheme(problem.scheme).order
     return Refinement(
         discretisation_errors(

@@ -81,10 +81,10 @@ def estimate_mesh_error(
     if modulus:
         reason = f"to first order, {modulus} would change to {values[modulus]:.2g} Pa"
         return known, _unknown_note(reason)
-    linear = collocation.parameters.list_linear_names()
+    linear = collocation.parameters.linear_names
     is_linear = np.array([item.name in linear for item in collocation.parameters.free], dtype=bool)
     change = np.where(is_linear, change, np.clip(change, -LARGEST_STEP, LARGEST_STEP))
-    q = np.clip(solution.q + change, *collocation.parameters.compute_bounds_q())
+    q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
     return with_estimated_mesh(
         known,
         estimates,
@@ -144,7 +144,7 @@ def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> It
         return
     bodies = dict.fromkeys(e.body for e in problem.experiments if e.specimen is None)
     elastic = set().union(*map(_elastic_names, bodies))
-    linear = problem.parameters.list_linear_names()
+    linear = problem.parameters.linear_names
     judged = {item.name for item in problem.parameters.free if item.name not in linear}
     changes = {
         name: error.estimated_mesh / abs(error.extrapolated)

@@ -203,7 +203,7 @@ def _errors_from_levels(
         by_step,
         by_mesh=by_mesh,
         step_order=order,
-        linear=problem.parameters.list_linear_names(),
+        linear=problem.parameters.linear_names,
     )
     return Refinement(errors, tuple(levels))
 

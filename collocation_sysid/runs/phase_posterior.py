@@ -241,8 +241,9 @@ class SimulatedSamples:
     p: Array  # (K, np): parameters of the samples, in the coordinates of the surrogate's program
     residuals: Array  # (K, n): residuals of the simulations, in units of σ
 
-    def find_least_chi_squared(self) -> float:
-        """Return the least χ² of the samples; infinite without samples."""
+    @property
+    def least_chi_squared(self) -> float:
+        """Least χ² of the samples; infinite without samples."""
         return float(min((self.residuals**2).sum(axis=1), default=np.inf))
 
     def errors(self, exponent: float) -> Array:
@@ -345,8 +346,9 @@ class PhasePosterior:
         noise = rng.normal(size=self.mean_changes.shape) @ root.T
         return self.mean_changes + noise
 
-    def compute_mean_logarithms(self) -> Array:
-        """Return the logarithms (E,) of the constant at the mean of its power y, relative to its
+    @property
+    def mean_logarithms(self) -> Array:
+        """Logarithms (E,) of the constant at the mean of its power y, relative to its
         mean.
         """
         powers = self.surrogate.to_power(self.contrasts)

@@ -232,7 +232,7 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
         modes.describe_resolution(),
         ends,
         determined_share=share,
-        identified=estimate.count_identified_modes(),
+        identified=estimate.identified_mode_count,
         likelier=likelier,
         phases=estimate.phases,
     )
@@ -256,8 +256,8 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
         agreements[item.name] = RecordingsAgreement(
             dict(zip(scatter.recordings, values, strict=True)),
             dict(zip(scatter.recordings, deviations, strict=True)),
-            chi_squared=float(scatter.compute_chi_squared()[k]),
-            degrees_of_freedom=int(scatter.count_degrees_of_freedom()[k]),
+            chi_squared=float(scatter.chi_squared[k]),
+            degrees_of_freedom=int(scatter.degrees_of_freedom[k]),
             disagree=bool(scatter.find_disagreements()[k]),
         )
     return agreements
@@ -274,8 +274,8 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         friction = friction_summaries(experiment, part.equations.dynamics, x=part.x)
         experiments[name] = FittedExperiment(
             solution.rms_by_experiment_m[name],
-            markers.count_samples(),
-            int(markers.count_missing().sum()),
+            markers.sample_count,
+            int(markers.missing_count.sum()),
             experiment.is_static,
             (*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
             **stated_sigmas(experiment),
@@ -285,14 +285,14 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
             test=experiment.specimen and experiment.specimen.test,
         )
     parts = {
-        experiment.name: experiment.find_symmetry()
+        experiment.name: experiment.symmetry
         for experiment in answer.problem.experiments
-        if experiment.find_symmetry() > 1
+        if experiment.symmetry > 1
     }
     force_n, torque_nm = pooled_wrench_rms(solution)
     return FitResult(
         solution.rms_m,
-        answer.compute_noise_rms_m(),
+        answer.noise_rms_m,
         experiments,
         wrench_rms_n=force_n,
         wrench_rms_nm=torque_nm,
@@ -313,7 +313,7 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
     for experiment in answer.problem.experiments:
         experiments[experiment.name] = compared = _forward_result(answer, experiment)
         if compared.fitted and compared.rms_m is not None and compared.max_m is not None:
-            squares.append(experiment.markers.count_samples() * np.array([compared.rms_m**2, 1.0]))
+            squares.append(experiment.markers.sample_count * np.array([compared.rms_m**2, 1.0]))
             largest.append(compared.max_m)
     if not largest:
         return ForwardResult(None, None, experiments=experiments)
@@ -387,7 +387,7 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
     """Yield sentences on nuisance parameters but places, with estimate and prior."""
     nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
-    for row in (*part.transcription.experiment.nuisance.list_kinds(), GAUGE):
+    for row in (*part.transcription.experiment.nuisance.kinds, GAUGE):
         here = nuisance.indices_of_rows(row).tolist()
         if row == PLACE or not here:
             continue
@@ -422,7 +422,7 @@ def _nuisance_sentence(
     )
     factor, unit = in_readable_unit(1.0, entry.unit_in_label())
     if entry.row == TARE:  # of the sensor, on which the whole specimen acts
-        factor *= part.transcription.experiment.find_symmetry()
+        factor *= part.transcription.experiment.symmetry
     size = float(np.linalg.norm(values))
     error = entry.sigma * known.get(name, np.nan)
     allowed = low + 1e-3 < part.phi[k] < high - 1e-3

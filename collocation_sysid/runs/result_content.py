@@ -110,8 +110,9 @@ class ReportedEstimate(Estimate):
         low, high = self.combined95
         return high - low <= abs(self.value)
 
-    def compute_systematic_std_error(self) -> float | None:
-        """Return the part of the combined standard uncertainty that is not statistical, √(combined²
+    @property
+    def systematic_std_error(self) -> float | None:
+        """Part of the combined standard uncertainty that is not statistical, √(combined²
         − statistical²), at least 0; None if one of the two is unknown.
         """
         if self.combined_std_error is None or self.statistical_std_error is None:
@@ -469,7 +470,7 @@ class Result:
     @property
     def limits(self) -> dict[str, Limit]:
         """What limits the precision of each estimate with a budget, by name."""
-        estimates = self.collect_estimates()
+        estimates = self.estimates
         return {
             name: Limit(estimates[name].is_determined, source, share, remedy_for(source))
             for name, shares in self.budget.items()
@@ -477,8 +478,9 @@ class Result:
             for source, share in [*shares.items()][:1]
         }
 
-    def collect_estimates(self) -> dict[str, ReportedEstimate]:
-        """Return the scalar parameters, then derived moduli, by name."""
+    @property
+    def estimates(self) -> dict[str, ReportedEstimate]:
+        """Scalar parameters, then derived moduli, by name."""
         coefficients = {
             coefficient
             for name, field in self.fields.items()
@@ -492,15 +494,17 @@ class Result:
         """Combinations of constants that are determined although a constant alone is not."""
         return () if self.uncertainty is None else self.uncertainty.combinations
 
-    def list_discretisation_kinds(self) -> tuple[str, ...]:
-        """Return the kinds of discretisation error that the combined intervals contain: "step",
+    @property
+    def discretisation_kinds(self) -> tuple[str, ...]:
+        """Kinds of discretisation error that the combined intervals contain: "step",
         "mesh".
         """
-        return known_kinds(self.collect_numerical_errors().values())
+        return known_kinds(self.numerical_errors.values())
 
-    def collect_numerical_errors(self) -> dict[str, DiscretisationError]:
-        """Return the known discretisation errors, by name of the estimate."""
-        errors = ((name, each.numerical_error) for name, each in self.collect_estimates().items())
+    @property
+    def numerical_errors(self) -> dict[str, DiscretisationError]:
+        """Known discretisation errors, by name of the estimate."""
+        errors = ((name, each.numerical_error) for name, each in self.estimates.items())
         return {name: error for name, error in errors if error is not None}
 
     def problem_folder(self, run: str | Path, purpose: str) -> Path:

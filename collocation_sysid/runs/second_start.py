@@ -69,7 +69,7 @@ def start_beyond_bounds(solution: Solution) -> SecondStart | None:
     that lock near one half.
     """
     parameters = solution.collocation.parameters
-    lower, upper = parameters.compute_bounds_q()
+    lower, upper = parameters.bounds_q
     known = parameter_values(solution.collocation, solution.q)
     locks = any(
         each.experiment.specimen is None and not each.body.element.mean_dilatation

@@ -141,7 +141,7 @@ class SolvedProblem:
             None,
         )
         line = self.budget.get(name)
-        error = self.collect_discretisation_errors().get(name)
+        error = self.discretisation_errors.get(name)
         linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
         systematic = None if line is None else line.systematic
         known_effect = 0.0 if line is None else line.known_effect
@@ -179,7 +179,7 @@ class SolvedProblem:
         return budget(
             self.systematic_effects,
             self.uncertainty,
-            numerical=self.collect_discretisation_errors(),
+            numerical=self.discretisation_errors,
             parameters=self.solution.collocation.parameters,
         )
 
@@ -220,8 +220,9 @@ class SolvedProblem:
         anisotropy = self.problem.assumed_deviations["anisotropy"]
         return modulus_axis_sentence(self.systematic_effects, self.estimates, anisotropy)
 
-    def collect_discretisation_errors(self) -> Mapping[str, DiscretisationError]:
-        """Return the known discretisation errors, by name of the estimate; empty without
+    @property
+    def discretisation_errors(self) -> Mapping[str, DiscretisationError]:
+        """Known discretisation errors, by name of the estimate; empty without
         `refinement`.
         """
         return {} if self.refinement is None else self.refinement.errors
@@ -327,8 +328,9 @@ class SolvedProblem:
         )
         return {field.name: field for each in known for field in each}
 
-    def compute_noise_rms_m(self) -> float:
-        """Return the RMS distance [m] of the fitted markers that is expected from noise with the
+    @property
+    def noise_rms_m(self) -> float:
+        """RMS distance [m] of the fitted markers that is expected from noise with the
         stated `sigma_m`, less what the fitted parameters absorb; 0 without markers.
         """
         return expected_rms_m(self.solution, self.uncertainty)
@@ -551,7 +553,7 @@ class SolvedProblem:
         numerical = np.zeros(len(parameters.free))
         deviations = np.nan_to_num(self._collect_relative_deviations())
         for k, name in enumerate(self._estimated_names):
-            error = self.collect_discretisation_errors().get(name)
+            error = self.discretisation_errors.get(name)
             if error is None or name not in self.budget:
                 continue
             shares = self.budget[name].shares

@@ -200,7 +200,7 @@ def _solve_by(
         if any(not modes.has_phases() for modes in problem.find_two_phase_fields().values()):
             return solve_two_phases(problem, start, solve_once=solve_once)
         solution = solve_once(problem, start)
-        tried = [problem.collect_lengths_m()]
+        tried = [problem.lengths_m]
         lengths_m = _likeliest_lengths(problem, solution)
         while lengths_m is not None and lengths_m not in tried:
             tried.append(lengths_m)
@@ -459,7 +459,7 @@ def _program_and_start(
             feature.require_valid(experiment)
     if warm_start is not None and problem.substeps == "auto":
         collocation = replace(collocation, substeps=warm_start.substeps)
-    has_guesses = not collocation.parameters.list_names_without_guess()
+    has_guesses = not collocation.parameters.names_without_guess
     if has_guesses:
         require_memory(problem, collocation, method=solver)
     with time_limit(_start_limit_s(problem, solver)):

@@ -100,7 +100,7 @@ def solve_two_phases(
         return solution
     fit = linearise_fit(solution.collocation, solution.z)
     posterior, temperature, rounds, is_simulated = _sample_posterior(problem, search, solution, fit)
-    phase = _representative_phases(posterior.draws.compute_probability(), search.modes.volumes_m3)
+    phase = _representative_phases(posterior.draws.probability, search.modes.volumes_m3)
     best = solve_once(
         problem.with_fields({search.name: replace(search.modes, phase=phase)}),
         WarmStart.of(solution),
@@ -135,7 +135,7 @@ def _sample_posterior(
         rounds += 1
         draft = PhasePosterior.sample(surrogate, phases, settings=USUAL, seed=2 * rounds)
         simulated = draft.simulate()
-        least_chi_squared = min(least_chi_squared, simulated.find_least_chi_squared())
+        least_chi_squared = min(least_chi_squared, simulated.least_chi_squared)
         posterior = PhasePosterior.sample(
             simulated.corrected_surrogate(),
             draft.select_last_phases(),
@@ -155,8 +155,8 @@ def _sample_posterior(
     temperature = 1.0
     if np.isfinite(least_chi_squared):
         # Temperature of `statistics.phase_sampling`: lack of fit per shape of the smooth field.
-        determined = max(1.0, factorise_information(fit).count_determined())
-        temperature = max(1.0, (least_chi_squared - fit.compute_chi_squared()) / determined)
+        determined = max(1.0, factorise_information(fit).determined_count)
+        temperature = max(1.0, (least_chi_squared - fit.chi_squared) / determined)
     if temperature > 1:
         posterior = PhasePosterior.sample(
             posterior.surrogate,
@@ -171,7 +171,7 @@ def _sample_posterior(
 def _two_phase_body(solution: Solution, search: _PhaseSearch) -> Body:
     """Return the body, among those of a solution, that has the two-phase field of `search`."""
     transcriptions = solution.collocation.transcriptions
-    return next(s.body for s in transcriptions if search.name in s.body.collect_field_lengths_m())
+    return next(s.body for s in transcriptions if search.name in s.body.field_lengths_m)
 
 
 def _two_phase_search(problem: Problem) -> _PhaseSearch:
@@ -188,7 +188,7 @@ def _two_phase_search(problem: Problem) -> _PhaseSearch:
             f"the two-phase field of {name} has {len(modes.phase)} elements; expected at most "
             f"{MOST_ELEMENTS}: use a coarser mesh, or a region around the inclusion"
         )
-    parts = next(body.parts for body in problem.bodies if name in body.collect_field_lengths_m())
+    parts = next(body.parts for body in problem.bodies if name in body.field_lengths_m)
     number = next(k for k, part in enumerate(parts) if part.field_name == name)
     part = parts[number]
     elements = tuple(part.full_name(field_coefficient(k).name) for k in range(len(modes.phase)))
@@ -248,7 +248,7 @@ def _linearise_at_mean(
 ) -> ElementSurrogate:
     """Return the measurements linearised at the mean of samples, with the exponent of these."""
     before = posterior.surrogate
-    base = posterior.compute_mean_logarithms()
+    base = posterior.mean_logarithms
     p = before.p.copy()
     p[before.other_columns] += posterior.mean_changes.mean(axis=0)
     return ElementSurrogate.linearise(
@@ -329,7 +329,7 @@ def _samples(
         deviations=departures.T @ departures / len(departures),
         misfit=_chi_squared_per_measurement(fit),
         smooth_misfit=np.nan,
-        scale_reduction=posterior.draws.compute_scale_reduction(),
+        scale_reduction=posterior.draws.scale_reduction,
         is_simulated=is_simulated,
     )
 
@@ -343,7 +343,7 @@ def _contrast_of_solution(solution: Solution, search: _PhaseSearch) -> float:
 
 def _chi_squared_per_measurement(fit: LinearisedFit) -> float:
     """Return χ² per measurement of a linearised fit."""
-    return fit.compute_chi_squared() / max(1, fit.count_measurements())
+    return fit.chi_squared / max(1, fit.measurement_count)
 
 
 def _with_samples(solution: Solution, samples: PhaseSamples) -> Solution:

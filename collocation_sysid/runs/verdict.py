@@ -197,7 +197,7 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
     for experiment in (
         transcription.experiment for transcription in solution.collocation.transcriptions
     ):
-        if not experiment.is_static or not experiment.markers.count_samples():
+        if not experiment.is_static or not experiment.markers.sample_count:
             continue
         sigma_m = float(np.max(experiment.markers.sigma_m))
         share = sigma_m / float(np.ptp(experiment.body.nodes_m, axis=0).max())
@@ -261,7 +261,7 @@ def expected_rms_m(solution: Solution, uncertainty: Uncertainty | None) -> float
     ]
     samples = np.concatenate([each.is_present.sum(axis=0) for each in markers]).astype(float)
     sigma_m = np.concatenate([each.sigma_m for each in markers])
-    measured = solution.collocation.count_measurements()
+    measured = solution.collocation.measurement_count
     fitted = 0.0 if uncertainty is None else measured - uncertainty.degrees_of_freedom
     numbers = np.concatenate([each.is_measured.sum(axis=(0, 2)) for each in markers]).astype(float)
     return rms_expected_from_noise_m(sigma_m, samples, numbers, parameter_count=float(fitted))

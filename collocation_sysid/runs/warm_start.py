@@ -29,7 +29,7 @@ class WarmStart:
     # in SI units.
     values: Mapping[str, float]
     # mapping of name to value: nuisance parameters by "experiment: label", as in
-    # `Collocation.list_parameter_names`, in the unit of the label.
+    # `Collocation.parameter_names`, in the unit of the label.
     nuisance: Mapping[str, float]
     # mapping of experiment to mapping of marker to (3,): places of the markers on the undeformed
     # body [m].
@@ -133,7 +133,7 @@ class WarmStart:
         """
         places_m = []
         for transcription in collocation.transcriptions:
-            here = transcription.marker_places_m(transcription.compute_guess_phi())
+            here = transcription.marker_places_m(transcription.guess_phi)
             for m, place in self._known_places(transcription).items():
                 here[m] = place
             places_m.append(here)
@@ -181,6 +181,6 @@ class WarmStart:
         )
         if not matches:
             return None
-        p = np.clip(p, *collocation.compute_parameter_bounds())
+        p = np.clip(p, *collocation.parameter_bounds)
         positions, failure = simulate_trajectories(collocation, p)
         return None if failure is not None else collocation.pack(p, positions)

@@ -587,7 +587,7 @@ def disagreement_notes(parameters: Parameters, scatter: RecordingComparison | No
     ]
     return [
         f"the recordings disagree on {names[k]} (χ² "
-        f"{scatter.compute_chi_squared()[k]:.3g} for {scatter.count_degrees_of_freedom()[k]} degrees of "
+        f"{scatter.chi_squared[k]:.3g} for {scatter.degrees_of_freedom[k]} degrees of "
         f"freedom): model errors exceed the noise, and the interval of {names[k]} includes the "
         "disagreement"
         for k in np.flatnonzero(scatter.find_disagreements()).tolist()

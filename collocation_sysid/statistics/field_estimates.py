@@ -142,8 +142,9 @@ class FieldEstimate:
         factor = np.exp(self.quantile * deviation)
         return self.value / factor, self.value * factor
 
-    def compute_deviation_over_prior(self) -> Array:
-        """Return the standard deviation (k,) of the logarithm over that of the prior about the
+    @property
+    def deviation_over_prior(self) -> Array:
+        """Standard deviation (k,) of the logarithm over that of the prior about the
         mean; for sampled phases over `PhaseSummary.deviation`. NaN without error bars.
         """
         prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
@@ -154,10 +155,11 @@ class FieldEstimate:
         """Mask (k,) of the elements whose standard deviation is less than `LEAST_DETERMINED_SHARE`
         of the prior's; false without error bars.
         """
-        return self.compute_deviation_over_prior() < LEAST_DETERMINED_SHARE
+        return self.deviation_over_prior < LEAST_DETERMINED_SHARE
 
-    def count_identified_modes(self) -> int:
-        """Return the number of independent modes whose variance the data at least halve, compared
+    @property
+    def identified_mode_count(self) -> int:
+        """Number of independent modes whose variance the data at least halve, compared
         with the prior.
 
         It counts the eigenvalues of `covariance`, of which the prior is the identity, below
@@ -171,9 +173,7 @@ class FieldEstimate:
         """Return the table (k, 4): value, ends of its interval, and its standard deviation over
         that of the prior.
         """
-        return np.column_stack(
-            [self.value, *self.statistical95, self.compute_deviation_over_prior()]
-        )
+        return np.column_stack([self.value, *self.statistical95, self.deviation_over_prior])
 
     @cached_property
     def _data_information(self) -> tuple[Array, Array]:

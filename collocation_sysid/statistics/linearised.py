@@ -127,8 +127,9 @@ class ResidualBlock:
             return self.components
         return np.repeat(self.is_present[..., None], 3, axis=2)
 
-    def find_outliers(self) -> Mask:
-        """Return the mask (T, M) of the samples whose residual Huber's loss has shortened; all
+    @property
+    def outliers(self) -> Mask:
+        """Mask (T, M) of the samples whose residual Huber's loss has shortened; all
         false without Huber's loss (`misfit` is None).
         """
         if self.misfit is None:
@@ -147,10 +148,11 @@ class ResidualBlock:
 
     def may_be_slow_errors(self) -> bool:
         """Return whether the instrument may err slowly, and the residuals are within its σ."""
-        return self.errs_slowly and bool(np.sum(self.residual**2) <= self.count_measurements())
+        return self.errs_slowly and bool(np.sum(self.residual**2) <= self.measurement_count)
 
-    def count_measurements(self) -> int:
-        """Return the number of coordinates that exist: of scalar measurements in this block."""
+    @property
+    def measurement_count(self) -> int:
+        """Number of coordinates that exist: of scalar measurements in this block."""
         return int(self.is_measured.sum())
 
     @cached_property
@@ -232,9 +234,10 @@ class LinearisedFit:
     derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
     phase_covariance: Array | None = None
 
-    def count_measurements(self) -> int:
-        """Return the number of scalar measurements of all blocks, without priors."""
-        return sum(block.count_measurements() for block in self.blocks)
+    @property
+    def measurement_count(self) -> int:
+        """Number of scalar measurements of all blocks, without priors."""
+        return sum(block.measurement_count for block in self.blocks)
 
     def with_disturbances(self, samples: Iterable[Array | None]) -> LinearisedFit:
         """Return the fit with samples of known errors of the residuals, which replace those of
@@ -258,8 +261,9 @@ class LinearisedFit:
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
-    def compute_chi_squared(self) -> float:
-        """Return the sum of squared residuals of all measurements, shortened as by Huber's loss,
+    @property
+    def chi_squared(self) -> float:
+        """Sum of squared residuals of all measurements, shortened as by Huber's loss,
         without priors.
         """
         return float(sum(np.sum(block.residual**2) for block in self.blocks))
@@ -300,7 +304,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
             residual, by_own = huber_as_weights(misfit, by_own, huber=kind.huber)
             residual, misfit, by_own = map(kind.pool_values, (residual, misfit, by_own))
             slope = np.zeros((*residual.shape, len(p)))
-            slope[..., transcription.list_parameter_indices()] = by_own
+            slope[..., transcription.parameter_indices] = by_own
             blocks.append(
                 ResidualBlock(
                     name=experiment.name,
@@ -322,10 +326,10 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
                 )
             )
     prior_residual, prior_slope = collocation.prior_residuals(p)
-    lower, upper = collocation.compute_parameter_bounds()
+    lower, upper = collocation.parameter_bounds
     return LinearisedFit(
         blocks=tuple(blocks),
-        names=collocation.list_parameter_names(),
+        names=collocation.parameter_names,
         shared_count=collocation.nq,
         prior_residual=prior_residual,
         prior_jacobian=prior_slope,
@@ -364,8 +368,9 @@ class Information:
     scaled_jacobians: tuple[Array, ...]
     prior: Array  # (r, r): Lᵀ PᵀP L
 
-    def count_determined(self) -> float:
-        """Return the number of parameters that the data determine, Σ tr DᵀD; one that a prior
+    @property
+    def determined_count(self) -> float:
+        """Number of parameters that the data determine, Σ tr DᵀD; one that a prior
         determines counts in part.
         """
         return float(sum(np.sum(slope**2) for slope in self.scaled_jacobians))
@@ -416,5 +421,5 @@ def covariance_of_fit(fit: LinearisedFit) -> Array:
     """Return the covariance (p, p) of all parameters of a fit with the stated noise and priors,
     bounds ignored; directions that are not determined count as known.
     """
-    information = least_squares_of_fit(fit).compute_information()
+    information = least_squares_of_fit(fit).information
     return np.asarray(np.linalg.pinv(information, hermitian=True), float)

@@ -155,12 +155,14 @@ class PosteriorDraws:
     constants: PottsConstants  # constants of the Potts prior, (k, C) each
     accepted: float  # share of accepted proposals
 
-    def compute_probability(self) -> Array:
-        """Return the probability (E,) of phase 1 in each element."""
+    @property
+    def probability(self) -> Array:
+        """Probability (E,) of phase 1 in each element."""
         return self.phases.mean(axis=(0, 1))
 
-    def compute_scale_reduction(self) -> float:
-        """Return the potential scale reduction of s (Gelman and Rubin 1992): about 1 if all chains
+    @property
+    def scale_reduction(self) -> float:
+        """Potential scale reduction of s (Gelman and Rubin 1992): about 1 if all chains
         sample the same distribution; infinite if no chain moves.
         """
         within = self.contrasts.var(axis=0, ddof=1).mean()

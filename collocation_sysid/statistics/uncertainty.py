@@ -217,10 +217,10 @@ def uncertainty_from_fit(
     """
     factored = factorise_information(fit)
     shared = fit.shared_count
-    freedom = fit.count_measurements() - round(factored.count_determined(), 9)
+    freedom = fit.measurement_count - round(factored.determined_count, 9)
     if error_model.noise == "estimated" and freedom < 1:
         raise InputError(
-            f"the noise cannot be estimated from {fit.count_measurements()} measurements, which are not "
+            f"the noise cannot be estimated from {fit.measurement_count} measurements, which are not "
             "more than the parameters that they determine; state the standard deviation of the noise "
             "(sigma_m) and noise = 'given'"
         )
@@ -258,7 +258,7 @@ def uncertainty_from_fit(
         derived=without_long_term_moduli(parameters, derived),
         nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
         nuisance_covariance=of_all[shared:, shared:],
-        chi_squared=fit.compute_chi_squared(),
+        chi_squared=fit.chi_squared,
         degrees_of_freedom=freedom,
         notes=(
             *parameter_notes(parameters, estimates),
@@ -353,9 +353,7 @@ def _widen_by_scatter(
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
     factors = np.where(scatter.find_disagreements(), factors, 1.0)
-    of_few = np.maximum(
-        quantiles, student_ppf(0.975, np.maximum(scatter.count_degrees_of_freedom(), 1))
-    )
+    of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1)))
     wide = np.where(scatter.find_disagreements(), of_few, quantiles)
     return covariance_q * np.outer(factors, factors), wide, factors * wide / quantiles
 
@@ -373,7 +371,7 @@ def _compare_recordings(
     known: dict[str, tuple[Array, Array, Array]] = {}
     sizes = relative_derivatives(parameters, q)
     for alone, step in single_fits(fit):
-        if alone.count_measurements() <= len(alone.names):
+        if alone.measurement_count <= len(alone.names):
             continue
         uncertainty = uncertainty_from_fit(alone, parameters, q=q, error_model=errors)
         independent = least_squares_of_fit(alone).standard_errors[: fit.shared_count] ** 2
@@ -405,7 +403,7 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool, Dependence]:
     factored = factorise_information(fit)
     level = estimate_noise_level(fit, factored)
     tested = analyse_dependence(fit, factored)
-    tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.compute_unevenness())
+    tested = replace(tested, lag1_deviation=tested.lag1_deviation * level.unevenness)
     is_dependent = tested.is_correlated() and not _is_explained(
         fit, factored, level=level, result=tested
     )

@@ -173,7 +173,7 @@ def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Arra
     p = collocation.guess_p
     p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
     p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
-    is_lag = np.array(["lag of" in name for name in collocation.list_parameter_names()], dtype=bool)
+    is_lag = np.array(["lag of" in name for name in collocation.parameter_names], dtype=bool)
     p[is_lag] = np.abs(p[is_lag]) + 0.1
     z = collocation.pack(p, positions)
     for lifted in lifted_variables(collocation):

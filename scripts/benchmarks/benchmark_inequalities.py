@@ -122,7 +122,7 @@ def by_sweeps(program: LimitedCollocation) -> Answer:
         )
         G = by_p[limited]
         gap = z[limited] - limit
-        gradient = 2 * scale * iterate.fit.compute_score()
+        gradient = 2 * scale * iterate.fit.score
         error = max(
             np.abs(gradient + G.T @ nu).max(),
             np.abs(gap + s).max(),
@@ -132,7 +132,7 @@ def by_sweeps(program: LimitedCollocation) -> Answer:
             return Answer(z, iteration, time.process_time() - began_s)
         while barrier > BARRIER and max(error, np.abs(s * nu - barrier).max()) <= 10 * barrier:
             barrier = max(BARRIER, min(0.2 * barrier, barrier**1.5))
-        information = 2 * scale * iterate.fit.compute_information()
+        information = 2 * scale * iterate.fit.information
         hessian = information
         if previous < 0.1:
             hessian = reduced_hessian(program, iterate, projected, nu, by_p)

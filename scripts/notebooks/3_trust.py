@@ -265,7 +265,7 @@ offset_runs = {
 }
 for name, each in offset_runs.items():
     print(f"{name}: {1e3 * each.solution.rms_m:.2f} mm RMS, ", end="")
-    print(f"{1e3 * each.compute_noise_rms_m():.2f} mm expected")
+    print(f"{1e3 * each.noise_rms_m:.2f} mm expected")
     print_estimates(each)
 offset_m = offset_runs["offsets estimated"].nuisance("camera offset of tip_1, x")
 print(f"estimated offset of tip_1 along x: {1e3 * offset_m:.2f} mm, true value 4 mm")

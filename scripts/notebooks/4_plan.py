@@ -144,7 +144,7 @@ plan = cs.plan_motion(run, task, limits)
 error = plan.tracking_error(plan.program.references[0])
 assert error.band_m
 print(f"predicted error of the tip: {1e3 * error.rms_m:.2f} mm RMS, {1e3 * error.largest_m:.2f} mm")
-print(f"95 % band: ± {1e3 * error.band_m:.2f} mm; limits reached: {plan.list_active_limits()}")
+print(f"95 % band: ± {1e3 * error.band_m:.2f} mm; limits reached: {plan.active_limits}")
 
 # %% [markdown]
 # ## 4.4 Execute

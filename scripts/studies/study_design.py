@@ -195,7 +195,7 @@ def twin(design: Design, rng: np.random.Generator) -> dict[str, float] | None:
         )
 
     (transcription,) = collocation_of(experiment).transcriptions
-    phi = transcription.compute_guess_phi() + rng.normal(size=transcription.nuisance.size)
+    phi = transcription.guess_phi + rng.normal(size=transcription.nuisance.size)
     values = problem.parameters.guesses
     motion = simulate(
         transcription.corrected_experiment(phi),

@@ -367,7 +367,7 @@ def draw_assumption_errors(names: Sequence[str]) -> Callable[..., TrueAndStated]
 def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
     errors = {}
     for row in (row for row in ASSUMPTIONS if row.name in names):
-        for name in row.list_components():
+        for name in row.components:
             error = (row.considered or 0.0) * rng.standard_normal()
             # Coefficients of the air are not negative, and a negative share of either damping law
             # would add energy where the body is stretched.

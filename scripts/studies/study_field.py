@@ -238,7 +238,7 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
                 width,
                 ratio,
                 step_mm,
-                field.count_identified_modes(),
+                field.identified_mode_count,
                 processor_time_s,
                 inclusion_coverage,
             )
@@ -284,7 +284,7 @@ def cost() -> None:
         twin = FieldTwin("", "half", 2.0, 0.04, max(1, modes))
         problem, _ = problem_of(twin, 1)
         if not modes:
-            fixed = {name: 0.0 for name in problem.bodies[0].list_field_coefficient_names()}
+            fixed = {name: 0.0 for name in problem.bodies[0].field_coefficient_names}
             problem = cs.Problem(
                 problem.experiments, problem.parameters.with_fixed(fixed), substeps=1
             )

@@ -192,9 +192,7 @@ def constants_of(
     result: Result, truth: Mapping[str, float], *, is_static: bool
 ) -> tuple[IdentifiedConstant, ...]:
     """Return parameters and derived moduli; without the dampings of equilibria, which have none."""
-    named = {
-        n: e for n, e in result.collect_estimates().items() if not (is_static and is_damping(n))
-    }
+    named = {n: e for n, e in result.estimates.items() if not (is_static and is_damping(n))}
     return tuple(
         _constant(name, each, name in result.derived, truth.get(name))
         for name, each in named.items()

@@ -141,7 +141,7 @@ def test_every_printed_constant_has_a_meaning():
 
 
 def test_every_row_of_the_budget_is_explained():
-    sources = [*REMEDIES, *(part for each in ASSUMPTIONS for part in each.list_components())]
+    sources = [*REMEDIES, *(part for each in ASSUMPTIONS for part in each.components)]
     for source in sources:
         (row,) = _word_table(source_label(source)).rows[-1:]
         assert row[1] == "uncertainty", source

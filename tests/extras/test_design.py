@@ -68,7 +68,7 @@ def drawn_motions(count: int = 12, waves: int = 1) -> list[HandMotion]:
     size = HandMotion.coefficient_count(waves)
     drawn = [rng.normal(size=size) * rng.choice([1.0, 5.0]) for _ in range(count)]
     return [
-        bounds.scale_to_limits(HandMotion.from_coefficients(u, 0.3, 10.0, bounds.compute_reach()))
+        bounds.scale_to_limits(HandMotion.from_coefficients(u, 0.3, 10.0, bounds.reach))
         for u in drawn
     ]
 
@@ -238,7 +238,7 @@ def at_answer(experiments) -> tuple[Collocation, np.ndarray]:
         simulate_scheme(s.experiment, s.dynamics.with_theta(s.constants.theta(AT.guess_q)))
         for s in found.transcriptions
     ]
-    phi = [s.compute_guess_phi() for s in found.transcriptions]
+    phi = [s.guess_phi for s in found.transcriptions]
     return found, found.pack(np.concatenate([AT.guess_q, *phi]), rows)
 
 
@@ -277,7 +277,7 @@ def test_error_bars_are_those_of_the_linearised_fit_of_a_run():
     assert {"lambda_pa", "mu_pa", "young_pa", "poisson"} <= known.keys()
     for name, estimate in known.items():
         assert estimate.statistical_std_error is not None
-        assert found.compute_relative()[name] == pytest.approx(
+        assert found.relative[name] == pytest.approx(
             estimate.statistical_std_error / estimate.value, rel=1e-3
         )
 
@@ -290,7 +290,7 @@ def test_criteria_agree_with_the_covariance():
     assert size["A"] == pytest.approx(np.sqrt(variances.mean()))
     assert size["D"] == pytest.approx(np.linalg.det(found.covariance) ** (1 / 8))
     alone = DesignCriterion("D", ("poisson",)).log_size(found)
-    assert np.exp(alone) == pytest.approx(found.compute_relative()["poisson"])
+    assert np.exp(alone) == pytest.approx(found.relative["poisson"])
     assert DesignCriterion(over="mean").combine_draws([1.0, 4.0]) == 2.5
     assert DesignCriterion(over="worst").combine_draws([1.0, 4.0]) == 4.0
 
@@ -299,7 +299,7 @@ def test_designs_without_information_still_compare():
     found = PredictedErrors.from_information(
         np.zeros((4, 4)), AT, ThetaMap(AT, hung_cube(3).body), AT.guess_q
     )
-    assert list(found.compute_relative().values())[:4] == pytest.approx([100.0] * 4)
+    assert list(found.relative.values())[:4] == pytest.approx([100.0] * 4)
 
 
 @pytest.mark.parametrize(
@@ -381,7 +381,7 @@ def test_a_sensor_measures_at_its_own_rate_over_the_new_time():
     assert grasp.wrench is not None
     assert np.ptp(grasp.wrench.t_s) == pytest.approx(0.2, abs=0.02)
     assert np.diff(grasp.wrench.t_s) == pytest.approx(np.diff(before.wrench.t_s).mean())
-    assert grasp.wrench.list_component_names() == before.wrench.list_component_names()
+    assert grasp.wrench.component_names == before.wrench.component_names
 
 
 def still_poses(recording: FutureRecording) -> PoseSequence:
@@ -402,10 +402,8 @@ def test_a_designed_motion_is_more_informative_than_a_poor_one():
     poor = replace(hung_cube(8), grasps=[Grasp(hung_cube(8).grasps[0].nodes, slow)])
     found = design_motion(Problem([poor], AT), LIMITS, 0.08, options=FEW)
     assert found.before is not None
-    assert max(found.before.relative[n] for n in TRUTH) > 3 * found.compute_minimised_error()
-    assert found.compute_minimised_error() == pytest.approx(
-        max(found.after.relative[n] for n in TRUTH)
-    )
+    assert max(found.before.relative[n] for n in TRUTH) > 3 * found.minimised_error
+    assert found.minimised_error == pytest.approx(max(found.after.relative[n] for n in TRUTH))
     assert max(found.shares.values()) <= 1
 
 
@@ -420,7 +418,7 @@ def test_a_wrench_counts_and_the_search_then_begins_at_random():
     assert np.linalg.eigvalsh(told[0] - told[1]).min() > -1e-6 * np.trace(told[0])
     assert told[0][0, 0] > 1.01 * told[1][0, 0]
     found = design_motion(Problem([sensing], AT), LIMITS, 0.08, options=DesignOptions(1, pairs=0))
-    assert np.isfinite(found.compute_minimised_error())
+    assert np.isfinite(found.minimised_error)
 
 
 def test_answers_that_need_too_much_memory_are_not_sought(monkeypatch):
@@ -452,7 +450,7 @@ def test_recordings_there_are_count_where_they_are_to_be_completed():
     alone = shared_information(linearise_fit(*at_answer([experiment])))
     before = PredictedErrors.from_information(
         alone, AT, ThetaMap(AT, experiment.body), AT.guess_q
-    ).compute_relative()
+    ).relative
     assert found.before is not None
     for name in TRUTH:
         assert found.before.relative[name] == pytest.approx(before[name], rel=1e-3)

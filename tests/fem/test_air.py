@@ -117,7 +117,7 @@ def test_drag_is_the_gradient_of_its_dissipation_and_acts_at_the_surface_alone(r
     forces = Forces.from_experiment(
         hung_cube(3, (3, 3, 3), air_density_kg_m3=AIR_KG_M3), [0.0, 0.1]
     )
-    drag = forces.find_air_drag()
+    drag = forces.air_drag
     assert drag is not None
     size = forces.body.pattern.size
     x, v = rng.normal(size=(2, 2, size))
@@ -141,10 +141,10 @@ def test_drag_is_the_gradient_of_its_dissipation_and_acts_at_the_surface_alone(r
 
 def test_nothing_drags_in_equilibrium_and_in_a_vacuum():
     static = hung_cube(3, air_density_kg_m3=AIR_KG_M3, kind="static")
-    assert Forces.from_experiment(static, [0.0]).find_air_drag() is None
+    assert Forces.from_experiment(static, [0.0]).air_drag is None
     vacuum = hung_cube(3, air_density_kg_m3="none")
     assert vacuum.air_density_kg_m3 == 0.0
-    assert Forces.from_experiment(vacuum, [0.0]).find_air_drag() is None
+    assert Forces.from_experiment(vacuum, [0.0]).air_drag is None
 
 
 # What the air does to an estimate -----------------------------------------------------------------

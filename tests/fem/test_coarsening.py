@@ -28,7 +28,7 @@ def test_a_coarse_box_is_the_same_box_with_fewer_nodes():
     coarse = coarsened(BOX, len(BOX.points_m) // 6)
     assert len(coarse.mesh.points_m) <= len(BOX.points_m) // 5
     assert coarse.mesh.volume_m3 == pytest.approx(BOX.volume_m3, rel=1e-9)
-    assert coarse.mesh.compute_bounds_m() == pytest.approx(BOX.compute_bounds_m())
+    assert coarse.mesh.bounds_m == pytest.approx(BOX.bounds_m)
     assert coarse.mesh.quality().quality_min >= 0.1
     assert not coarse.mesh.notes  # no element is inverted, all are connected
 

@@ -37,7 +37,7 @@ def test_box_has_exact_volume_bounds_and_node_count(box):
     assert len(box.points_m) == 6 * 3 * 3
     assert len(box.tetrahedra) == 6 * 5 * 2 * 2
     assert box.volume_m3 == pytest.approx(0.1 * 0.04 * 0.03, rel=1e-12)
-    np.testing.assert_allclose(box.compute_bounds_m(), [[0, 0, 0], [0.1, 0.04, 0.03]])
+    np.testing.assert_allclose(box.bounds_m, [[0, 0, 0], [0.1, 0.04, 0.03]])
     assert (box.volumes_m3 > 0).all()
     assert box.notes == ()
 
@@ -49,14 +49,14 @@ def test_box_surface_is_closed_outward_and_has_the_exact_area(box):
     # The divergence theorem gives the volume only if every triangle faces outward.
     centers = box.points_m[box.surface].mean(axis=1)
     assert (centers * normals).sum() / 3 == pytest.approx(box.volume_m3, rel=1e-12)
-    outward = centers - box.compute_bounds_m().mean(axis=0)
+    outward = centers - box.bounds_m.mean(axis=0)
     assert ((outward * normals).sum(axis=1) > 0).all()
     assert is_conforming(box)
 
 
 def test_box_can_be_placed_elsewhere():
     mesh = box_mesh((1, 2, 3), (1, 1, 1), origin_m=(-1, 5, 0))
-    np.testing.assert_allclose(mesh.compute_bounds_m(), [[-1, 5, 0], [0, 7, 3]])
+    np.testing.assert_allclose(mesh.bounds_m, [[-1, 5, 0], [0, 7, 3]])
 
 
 @pytest.mark.parametrize(("rings", "layers"), [(1, 1), (1, 11), (2, 8), (3, 4)])

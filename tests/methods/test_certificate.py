@@ -31,7 +31,7 @@ def test_curvatures_of_exact_data_are_the_information_of_the_sweeps():
     p, positions = collocation.unpack(solution.z)
     rows = [each.grid_times for each in collocation.transcriptions]
     fit = Horizon(collocation, rows).evaluate(p, positions).fit
-    expected = 2 * collocation.loss_scale * np.linalg.eigvalsh(fit.compute_information())
+    expected = 2 * collocation.loss_scale * np.linalg.eigvalsh(fit.information)
     np.testing.assert_allclose(certificate.curvatures, expected, rtol=1e-5)
     assert certificate.is_strict_minimum
     assert max(certificate.stationarity, certificate.feasibility) < 1e-7
@@ -64,7 +64,7 @@ def test_the_hessian_contains_the_curvature_of_noisy_data():
             a, b = np.eye(len(p))[i] * step, np.eye(len(p))[j] * step
             corners = loss_at(a + b) - loss_at(a - b) - loss_at(b - a) + loss_at(-a - b)
             hessian[i, j] = corners / (4 * step**2)
-    is_free = np.abs(solution.q - collocation.parameters.compute_bounds_q()[0]) > 1e-6
+    is_free = np.abs(solution.q - collocation.parameters.bounds_q[0]) > 1e-6
     assert is_free.tolist() == [True, True, True, False]  # γ_m ends at its bound
     expected = np.linalg.eigvalsh(hessian[np.ix_(is_free, is_free)])
     np.testing.assert_allclose(certificate.curvatures, expected, rtol=1e-3)
@@ -77,7 +77,7 @@ def test_lifted_memory_is_part_of_the_hessian():
     p, positions = solution.collocation.unpack(solution.z)
     rows = [each.grid_times for each in solution.collocation.transcriptions]
     fit = Horizon(solution.collocation, rows).evaluate(p, positions).fit
-    expected = 2 * solution.collocation.loss_scale * np.linalg.eigvalsh(fit.compute_information())
+    expected = 2 * solution.collocation.loss_scale * np.linalg.eigvalsh(fit.information)
     np.testing.assert_allclose(certificate.curvatures, expected, rtol=1e-4)
 
 

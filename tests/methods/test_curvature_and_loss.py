@@ -41,17 +41,17 @@ def test_exact_curvature_completes_the_hessian_of_the_loss(experiment, huber, rn
     p += 0.05 * rng.normal(size=count)
     direction = rng.normal(size=count)
     point = point_at(collocation, p)
-    hessian = point.fit.compute_information() + exact_curvature(collocation, point)
+    hessian = point.fit.information + exact_curvature(collocation, point)
 
     def half_gradient(at: np.ndarray) -> np.ndarray:
         there = point_at(collocation, at)
-        return there.fit.compute_score()
+        return there.fit.score
 
     differences = directional_derivative(half_gradient, p, direction, 1e-4)
     np.testing.assert_allclose(
         hessian @ direction, differences, atol=1e-6 * np.abs(differences).max()
     )
-    gauss_newton = point.fit.compute_information() @ direction
+    gauss_newton = point.fit.information @ direction
     assert np.abs(gauss_newton - differences).max() > 1e-3 * np.abs(differences).max()
 
 

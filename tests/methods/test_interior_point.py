@@ -574,7 +574,7 @@ def test_the_history_counts_iterations_and_ends_at_the_answer():
     assert (np.diff([iteration.time_s for iteration in seen]) >= 0).all()
     np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
-    loss = cube().objective(solution.z) * cube().count_measurements()
+    loss = cube().objective(solution.z) * cube().measurement_count
     assert seen[-1].loss == pytest.approx(loss)
 
 

@@ -384,8 +384,8 @@ def test_curvature_joins_the_triangle_unless_that_is_indefinite(rng):
     b += b.T
     fit = SquareRootInformation(np.column_stack([triangle, right]))
     joined = with_curvature(fit, b)
-    np.testing.assert_allclose(joined.compute_information(), triangle.T @ triangle + b, atol=1e-12)
-    np.testing.assert_allclose(joined.compute_score(), triangle.T @ right, atol=1e-12)
+    np.testing.assert_allclose(joined.information, triangle.T @ triangle + b, atol=1e-12)
+    np.testing.assert_allclose(joined.score, triangle.T @ right, atol=1e-12)
     assert with_curvature(fit, -100 * np.eye(4)) is fit
 
 
@@ -413,9 +413,7 @@ def test_the_history_contains_the_observed_iterations_and_ends_at_the_answer():
     assert numbers[-1] <= solution.iterations
     np.testing.assert_allclose([*seen[0].parameters.values()], as_theta(GUESS))
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
-    assert seen[-1].loss == pytest.approx(
-        cube().objective(solution.z) * cube().count_measurements()
-    )
+    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurement_count)
 
 
 def test_timings_are_parts_of_the_whole():

@@ -153,9 +153,7 @@ def test_a_constant_of_which_nothing_is_known_needs_a_guess():
         InputError, match="stiffening: this parameter has no guess, and no usual value"
     ):
         Parameters.from_mapping({"stiffening": Unknown()})
-    assert Parameters.from_mapping({"bulk_pa": Unknown()}).list_names_without_guess() == (
-        "bulk_pa",
-    )
+    assert Parameters.from_mapping({"bulk_pa": Unknown()}).names_without_guess == ("bulk_pa",)
 
 
 def test_without_a_guess_values_are_refused_by_name():
@@ -251,7 +249,7 @@ def test_markers_and_forces_count_alike():
     together, of_markers, of_forces = (
         trial.evaluate_guess(is_complete=False)[0] for trial in trials
     )
-    counts = [trial.collocation.count_measurements() for trial in trials]
+    counts = [trial.collocation.measurement_count for trial in trials]
     assert min(of_markers, of_forces) < together < max(of_markers, of_forces)
     assert counts[0] == counts[1] + counts[2]
 

@@ -230,9 +230,7 @@ def test_the_history_contains_the_observed_iterations_and_its_loss_falls(gradien
     assert list(solution.history) == seen
     losses = [iteration.loss for iteration in seen]
     assert losses == sorted(losses, reverse=True)
-    assert seen[-1].loss == pytest.approx(
-        cube().objective(solution.z) * cube().count_measurements()
-    )
+    assert seen[-1].loss == pytest.approx(cube().objective(solution.z) * cube().measurement_count)
     timing = solution.timing
     assert min(timing.evaluations, timing.linear_algebra) > 0
     assert timing.evaluations + timing.linear_algebra + timing.build <= timing.total

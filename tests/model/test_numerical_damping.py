@@ -66,7 +66,7 @@ def test_a_simulation_damps_as_much_as_predicted(name: str, gamma_m_1_s: float):
     theta = np.array([200.0, 300.0, 0.0, gamma_m_1_s])
     released, modes = released_in_a_mode(theta, 0)
     omega, ratio = oscillation(released, modes, 0, theta, name)
-    true_omega = modes.compute_angular_frequencies_rad_s()[0]
+    true_omega = modes.angular_frequencies_rad_s[0]
     physical = modes.damping_ratios[0]
     mode = numerical_mode(SCHEMES[name], true_omega, released.timestep_s, physical)
     assert ratio - physical == pytest.approx(mode.damping_ratio, abs=2e-5)

@@ -160,7 +160,7 @@ def test_values_have_the_users_names():
 
 
 def test_bounds_and_guesses_are_logarithms():
-    lower, upper = IN_LAME.compute_bounds_q()
+    lower, upper = IN_LAME.bounds_q
     np.testing.assert_allclose(np.exp(lower), [10, 10, 1e-5, 1e-3])
     np.testing.assert_allclose(np.exp(upper), [1e5, 1e5, 1, 100])
     np.testing.assert_allclose(np.exp(IN_LAME.guess_q), [400, 150, 0.02, 0.5])
@@ -207,7 +207,7 @@ def test_a_linear_parameter_may_be_negative_or_zero():
         {**given, "kappa_pa": KAPPA_PA, "gamma_r_s": 0.0, "gamma_m_1_s": 0}
     )
     np.testing.assert_allclose(parameters.guess_q, [-1.0])
-    lower, upper = parameters.compute_bounds_q()
+    lower, upper = parameters.bounds_q
     np.testing.assert_allclose([lower[0], upper[0]], [-2.5, 1.25])
     theta = ThetaMap(parameters, body_of("yeoh")).theta([0.5])
     np.testing.assert_allclose(theta, [150.0, 20.0, 0.0, KAPPA_PA, 0.0, 0.0])

@@ -28,7 +28,7 @@ def test_row_zero_is_the_static_problem():
 
 @pytest.mark.parametrize(("name", "reach"), [("backward-euler", 2), ("midpoint", 2), ("bdf2", 4)])
 def test_reach_is_the_oldest_point_in_a_row(name: str, reach: int):
-    assert SCHEMES[name].compute_largest_lag() == reach
+    assert SCHEMES[name].largest_lag == reach
 
 
 # Looking up

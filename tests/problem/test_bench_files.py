@@ -316,11 +316,11 @@ def test_components_that_vanish_by_symmetry_are_not_fitted(tmp_path):
     (tmp_path / "cell.csv").write_text(head + "\n".join(rows) + "\n")
     without = Problem.read(file)
     (sensor,) = without.experiments[1].wrenches
-    assert len(sensor.list_component_names()) == 6
+    assert len(sensor.component_names) == 6
     file.write_text(cell.replace("]\n\n[[experiment]]", f"{PLANES}\n[[experiment]]", 1))
     problem = Problem.read(file)
     (sensor,) = problem.experiments[1].wrenches
-    assert sensor.list_component_names() == ("fz",)
+    assert sensor.component_names == ("fz",)
     np.testing.assert_allclose(sensor.values[:, 2], np.array([0, 2.5, 6, 9]) / 4)
     assert any("fx, fy, tx, ty and tz of the sensor are not used" in n for n in problem.notes)
     columns = [row.rpartition(",")[0] for row in (head, *rows)]

@@ -261,7 +261,7 @@ def test_places_of_markers_without_a_reference_start_from_their_first_sample(tin
     experiment = experiment_of(tiny)
     markers, nodes_m = experiment.markers, experiment.body.nodes_m
     assert not markers.located.any()
-    np.testing.assert_allclose(experiment.compute_place_sigma_m(), np.linalg.norm(SIZE_M))
+    np.testing.assert_allclose(experiment.place_sigma_m, np.linalg.norm(SIZE_M))
     # The first pose is that of the undeformed body, and this marker is inside.
     np.testing.assert_allclose(
         markers.predict_positions(nodes_m)[1], markers.positions_m[0, 1], atol=1e-9
@@ -275,7 +275,7 @@ def test_some_markers_may_have_a_reference_and_others_not(tiny):
     found = experiment.markers
     assert found.names == known.names
     assert found.located.tolist() == [True, False, True]
-    assert (experiment.compute_place_sigma_m() > 0).tolist() == [False, True, False]
+    assert (experiment.place_sigma_m > 0).tolist() == [False, True, False]
     shape, given = np.random.default_rng(0).normal(size=(36, 3)), [0, 2]
     np.testing.assert_allclose(
         found.predict_positions(shape)[given], known.predict_positions(shape)[given]
@@ -288,7 +288,7 @@ def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
         replace_cell(MARKERS, 2, column, "")(tiny)
     experiment = experiment_of(tiny)
     markers = experiment.markers
-    assert markers.count_missing().tolist() == [1, 0, 0]
+    assert markers.missing_count.tolist() == [1, 0, 0]
     start_m = markers.predict_positions(experiment.body.nodes_m)[0]
     (turn,), (shift_m,) = experiment.grasps[0].poses.at(experiment.t_s[1:2])
     back_m = turn.T @ (markers.positions_m[1, 0] - shift_m)

@@ -45,7 +45,7 @@ def test_components_that_are_not_measured_are_left_out(tmp_path: Path):
     t_s, found, _ = read_wrench(tmp_path / "w.csv")
     np.testing.assert_array_equal(found[:, 2], [1.5, np.nan, 2.5])
     wrench = Wrench(t_s, found, 0.1)
-    assert wrench.list_component_names() == ("fz",)
+    assert wrench.component_names == ("fz",)
     assert wrench.is_measured.sum() == 2
 
 

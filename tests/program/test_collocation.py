@@ -201,8 +201,8 @@ def test_losses_of_experiments_add_up():
     total = 0.0
     for experiment, x in zip(experiments, positions, strict=True):
         alone = Collocation([experiment], GUESS)
-        total += alone.objective(alone.pack(q, [x])) * alone.count_measurements()
-    assert both.objective(z) * both.count_measurements() == pytest.approx(total)
+        total += alone.objective(alone.pack(q, [x])) * alone.measurement_count
+    assert both.objective(z) * both.measurement_count == pytest.approx(total)
 
 
 def test_validation_experiments_are_left_out():
@@ -231,8 +231,8 @@ def test_the_loss_counts_present_samples_only():
     squares = np.sum((predicted - markers.positions_m) ** 2, axis=2)
     present = np.isfinite(squares)
     assert 0 < present.sum() < present.size
-    assert collocation.count_measurements() == 3 * present.sum()
-    expected = (squares / markers.sigma_m**2)[present].sum() / collocation.count_measurements()
+    assert collocation.measurement_count == 3 * present.sum()
+    expected = (squares / markers.sigma_m**2)[present].sum() / collocation.measurement_count
     assert collocation.objective(z) == pytest.approx(expected)
     np.testing.assert_allclose(
         transcription.markers.squared_distances_m2(x, np.zeros(0)), squares[present]
@@ -261,7 +261,7 @@ def test_with_substeps_only_the_rows_at_samples_are_measured():
 def test_a_prior_adds_its_squared_residual():
     with_prior, without = (Collocation([swung()], p) for p in (WITH_PRIOR, GUESS))
     z = some_point(without)
-    difference = (with_prior.objective(z) - without.objective(z)) * without.count_measurements()
+    difference = (with_prior.objective(z) - without.objective(z)) * without.measurement_count
     assert difference == pytest.approx(((z[0] - np.log(300.0)) / 0.2) ** 2)
 
 

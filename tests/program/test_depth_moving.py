@@ -57,7 +57,7 @@ def test_the_interval_contains_the_truth_with_a_step_error(run):
     low, high = run.interval("young_pa")
     assert low < MADE["young_pa"] < high
     # Steps of a whole sample make it stiffer, and the run says by how much.
-    error = run.result.collect_numerical_errors()["young_pa"]
+    error = run.result.numerical_errors["young_pa"]
     found = run.solution.parameters["young_pa"], error.extrapolated
     off = [each / MADE["young_pa"] - 1 for each in found]
     assert off[0] > 0.003

@@ -147,7 +147,7 @@ def test_missing_keys_of_a_custom_sensor_are_named(changes: dict, words: str):
 def test_a_grasp_has_a_number_from_one_on():
     cube = hung_cube(9)
     last = replace(accelerometer(cube.t_s), points_m=(), grasp=1, **CLAMPED)
-    assert instrumented(cube, last).find_instrumented_grasps() == (0,)
+    assert instrumented(cube, last).instrumented_grasps == (0,)
     with pytest.raises(
         InputError, match="refers to grasp 0; expected the number of a grasp, 1 to 1"
     ):

@@ -32,8 +32,8 @@ def test_rows_of_some_parameters_join_those_of_all(rng):
     found = SquareRootInformation.empty(4).with_problem(
         SquareRootInformation.empty(2).with_rows(residual, slope), places
     )
-    np.testing.assert_allclose(found.compute_information(), whole.T @ whole, atol=1e-12)
-    np.testing.assert_allclose(found.compute_score(), whole.T @ residual, atol=1e-12)
+    np.testing.assert_allclose(found.information, whole.T @ whole, atol=1e-12)
+    np.testing.assert_allclose(found.score, whole.T @ residual, atol=1e-12)
 
 
 def test_the_best_between_bounds_is_that_of_bounded_least_squares(rng):

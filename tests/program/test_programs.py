@@ -157,7 +157,7 @@ def differing(moved: Experiment, scheme: str = "midpoint", values=GUESS, **body)
     made = cs.Body(moved.body.mesh, density_kg_m3=30.0, **({"field": field} | body))
     made = made.with_free_densities(made.parts_with_free_density(values.names))
     known = values.with_fields([made])
-    uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.list_field_coefficient_names())}
+    uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.field_coefficient_names)}
     uneven |= dict.fromkeys(made.find_contrast_deviations(), 1.7)
     return program(replace(moved, body=made), parameters=known.with_guess(uneven), scheme=scheme)
 
@@ -596,7 +596,7 @@ def test_sensitivities_keep_the_linearised_constraints(made: Collocation, rng):
     for part in made.iterates(z):
         found.append(Sweep(part.transcription).forward(part.x, part.equations).by_p)
     moving = [
-        transcription.list_parameter_indices()[transcription.dynamic_parameters].tolist()
+        transcription.parameter_indices[transcription.dynamic_parameters].tolist()
         for transcription in made.transcriptions
     ]
     for place in sorted(set(chain(*moving))):
@@ -616,11 +616,11 @@ def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(
     made: Collocation, rng
 ):
     q, phi = (made.parameters.guess_q, 0.1 + 0.3 * np.abs(rng.normal(size=made.nphi)))
-    p = np.clip(np.concatenate([q, phi]), *made.compute_parameter_bounds())
+    p = np.clip(np.concatenate([q, phi]), *made.parameter_bounds)
     z = simulate_variables(made, p)
     rows = [transcription.grid_times for transcription in made.transcriptions]
     point = Horizon(made, rows).evaluate(p, made.unpack(z)[1])
-    forward, backward = (2 * made.loss_scale * point.fit.compute_score(), adjoint_gradient(made, z))
+    forward, backward = (2 * made.loss_scale * point.fit.score, adjoint_gradient(made, z))
     assert point.loss == pytest.approx(made.objective(z) / made.loss_scale, rel=1e-7)
     np.testing.assert_allclose(backward, forward, atol=1e-6 * np.abs(forward).max())
 

@@ -47,10 +47,8 @@ def test_shared_parameters_are_saved():
     fourth = replace(bar_with_nuisance(4), nuisance=Nuisance.none(marker_offset_m=0.003))
     collocation = Collocation([first, sharing(second, *shared), fourth, third], GUESS)
     alone = Collocation([cube, second, fourth, swung_again(cube, "third")], GUESS)
-    saved = [name for name in collocation.list_parameter_names() if name.startswith("shared: ")]
-    assert len(set(collocation.list_parameter_names())) == len(alone.list_parameter_names()) - len(
-        saved
-    )
+    saved = [name for name in collocation.parameter_names if name.startswith("shared: ")]
+    assert len(set(collocation.parameter_names)) == len(alone.parameter_names) - len(saved)
     assert collocation.nphi == alone.nphi - len(saved)
 
 
@@ -60,7 +58,7 @@ def test_tares_are_shared():
     names = ("tare", "sensor_time_s", "sensor_lag_s", "tool_kg", "tool_m", "gravity_rad")
     pair = [sharing(each, *names) for each in (one, swung_again(one, "second"))]
     program = with_lifted_variables(Collocation(pair, GUESS))
-    assert len({name for name in program.list_parameter_names() if "tare" in name}) == 6
+    assert len({name for name in program.parameter_names if "tare" in name}) == 6
 
 
 # Answers
@@ -190,8 +188,8 @@ def test_words_make_several_groups():
         for transcription in collocation.transcriptions
     ]
     assert places == [0, 2, 2, 0, 4]
-    assert collocation.list_parameter_names()[4] == "shared: tilt of gravity, first [rad]"
-    assert collocation.list_parameter_names()[6] == "shared left: tilt of gravity, first [rad]"
+    assert collocation.parameter_names[4] == "shared: tilt of gravity, first [rad]"
+    assert collocation.parameter_names[6] == "shared left: tilt of gravity, first [rad]"
 
 
 OTHERS = {

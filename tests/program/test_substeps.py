@@ -117,7 +117,7 @@ def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
     assert not holds(noise.statistical95, TRUTH["mu_pa"])
     assert holds(coarse.interval("mu_pa"), TRUTH["mu_pa"])
     assert holds(coarse.interval("young_pa"), 720.0)
-    assert coarse.result.list_discretisation_kinds() == ("step",)
+    assert coarse.result.discretisation_kinds == ("step",)
 
 
 def test_the_value_is_corrected_for_the_step_and_lies_within_both_intervals():
@@ -142,7 +142,7 @@ def test_unestimated_parameters_are_not_reported_as_held():
     coarse = found(3e-4, 1)
     unseen = replace(coarse.problem, rollout=cs.RolloutOptions("scheme"))
     blind = run(unseen, seek_causes=False)
-    assert blind.result.list_discretisation_kinds() == ()
+    assert blind.result.discretisation_kinds == ()
     assert blind.estimates["mu_pa"].value == blind.optimum["mu_pa"].value
     fitted95 = blind.optimum["mu_pa"].statistical95
     assert blind.estimates["mu_pa"].statistical95 == pytest.approx(fitted95, rel=1e-12)
@@ -199,7 +199,7 @@ def test_nothing_is_solved_twice_where_one_step_is_enough():
 def test_a_number_that_is_stated_is_kept():
     solved: list[int] = []
     twice = run(twin(3e-4, 2), counting(solved), seek_causes=False)
-    assert twice.result.list_discretisation_kinds() == ("step",)
+    assert twice.result.discretisation_kinds == ("step",)
     assert solved == [2]
 
 

@@ -136,7 +136,7 @@ def test_a_grasp_that_lets_go_has_a_wrench_while_it_holds():
 
 
 def some_p(collocation: Collocation) -> np.ndarray:
-    low, high = collocation.compute_parameter_bounds()
+    low, high = collocation.parameter_bounds
     phi = np.abs(0.3 * np.random.default_rng(1).standard_normal(collocation.nphi)) + 0.1
     return np.clip(np.concatenate([collocation.parameters.guess_q, phi]), low, high)
 

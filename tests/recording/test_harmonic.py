@@ -67,7 +67,7 @@ def test_relaxation_times_are_those_of_the_temperature():
         theta = dict(zip(body.constants, body.theta_from_values(long_term | values), strict=True))
         assert theta["a.tau_s"] == pytest.approx(10.0 * factor)
         assert theta["b.tau_s"] == pytest.approx(0.1 * factor)
-        assert set(values) <= set(body.list_parameter_names())
+        assert set(values) <= set(body.parameter_names)
 
 
 @pytest.mark.long

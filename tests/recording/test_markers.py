@@ -218,8 +218,8 @@ def test_single_coordinates_of_a_sample_are_kept():
         markers.is_present, [[True, True], [True, True], [True, False], [True, False]]
     )
     assert not markers.is_complete[1, 0]
-    np.testing.assert_array_equal(markers.count_missing(), [0, 2])
-    assert markers.count_samples() == 6
+    np.testing.assert_array_equal(markers.missing_count, [0, 2])
+    assert markers.sample_count == 6
     np.testing.assert_array_equal(np.isnan(markers.positions_m[1, 0]), [False, False, True])
     # Descriptions of the motion use complete samples only.
     assert np.isnan(markers.positions_at_samples_m[1, 0]).all()

@@ -246,7 +246,7 @@ def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(f
     (part,) = found.collocation.iterates(found.z)
     (reading,) = camera_residuals(part.transcription)
     surface = reading.fitted(part.motion_for(reading.observable), part.phi)
-    rows = surface_rows(surface, part.transcription.experiment.compute_upward_direction())
+    rows = surface_rows(surface, part.transcription.experiment.upward_direction)
     points, lines = rows[np.isfinite(rows[:, 3])], rows[np.isnan(rows[:, 3])]
     used = np.isfinite(points[:, 4])
     assert used.sum() == reading.correspondences.is_compared.sum()
@@ -270,7 +270,7 @@ def test_a_film_shows_the_points_that_were_seen_about_each_of_its_samples(found)
     (part,) = found.collocation.iterates(found.z)
     (reading,) = camera_residuals(part.transcription)
     surface = reading.fitted(part.motion_for(reading.observable), part.phi)
-    rows = surface_rows(surface, part.transcription.experiment.compute_upward_direction())
+    rows = surface_rows(surface, part.transcription.experiment.upward_direction)
     experiment = part.transcription.experiment
     x = np.repeat(part.x.reshape(1, -1, 3), 3, axis=0)
     replay = MotionRecord.from_experiment(experiment, (x[:1], np.zeros((1, 0, 3))))

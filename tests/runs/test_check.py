@@ -283,7 +283,7 @@ def test_a_marker_far_from_the_body_is_named(tiny: Path):
     AWAY(tiny)
     findings = checked(tiny)
     assert about(findings, "marker 'side' of 'swing' lies 25 mm", "reference_m")
-    assert findings.recordings[0].find_farthest_marker().name == "side"
+    assert findings.recordings[0].farthest_marker.name == "side"
     assert findings.largest_marker_distance_m == pytest.approx(0.025)
 
 
@@ -357,7 +357,7 @@ def test_nonzeros_are_estimated_for_a_problem_without_guesses(tiny: Path):
     program = problem.collocation()
     expected = nonzeros(problem, program)
     without = Problem.read(tiny / "problem.toml", unguessed)
-    assert without.collocation().parameters.list_names_without_guess()
+    assert without.collocation().parameters.names_without_guess
     assert nonzeros(without, program) == expected
     assert min(expected) > 0
 

@@ -30,9 +30,9 @@ def test_two_coordinates_of_each_marker_identify_the_body(seen_from_the_side):
     for name, value in TRUTH.items():
         assert solution.parameters[name] == pytest.approx(value, rel=2e-2)
     count = 2 * seen_from_the_side.markers.is_present.sum()
-    assert solution.collocation.count_measurements() == count
+    assert solution.collocation.measurement_count == count
     fit = linearise_fit(solution.collocation, solution.z)
-    assert fit.blocks[0].count_measurements() == count
+    assert fit.blocks[0].measurement_count == count
     (note,) = (note for note in solution.notes if "present in less than half" in note)
     assert "y (0%)" in note
     assert "hung cube" in note

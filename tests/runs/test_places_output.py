@@ -118,7 +118,7 @@ def test_a_later_solve_starts_from_the_places_found(folder: Path, result: dict):
     collocation = earlier.apply_to_places(problem.collocation())
     (transcription,) = collocation.transcriptions
     found = [place["position_m"] for place in result["places"]["swing"].values()]
-    assert transcription.marker_places_m(transcription.compute_guess_phi()) == pytest.approx(
+    assert transcription.marker_places_m(transcription.guess_phi) == pytest.approx(
         np.array(found), abs=1e-9
     )
     z = earlier.simulated_variables(collocation)
@@ -138,11 +138,11 @@ def test_places_travel_to_another_mesh(folder: Path):
         cs.Problem.read(folder / "problem.toml", [*OPTIONS, *other][1::2])
     )
     (transcription,) = earlier.apply_to_places(problem.collocation()).transcriptions
-    places_m = transcription.marker_places_m(transcription.compute_guess_phi())
+    places_m = transcription.marker_places_m(transcription.guess_phi)
     for m, name in enumerate(transcription.experiment.markers.names):
         assert places_m[m] == pytest.approx(earlier.places_m["swing"][name], abs=1e-9)
         of_nodes, reading = transcription.markers.observable.shape_functions(
-            transcription.compute_guess_phi()
+            transcription.guess_phi
         )
         there = reading.weights[m] @ transcription.body.nodes_m[of_nodes[m]]
         assert there == pytest.approx(places_m[m], abs=1e-9)

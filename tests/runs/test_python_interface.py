@@ -93,7 +93,7 @@ def test_markers_without_places_start_where_the_first_samples_are():
         swing.markers.predict_positions(box().nodes_m), tracks[0], atol=1e-12
     )
     assert not swing.markers.located.any()
-    assert (swing.compute_place_sigma_m() > EDGE_M).all()
+    assert (swing.place_sigma_m > EDGE_M).all()
 
 
 def test_markers_have_places_or_a_placement():

@@ -286,7 +286,7 @@ def test_without_damping_its_law_is_no_matter(changes):
     at = ExperimentAtAnswer(next(iter(collocation.iterates(z))), collocation.parameters)
     for name in ("damping_law", "rayleigh_damping"):
         row = BY_NAME[name]
-        assert all(row.effect(at, axis) is None for axis in range(len(row.list_components())))
+        assert all(row.effect(at, axis) is None for axis in range(len(row.components)))
 
 
 def test_a_law_of_a_users_own_stays_as_it_is():

@@ -214,7 +214,7 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     seen = measured(pressed_cube(6))
     run = cs.run(cs.Problem([seen], GUESS), seek_causes=False)
     assert run.refinement is None
-    assert run.result.list_discretisation_kinds() == ()
+    assert run.result.discretisation_kinds == ()
     free = measured(replace(pressed_cube(6), grasps=pressed_cube(6).body_grasps))
     assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
 

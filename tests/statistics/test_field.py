@@ -132,7 +132,7 @@ def uneven(kind: dict, rng: np.random.Generator) -> tuple[Body, list[np.ndarray]
     """A body, places, velocities and weights of its nodes, and θ with shares at its end."""
     body = bar(cs.Field(0.05, modes=4), divisions=(1, 1, 3), **kind)
     memory = {"slow.share": 0.3, "slow.tau_s": 0.1}
-    shares = dict(zip(body.list_field_coefficient_names(), rng.normal(size=4), strict=True))
+    shares = dict(zip(body.field_coefficient_names, rng.normal(size=4), strict=True))
     x = body.nodes_m + 1e-3 * rng.normal(size=body.nodes_m.shape)
     theta = body.theta_from_values({**KNOWN, **memory, "young_pa": YOUNG_PA, **shares})
     return body, [x, *rng.normal(size=(2, *x.shape))], theta
@@ -171,7 +171,7 @@ def test_a_hidden_stiff_half_is_found():
     assert np.exp(lower - upper) == pytest.approx(2.0, rel=0.15)
     assert held_share(field, 2.0) >= 0.9
     assert field.is_informed.mean() > 0.9
-    assert 5 < field.count_identified_modes() <= 20
+    assert 5 < field.identified_mode_count <= 20
 
 
 @pytest.mark.parametrize("method", [cs.InteriorPoint(), cs.Shooting()], ids=type)
@@ -249,7 +249,7 @@ def test_a_density_field_has_the_mass_of_its_shapes(rng):
     values = {
         **KNOWN,
         "young_pa": YOUNG_PA,
-        **dict(zip(body.list_field_coefficient_names(), shares, strict=True)),
+        **dict(zip(body.field_coefficient_names, shares, strict=True)),
     }
     mass_kg = body.mass_of_dofs(body.theta_from_values(values))[::3]
     local = 100.0 * (1 + body.parts[0].field.shapes @ shares)
@@ -306,7 +306,7 @@ def test_a_solve_keeps_clear_of_masses_below_zero():
 def test_densities_by_the_default_amplitude_have_masses_above_zero(rng):
     body = bar(cs.Field(0.03, "density_kg_m3", 30))
     for _ in range(200):
-        shares = dict(zip(body.list_field_coefficient_names(), rng.normal(size=30), strict=True))
+        shares = dict(zip(body.field_coefficient_names, rng.normal(size=30), strict=True))
         theta = body.theta_from_values({**KNOWN, "young_pa": YOUNG_PA, **shares})
         assert body.mass_of_dofs(theta).min() > 0
 
@@ -320,8 +320,8 @@ def test_an_even_body_is_found_even():
 def test_undeformed_parts_of_a_field_keep_their_prior():
     field = found(1.0, 0.055)
     above = (bar().nodes_m[bar().cells, 2] > 0.055).all(axis=1)
-    assert field.compute_deviation_over_prior()[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
-    assert field.compute_deviation_over_prior()[~above].max() < 0.5
+    assert field.deviation_over_prior[above & (centres(bar())[:, 2] > 0.1)].min() > 0.9
+    assert field.deviation_over_prior[~above].max() < 0.5
 
 
 def test_an_amplitude_that_is_too_small_is_reported():
@@ -405,7 +405,7 @@ def test_a_field_is_one_parameter_with_a_slice_of_the_coordinates():
 
 def body_coefficients(known: cs.Problem) -> tuple[str, ...]:
     (body,) = known.bodies
-    return body.list_field_coefficient_names()
+    return body.field_coefficient_names
 
 
 def test_a_scalar_is_not_tied_to_a_component_of_a_field():
@@ -434,7 +434,7 @@ def test_a_stated_coefficient_keeps_its_value_and_has_no_error_bar():
 def test_the_likeliest_of_several_lengths_is_taken():
     several = replace(problem(2.0), experiments=[_of_lengths(0.005, 0.05)])
     run = cs.run(several, seek_causes=False)
-    assert run.problem.collect_lengths_m() == {"young_pa": 0.05}
+    assert run.problem.lengths_m == {"young_pa": 0.05}
     found = run.result.fields["young_pa"]
     assert found.shapes.length_m == 0.05
     assert found.likelier["0.05"] == 0.0 > found.likelier["0.005"]
@@ -453,7 +453,7 @@ def test_a_run_folder_has_the_field_in_every_element(tmp_path):
     run.save(tmp_path / "run")
     result, (replay,) = read_run(tmp_path / "run")
     stored, field = replay.fields["young_pa"], run.fields["young_pa"]
-    assert result.fields["young_pa"].identified == field.count_identified_modes()
+    assert result.fields["young_pa"].identified == field.identified_mode_count
     np.testing.assert_array_equal(stored[field.cells, 0], field.value)
     assert (stored[:, 1] < stored[:, 0]).all()
     assert (stored[:, 0] < stored[:, 2]).all()
@@ -507,12 +507,12 @@ def _brightness(figure: Figure) -> float:
 def test_a_finer_mesh_has_the_same_field():
     core = cs.Region("core", np.arange(30), field=cs.Field((0.02, 0.04), "mu_pa", 3))
     body = bar(cs.Field(0.05, modes=4), regions=[core])
-    body = body.with_field_lengths(body.collect_field_lengths_m() | {"core.mu_pa": 0.04})
+    body = body.with_field_lengths(body.field_lengths_m | {"core.mu_pa": 0.04})
     finer = refine_body(body)
-    assert finer.collect_field_lengths_m() == {"young_pa": 0.05, "core.mu_pa": 0.04}
+    assert finer.field_lengths_m == {"young_pa": 0.05, "core.mu_pa": 0.04}
     for coarse, fine in zip(body.parts, finer.parts, strict=True):
         np.testing.assert_array_equal(fine.field.shapes, np.repeat(coarse.field.shapes, 8, axis=0))
-    shares = dict.fromkeys(body.list_field_coefficient_names(), 0.3)
+    shares = dict.fromkeys(body.field_coefficient_names, 0.3)
     values = {"poisson": 0.3, **shares, "young_pa": YOUNG_PA}
     stretched = np.diag([1.02, 0.99, 1.05])
     energies = [
@@ -530,7 +530,7 @@ def test_a_file_states_fields_of_the_body_and_of_a_region(tiny: Path):
     stated = [*(f"object.field.{each}" for each in own), f"object.region={core}"]
     inside = ["object.region.core.field.length_m=[0.1, 0.2]", "object.region.core.field.modes=2"]
     read = cs.Problem.read(tiny / "problem.toml", [*stated, *inside])
-    assert read.collect_lengths_m() == {"gamma_r_s": 0.1, "core.young_pa": 0.1}
+    assert read.lengths_m == {"gamma_r_s": 0.1, "core.young_pa": 0.1}
     free = [item.name for item in read.parameters.free if "field" in item.name]
     assert free == ["field_1", "field_2", "field_3", "core.field_1", "core.field_2"]
     known = cs.Problem.read(tiny / "problem.toml", [*stated, "parameters.field_2.guess=0.4"])

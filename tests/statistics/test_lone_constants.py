@@ -226,7 +226,7 @@ def test_an_assumption_that_is_known_has_the_stated_effect():
 
     doubtful = run_with(mass=0.6, density_gradient=0.05)
     result = build_result(doubtful)
-    assert not result.collect_estimates()["young_pa"].is_determined
+    assert not result.estimates["young_pa"].is_determined
     assert next(iter(result.budget["young_pa"])) == "mass"
     (stated,) = re.findall(r"±([\d.]+) %", effect_of_remedy(result, "young_pa"))
     followed = half_width(run_with(density_gradient=0.05), "young_pa")
@@ -253,8 +253,7 @@ def test_what_would_determine_a_constant_does():
 def test_the_effect_of_a_remedy_is_stated_for_what_it_would_determine():
     estimate = SimpleNamespace(is_determined=False, combined95=(1.0, 16.0))
     result: Any = SimpleNamespace(
-        collect_estimates=lambda: {"lambda_pa": estimate},
-        budget={"lambda_pa": {"scale": 0.75, "noise": 0.25}},
+        estimates={"lambda_pa": estimate}, budget={"lambda_pa": {"scale": 0.75, "noise": 0.25}}
     )
     assert (
         effect_of_remedy(result, "lambda_pa")

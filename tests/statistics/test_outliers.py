@@ -45,7 +45,7 @@ def test_a_sample_that_spoils_the_rest_is_named():
     assert (outlier.series, outlier.t_s) == ("swing 0/m1", pytest.approx(0.2))
     assert outlier.share > 0.9
     assert outlier.deviations == pytest.approx(158, rel=0.1)
-    assert rest.count_measurements() == fit.count_measurements() - 3
+    assert rest.measurement_count == fit.measurement_count - 3
     trust, _ = judged(with_outlier(RNG(0).normal(size=(60, 3, 3))))
     assert any(
         "swing 0/m1: the sample at t = 0.2 s deviates by 1.5e+02" in r for r in trust.reasons

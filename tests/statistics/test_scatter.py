@@ -64,8 +64,8 @@ def test_a_step_from_the_joint_answer_is_the_fit_to_one_recording():
 
 def test_recordings_that_agree_have_the_chi_squared_of_chance():
     found = [scatter(judged(seed)) for seed in range(SEEDS)]
-    values = np.array([each.compute_chi_squared() for each in found]) / (RECORDINGS - 1)
-    assert all((each.count_degrees_of_freedom() == RECORDINGS - 1).all() for each in found)
+    values = np.array([each.chi_squared for each in found]) / (RECORDINGS - 1)
+    assert all((each.degrees_of_freedom == RECORDINGS - 1).all() for each in found)
     low, high = chi2.ppf([1e-4, 1 - 1e-4], SEEDS * (RECORDINGS - 1)) / SEEDS / (RECORDINGS - 1)
     assert (low < values.mean(axis=0)).all()
     assert (values.mean(axis=0) < high).all()
@@ -78,9 +78,7 @@ def test_disagreeing_recordings_widen_the_interval_of_the_parameter_concerned():
     calm, found = judged(1), judged(1, spread=SPREAD)
     assert scatter(found).find_disagreements().tolist() == [False, True, False, False]
     ratio = np.sqrt(np.diag(found.covariance) / np.diag(calm.covariance))
-    birge = np.sqrt(
-        scatter(found).compute_chi_squared()[1] / scatter(found).count_degrees_of_freedom()[1]
-    )
+    birge = np.sqrt(scatter(found).chi_squared[1] / scatter(found).degrees_of_freedom[1])
     assert ratio[1] == pytest.approx(birge, rel=0.3)
     assert found.quantiles[1] == pytest.approx(t.ppf(0.975, RECORDINGS - 1))
     assert (ratio[[0, 2, 3]] < 1.3).all()

@@ -66,7 +66,7 @@ def test_a_probe_without_shown_estimates_states_no_changes():
         size_error=0.01,
         moves={},
     )
-    result: Any = SimpleNamespace(probes=[probe], collect_estimates=dict, parameters={}, budget={})
+    result: Any = SimpleNamespace(probes=[probe], estimates={}, parameters={}, budget={})
     first = next(_conclusions(result))
     assert first.endswith("χ² decreases by 30; measure it, or estimate it")
 
@@ -79,7 +79,7 @@ def test_memory_of_a_negative_share_is_called_another_effect():
         )  # fmt: skip
 
     probes = [probe("memory_share τ=0.01s", -0.25, 79.8), probe("clock_rate", 0.1, 30.0)]
-    result: Any = SimpleNamespace(probes=probes, collect_estimates=dict, parameters={}, budget={})
+    result: Any = SimpleNamespace(probes=probes, estimates={}, parameters={}, budget={})
     (impossible,) = _conclusions(result)
     assert impossible.startswith("χ² would decrease by 79.8 with memory of a negative share")
     assert impossible.endswith("this is another effect, not memory; by less with clock rate (30)")
@@ -104,7 +104,7 @@ def test_a_decrease_without_a_finding_is_explained(chi_squared, explained):
         size_error=0.05,
         routine=True,
     )
-    result: Any = SimpleNamespace(probes=[probe], collect_estimates=dict, parameters={}, budget={})
+    result: Any = SimpleNamespace(probes=[probe], estimates={}, parameters={}, budget={})
     (told,) = _conclusions(result)
     assert told.startswith("tested without a finding: anisotropy z")
     assert ("χ² decreases by 44 with anisotropy z, which is not significant" in told) == explained

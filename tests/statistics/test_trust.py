@@ -297,7 +297,7 @@ def judged(fault: str, seed: int = 100) -> Run:
 def test_faultless_twins_are_good(seed):
     found = judged("none", seed)
     assert found.trust == Assessment(())
-    assert found.compute_noise_rms_m() == pytest.approx(found.solution.rms_m, rel=0.1)
+    assert found.noise_rms_m == pytest.approx(found.solution.rms_m, rel=0.1)
 
 
 @pytest.mark.long

@@ -260,11 +260,11 @@ def test_samples_are_of_the_posterior_that_enumeration_gives(rng):
         labels.append(h)
     weights = np.exp(np.array(logarithms) - max(logarithms))
     weights /= weights.sum()
-    np.testing.assert_allclose(draws.compute_probability(), weights @ np.array(labels), atol=0.03)
+    np.testing.assert_allclose(draws.probability, weights @ np.array(labels), atol=0.03)
     expected = weights @ np.array(means)
     assert draws.means.mean() == pytest.approx(expected, abs=0.05)
     assert draws.contrasts.mean() == pytest.approx(expected, abs=0.08)
-    assert draws.compute_scale_reduction() < 1.1
+    assert draws.scale_reduction < 1.1
 
 
 def surrogate_at(ratio: float, phase: np.ndarray, exponent: float) -> ElementSurrogate:
@@ -338,7 +338,7 @@ def test_elements_are_linearised_at_the_smooth_field():
     smooth = cs.solve(problem(3.0).with_fields({search.name: search.modes.to_smooth_field()}))
     surrogate = _linearise_at(problem(3.0), search, solution=smooth)
     fit = linearise_fit(smooth.collocation, smooth.z)
-    assert surrogate.fit.compute_chi_squared() == pytest.approx(fit.compute_chi_squared(), rel=1e-6)
+    assert surrogate.fit.chi_squared == pytest.approx(fit.chi_squared, rel=1e-6)
     assert np.abs(surrogate.base).max() > 0.1
 
 

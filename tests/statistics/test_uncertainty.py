@@ -97,7 +97,7 @@ def test_sensitivities_fit_every_layout_and_several_experiments(options):
 def assert_constraints_are_kept(collocation, z):
     found = sensitivities(collocation, z)
     moving = [
-        transcription.list_parameter_indices()[transcription.dynamic_parameters]
+        transcription.parameter_indices[transcription.dynamic_parameters]
         for transcription in collocation.transcriptions
     ]
     assert [b.shape for b in found] == [

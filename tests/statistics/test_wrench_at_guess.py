@@ -92,13 +92,11 @@ def test_nothing_is_concluded_from_a_body_that_a_second_grasp_deforms() -> None:
 def test_the_deviation_has_the_offset_of_the_sensor() -> None:
     right = deviation(lambda wrench: wrench)
     wrong = deviation(shift)
-    np.testing.assert_allclose(
-        (wrong.compute_offset() - right.compute_offset())[:3], [0, OFFSET_N, 0], atol=1e-12
-    )
-    assert wrong.compute_rms_n() > right.compute_rms_n()
-    assert f"fy {wrong.compute_offset()[1]:+.3g} N" in wrong.note()
+    np.testing.assert_allclose((wrong.offset - right.offset)[:3], [0, OFFSET_N, 0], atol=1e-12)
+    assert wrong.rms_n > right.rms_n
+    assert f"fy {wrong.offset[1]:+.3g} N" in wrong.note()
     (hypothesis,) = wrong.hypotheses()
-    assert f"fy {wrong.compute_offset()[1]:+.3g} N" in hypothesis.message
+    assert f"fy {wrong.offset[1]:+.3g} N" in hypothesis.message
     assert "nuisance.tare" in hypothesis.message
 
 

@@ -66,7 +66,7 @@ def test_error_bars_are_those_of_the_slopes():
     solution = ReducedSpace()(collocation)
     markers, sensor = linearise_fit(collocation, solution.z).blocks
     assert (sensor.sigma_key, markers.sigma_key) == ("sigma_n", "sigma_m")
-    assert sensor.count_measurements() == int(
+    assert sensor.measurement_count == int(
         collocation.transcriptions[0]
         .residuals_of(WrenchResidual)[0]
         .is_compared.reshape(-1, 6)
@@ -196,7 +196,7 @@ def test_a_sensor_separates_stiffness_and_density():
     p, x = collocation.unpack(solution.z)
     point = Horizon(collocation, [len(x[0])]).evaluate(p, x)
     rows = np.concatenate([block.jacobian.reshape(-1, 5) for block in fit.blocks])
-    np.testing.assert_allclose(rows.T @ rows, point.fit.compute_information(), rtol=1e-6)
+    np.testing.assert_allclose(rows.T @ rows, point.fit.information, rtol=1e-6)
     seen = Problem([blind(swung())], unknown)
     told = uncertainty_at(seen.collocation(), seen.collocation().pack(p, x)).estimates
     assert told["density_kg_m3"].statistical_std_error is None

@@ -276,7 +276,7 @@ def test_a_place_that_is_estimated_off_the_body_is_named() -> None:
     program = cs.Problem([swung([tracks])], parameters=unknown_young()).collocation()
     transcription = program.transcriptions[0]
     (residual,) = transcription.residuals_of(ImageTrackResidual)
-    phi = transcription.compute_guess_phi()
+    phi = transcription.guess_phi
     assert not list(places_off_body(residual, phi, "'front'"))
     place = residual.correspondences.coordinate_parameters[NAMES.index("tip_top")]
     phi[place] += 0.1 / transcription.nuisance.scales[place]

@@ -215,7 +215,7 @@ def test_a_parameter_that_a_prior_determines_costs_no_degree_of_freedom():
     fit, wrong = sample()
     tight = replace(fit, prior_jacobian=np.where(np.arange(len(fit.names)) < 4, 0.0, 1e6))
     found = uncertainty_from_fit(tight, PARAMETERS, wrong[:4])
-    assert found.degrees_of_freedom == pytest.approx(fit.count_measurements() - 4, abs=1e-3)
+    assert found.degrees_of_freedom == pytest.approx(fit.measurement_count - 4, abs=1e-3)
 
 
 # What is said of the residuals

@@ -195,7 +195,7 @@ def _write_recording(
         files["markers"] = f"{name}_markers.csv"
         write_text_file(folder / files["markers"], _marker_table(experiment))
     else:
-        content["symmetry"] = experiment.find_symmetry()
+        content["symmetry"] = experiment.symmetry
     content["grasps"] = _write_grasps(experiment, folder=folder, name=name)
     return content
 

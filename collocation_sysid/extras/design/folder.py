@@ -132,7 +132,7 @@ def design_json(design: Design) -> dict[str, Any]:
             "for": list(design.criterion.names),
             "over": design.criterion.over,
             "draws": design.draws,
-            "relative_error": design.compute_minimised_error(),
+            "relative_error": design.minimised_error,
         },
         "recordings_count": design.added,
         "before": None if design.before is None else _error_bars_json(design.before),
@@ -141,7 +141,7 @@ def design_json(design: Design) -> dict[str, Any]:
             name: {"limit": getattr(limits, name), "share_used": share}
             for name, share in design.shares.items()
         },
-        "limits_reached": design.list_active_limits(),
+        "limits_reached": design.active_limits,
         "search": {
             "evaluations": len(search.history),
             "interrupted": search.is_interrupted,

@@ -187,8 +187,9 @@ class HandBounds:
     low_m: Array
     high_m: Array
 
-    def compute_reach(self) -> TimeDerivatives:
-        """Return the largest translation [m] along the farthest axis of the workspace and largest
+    @property
+    def reach(self) -> TimeDerivatives:
+        """Largest translation [m] along the farthest axis of the workspace and largest
         rotation [rad], as an array (2,), with the limits of their first and second derivatives,
         (2,) each.
         """

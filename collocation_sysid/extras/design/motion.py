@@ -120,14 +120,16 @@ class Design:
         """
         return self.experiment.grasps[0].poses
 
-    def list_active_limits(self) -> list[str]:
-        """Return the names of the robot's limits of which the motion uses more than the share
+    @property
+    def active_limits(self) -> list[str]:
+        """Names of the robot's limits of which the motion uses more than the share
         `REACHED`.
         """
         return [name for name, share in self.shares.items() if share > REACHED]
 
-    def compute_minimised_error(self) -> float:
-        """Return the relative error bar that was minimised, 0.01 for 1 %, combined over parameters
+    @property
+    def minimised_error(self) -> float:
+        """Relative error bar that was minimised, 0.01 for 1 %, combined over parameters
         and draws by the criterion.
         """
         return float(np.exp(self.best.value))
@@ -167,7 +169,7 @@ class MotionObjective:
             coefficients,
             float(recording.since_start_s[-1]),
             highest_hz=recording.highest_hz(self.limits),
-            reach=self.bounds.compute_reach(),
+            reach=self.bounds.reach,
         )
         return self.bounds.scale_to_limits(free)
 
@@ -201,7 +203,7 @@ class MotionObjective:
             0.0 if motion is None else recording.simulate_motion(motion, q)[0] for q in self.draws
         ]
         errors = [self.errors(each, q) for each, q in zip(known, self.draws, strict=True)]
-        each = [error.compute_relative() for error in errors]
+        each = [error.relative for error in errors]
         lowest, highest = ({n: pick(e[n] for e in each) for n in each[0]} for pick in (min, max))
         return ErrorBars(errors[0].values, each[0], lowest=lowest, highest=highest)
 

@@ -39,7 +39,7 @@ def design_summary(design: Design, folder: Path) -> list[Shown]:
         *[interrupted] * design.best.is_interrupted,
         _error_table(design),
         _column_note(design),
-        f"limits reached: {', '.join(design.list_active_limits()) or 'none'}",
+        f"limits reached: {', '.join(design.active_limits) or 'none'}",
         f"written to {folder}",
     ]
 

@@ -185,8 +185,9 @@ class PredictedErrors:
         chosen = names or list(self.slopes)[: self.estimated_count]
         return np.array([self.slopes[name] for name in chosen])
 
-    def compute_relative(self) -> dict[str, float]:
-        """Return the standard errors of parameters and derived moduli relative to their values, by
+    @property
+    def relative(self) -> dict[str, float]:
+        """Standard errors of parameters and derived moduli relative to their values, by
         name.
         """
         return {
@@ -251,7 +252,7 @@ def symmetric_draws(
     """
     rng = np.random.default_rng(seed)
     deviations = [root @ rng.normal(size=len(middle)) for _ in range(pairs)]
-    lower, upper = parameters.compute_bounds_q()
+    lower, upper = parameters.bounds_q
     margin = 1e-3 * np.minimum(upper - lower, 1.0)
     draws = [middle, *(middle + sign * way for way in deviations for sign in (1, -1))]
     return [np.clip(q, lower + margin, upper - margin) for q in draws]
@@ -274,7 +275,7 @@ def shared_information(fit: LinearisedFit) -> Array:
     included.
     """
     alone = least_squares_of_fit(fit).marginal(fit.shared_count)
-    return alone.compute_information() - np.diag(fit.prior_jacobian[: fit.shared_count] ** 2)
+    return alone.information - np.diag(fit.prior_jacobian[: fit.shared_count] ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,23 +320,22 @@ class FutureRecording:
                 "the grasp holds only some axes, or only a part of the time; expected one that holds "
                 "all axes throughout"
             )
-        if not 3 <= self.count_samples() <= MOST_SAMPLES:
+        if not 3 <= self.sample_count <= MOST_SAMPLES:
             raise InputError(
-                f"{self.duration_s:g} s are {self.count_samples() - 1:.6g} steps of "
+                f"{self.duration_s:g} s are {self.sample_count - 1:.6g} steps of "
                 f"{template.timestep_s:g} s; expected 2 to {MOST_SAMPLES}",
                 where="--duration",
             )
 
-    def count_samples(self) -> int:
-        """Return the number of samples of the designed recording, the first and the last included."""
+    @property
+    def sample_count(self) -> int:
+        """Number of samples of the designed recording, the first and the last included."""
         return round(self.duration_s / self.template.timestep_s) + 1
 
     @cached_property
     def since_start_s(self) -> Array:
         """Times (T,) of the samples since the start [s]."""
-        return np.asarray(
-            np.arange(self.count_samples()) * self.template.timestep_s, dtype=np.float64
-        )
+        return np.asarray(np.arange(self.sample_count) * self.template.timestep_s, dtype=np.float64)
 
     @cached_property
     def start_pose(self) -> tuple[Array, Array]:
@@ -385,7 +385,7 @@ class FutureRecording:
     @cached_property
     def pose_times_s(self) -> Array:
         """Times (P,) of the poses since the start [s], several per sample."""
-        count = POSES_PER_SAMPLE * (self.count_samples() - 1) + 1
+        count = POSES_PER_SAMPLE * (self.sample_count - 1) + 1
         return np.linspace(0.0, self.since_start_s[-1], count)
 
     def poses(self, motion: HandMotion) -> PoseSequence:
@@ -485,9 +485,7 @@ class FutureRecording:
         if failure is not None:
             raise failure
         self._starts[q.tobytes()] = x[:1]
-        return linearise_fit(
-            alone, alone.pack(np.append(q, transcription.compute_guess_phi()), [x])
-        ), x
+        return linearise_fit(alone, alone.pack(np.append(q, transcription.guess_phi), [x])), x
 
 
 # Heights of the pulses in translation [m] and rotation vector [rad]: small, for a linear response.
@@ -517,13 +515,7 @@ class LinearRecording:
         """
         (transcription,) = recording.program(recording.template).transcriptions
         markers = 3 * len(recording.template.markers.names)
-        return (
-            6
-            * 16e-9
-            * recording.count_samples()
-            * markers
-            * len(transcription.list_parameter_indices())
-        )
+        return 6 * 16e-9 * recording.sample_count * markers * len(transcription.parameter_indices)
 
     @classmethod
     def from_simulations(cls, recording: FutureRecording, q: Array) -> LinearRecording:
@@ -539,7 +531,7 @@ class LinearRecording:
             0
         ]
         (at_rest,) = still.blocks
-        count = recording.count_samples()
+        count = recording.sample_count
         length = 1 << (2 * count - 1).bit_length()
         answers = []
         for k, height in enumerate(HEIGHTS):
@@ -567,7 +559,7 @@ class LinearRecording:
         of_course = np.fft.rfft(course[CENTRE:], self.length, axis=0)
         transform = np.einsum("fk,kfcp->fcp", of_course, self.responses)
         (rest,) = self.rest.blocks
-        change = np.fft.irfft(transform, self.length, axis=0)[: recording.count_samples()]
+        change = np.fft.irfft(transform, self.length, axis=0)[: recording.sample_count]
         slope = rest.jacobian + change.reshape(rest.jacobian.shape)
         return shared_information(replace(self.rest, blocks=(replace(rest, jacobian=slope),)))
 

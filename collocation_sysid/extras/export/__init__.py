@@ -132,7 +132,7 @@ def write_draws(
     """
     exported = target_named(target_name).export(body)  # refused before anything is written
     rows = [dict(zip(draws, row, strict=True)) for row in zip(*draws.values(), strict=True)]
-    own = {*body.parameters, *body.body.list_field_coefficient_names()}
+    own = {*body.parameters, *body.body.field_coefficient_names}
     names = [name for name in draws if name in own]  # without derived moduli
     digits = max(3, len(str(len(rows))))
     with replaced_folder(folder, marker_file=SAMPLES_FILE, content_word="ensemble") as place:
@@ -193,7 +193,7 @@ def comparison_table(name: str, comparisons: Sequence[PredictionComparison]) -> 
     rows = []
     for each in comparisons:
         values = (f"{value:.5g} {each.unit}" for value in (each.theirs, each.ours))
-        rows.append((each.what, *values, f"{each.compute_relative_difference():+.2%}", each.remark))
+        rows.append((each.what, *values, f"{each.relative_difference:+.2%}", each.remark))
     return Table("", ("", name, "ours", "difference", ""), rows=tuple(rows), names=5)
 
 

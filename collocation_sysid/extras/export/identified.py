@@ -271,9 +271,7 @@ class IdentifiedBody:
             title,
             result.trust.verdict,
             warnings=_warnings(result),
-            parameters={
-                n: each for n, each in result.parameters.items() if n in result.collect_estimates()
-            },
+            parameters={n: each for n, each in result.parameters.items() if n in result.estimates},
             body=body,
             theta=body.theta_from_values(values),
             experiment=corrected,

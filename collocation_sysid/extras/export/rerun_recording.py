@@ -204,7 +204,7 @@ class _Recording:
 
     def _write_parameters(self, result: Result, span_s: Array) -> None:
         """Write parameters with combined intervals as constant curves."""
-        for name, each in result.collect_estimates().items():
+        for name, each in result.estimates.items():
             curves = {"value": each.value}
             if each.combined95 is not None:
                 curves |= {"lower": each.combined95[0], "upper": each.combined95[1]}

@@ -60,8 +60,9 @@ class PredictionComparison:
     unit: str  # unit of both
     remark: str = ""  # further sentence; empty if there is none
 
-    def compute_relative_difference(self) -> float:
-        """Return the relative difference (theirs − ours) / ours; NaN if ours is zero."""
+    @property
+    def relative_difference(self) -> float:
+        """Relative difference (theirs − ours) / ours; NaN if ours is zero."""
         return (self.theirs - self.ours) / self.ours if self.ours else float("nan")
 
 

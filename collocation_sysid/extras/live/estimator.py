@@ -266,7 +266,7 @@ class LiveEstimator:
         self._last_positions_m = np.full((1, 3), np.nan)
         self.second_pass: WindowPass | None = None
         self.log: list[LoggedRow] = []
-        self.search = self._new_search() if problem.parameters.list_names_without_guess() else None
+        self.search = self._new_search() if problem.parameters.names_without_guess else None
         self.scatter = ResidualScatter()
         self._trust = INITIAL_RADIUS
         self._rejected = 0
@@ -533,7 +533,7 @@ class LiveEstimator:
                 notes += self._start_pass(rows)
             elif not first_pass.has_failed:
                 done = first_pass.add_rows(
-                    [row.poses for row in rows[: first_pass.count_remaining_rows()]]
+                    [row.poses for row in rows[: first_pass.remaining_row_count]]
                 )
         except (SimulationError, InputError) as error:
             if first_pass is None:
@@ -610,7 +610,7 @@ class LiveEstimator:
         """Set the attributes `lower` and `upper`, bounds (P,) of the parameters p in the solver's
         coordinates, from the model.
         """
-        self.lower, self.upper = self.model.collocation.compute_parameter_bounds()
+        self.lower, self.upper = self.model.collocation.parameter_bounds
 
     def _new_search(self) -> StiffnessSearch:
         """Return a new search for initial values over a range of stiffness, with the present
@@ -777,9 +777,7 @@ class LiveEstimator:
         self.intake.reset()
         self.prior = SquareRootInformation.empty(model.parameter_count)
         self.p = np.clip(model.collocation.guess_p, self.lower, self.upper)
-        self.search = (
-            self._new_search() if self.problem.parameters.list_names_without_guess() else None
-        )
+        self.search = self._new_search() if self.problem.parameters.names_without_guess else None
         self.scatter = ResidualScatter()
         self._trust = INITIAL_RADIUS
         self._rejected = 0
@@ -823,7 +821,7 @@ class LiveEstimator:
         """Return the parameters p (P,), in the solver's coordinates, that minimise a quadratic loss
         within the bounds and the trust region about the linearisation point of a pass.
         """
-        reach = self._trust * self.model.collocation.compute_reach_p()
+        reach = self._trust * self.model.collocation.reach_p
         low = np.maximum(self.lower, first_pass.sweep.p - reach)
         high = np.minimum(self.upper, first_pass.sweep.p + reach)
         best = known.minimiser(self.model.transformed(low), self.model.transformed(high))
@@ -836,9 +834,7 @@ class LiveEstimator:
         size = self.model.parameter_count
         samples = len(self.log) / self.model.collocation.substeps
         deviation = POINT_PRIOR_DEVIATION * max(1.0, samples / TRIAL_SAMPLES)
-        slopes = np.diag(
-            1 / (deviation * self.model.collocation.compute_reach_p() * first_pass.sweep.rates)
-        )
+        slopes = np.diag(1 / (deviation * self.model.collocation.reach_p * first_pass.sweep.rates))
         information = self._combined.information.with_rows(
             np.zeros(size), slopes, parameters=first_pass.sweep.transformed
         )
@@ -927,8 +923,7 @@ class LiveEstimator:
                     self.first_pass, second_pass, began=began, distance=RELINEARISE_DISTANCE
                 )
             affordable = min(
-                self._affordable_rows(done, self.clock() - began),
-                second_pass.count_repeatable_rows(),
+                self._affordable_rows(done, self.clock() - began), second_pass.repeatable_row_count
             )
             if not affordable:
                 break
@@ -945,7 +940,7 @@ class LiveEstimator:
         lag = len(self.log) - second_pass.rows
         elapsed_s = self.clock() - began
         if lag > min(
-            second_pass.count_repeatable_rows(),
+            second_pass.repeatable_row_count,
             self._affordable_rows(0, elapsed_s + self.budget.frame_s),
         ):
             return 0
@@ -1093,7 +1088,7 @@ class LiveEstimator:
                 second_pass.sweep.transformed, self.model.judged_instruments
             )
         else:
-            reach = self.model.collocation.compute_reach_p()
+            reach = self.model.collocation.reach_p
             length = float(np.abs((second_pass.sweep.p - first_pass.sweep.p) / reach).max())
             self._trust = max(RADIUS_REDUCTION * length, 1e-6)
             self._rejected += 1

@@ -46,7 +46,7 @@ def model_from_problem(problem: Problem) -> StreamingModel:
     """
     experiment = _only_experiment(problem)
     collocation = problem.collocation()
-    if collocation.parameters.list_names_without_guess():
+    if collocation.parameters.names_without_guess:
         usual = typical_parameters(collocation.parameters, MIDDLE_PA)
         collocation = replace(collocation, parameters=usual)
     return StreamingModel.from_collocation(experiment, collocation)

@@ -121,7 +121,7 @@ class WindowPass:
         Parameters
         ----------
         poses : sequence of Poses
-            Poses of the moving grasps at the rows, at least one, at most `count_remaining_rows`.
+            Poses of the moving grasps at the rows, at least one, at most `remaining_row_count`.
         guesses : sequence of (3n,), optional
             Initial guesses of the positions [m]; by default from the rows of `base`, if it has
             them.
@@ -189,7 +189,7 @@ class WindowPass:
         return [residual for block in self.blocks for residual in block.residuals]
 
     def repeat_rows(self, rows: Sequence[LoggedRow]) -> None:
-        """Compute the first of the logged rows, at most `count_repeatable_rows`, and add their
+        """Compute the first of the logged rows, at most `repeatable_row_count`, and add their
         samples to the pass.
 
         Fewer rows, but at least one, are computed if an initial guess turns out to be far off. The
@@ -207,22 +207,24 @@ class WindowPass:
         SimulationError
             If a row cannot be solved; no samples are added then.
         """
-        done = self.add_rows([row.poses for row in rows[: self.count_repeatable_rows()]])
+        done = self.add_rows([row.poses for row in rows[: self.repeatable_row_count]])
         pairs = [(each, done - k) for k, row in enumerate(rows[:done], 1) for each in row.samples]
         self.add_residuals(self.sweep.linearise_samples(pairs))
 
-    def count_remaining_rows(self) -> int:
-        """Return the largest number of rows that can be computed at once: those left in the block,
+    @property
+    def remaining_row_count(self) -> int:
+        """Largest number of rows that can be computed at once: those left in the block,
         or in a new one if it is full, at most `StreamingModel.rows_per_chunk`.
         """
         return min(self.model.rows_per_chunk, self.block_rows - self.rows % self.block_rows)
 
-    def count_repeatable_rows(self) -> int:
-        """Return the largest number of rows that can be computed at once with initial guesses from
+    @property
+    def repeatable_row_count(self) -> int:
+        """Largest number of rows that can be computed at once with initial guesses from
         `base`; 1 if there are none.
         """
         rows_of_base = 0 if self.base is None else self.base.rows - self.rows
-        return max(1, min(rows_of_base, self.count_remaining_rows()))
+        return max(1, min(rows_of_base, self.remaining_row_count))
 
     def _rows_of_base(self, count: int) -> list[StoredRow]:
         """Return the next `count` rows of the pass `base` that is repeated, those after the rows of

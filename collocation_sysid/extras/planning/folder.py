@@ -194,7 +194,7 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
             name: {"limit": getattr(program.limits, name), "share_used": float(share)}
             for name, share in plan.shares.items()
         },
-        "limits_reached": plan.list_active_limits(),
+        "limits_reached": plan.active_limits,
         "binding_limits": [each._asdict() for each in plan.binding_limits],
         "body": plan.body_extremes,
         "largest_error_m": plan.largest_error_m,
@@ -256,7 +256,7 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
             Line("no motion was found that keeps the limits of the body; see [avoid]", "check")
         )
     if not plan.binding_limits:
-        lines.append(f"limits reached: {', '.join(plan.list_active_limits()) or 'none'}")
+        lines.append(f"limits reached: {', '.join(plan.active_limits) or 'none'}")
     for each in plan.binding_limits:
         spans = ", ".join(f"{first:.3g}–{last:.3g}" for first, last in each.spans_s)
         lines.append(

@@ -140,8 +140,9 @@ class MotionPlan:
         """Largest value over each limit of the robot, by name of the limit."""
         return self.program.bounds.shares(self.motion)
 
-    def list_active_limits(self) -> list[str]:
-        """Return the names of the limits of which the motion uses more than `REACHED`."""
+    @property
+    def active_limits(self) -> list[str]:
+        """Names of the limits of which the motion uses more than `REACHED`."""
         return [name for name, share in self.shares.items() if share > REACHED]
 
     @property

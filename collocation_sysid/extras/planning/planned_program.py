@@ -607,7 +607,7 @@ def _space(task: Task, bounds: HandBounds, signals: Sequence[Signal]) -> SplineS
                 where="hand.end_rotation_deg",
             )
     end[np.setdiff1d(np.arange(6), free)] = 0.0
-    reach = bounds.compute_reach()
+    reach = bounds.reach
     units = np.repeat(np.minimum(reach.value, reach.second * task.duration_s**2 / 4), 3)
     return SplineSpace(
         task.duration_s,

@@ -467,19 +467,17 @@ def evidence_from_fit(fit: LinearisedFit) -> Evidence:
     of each block; it is the number of measurements if the residuals are zero up to rounding.
     """
     factored = factorise_information(fit)
-    rounding = ROUNDING**2 * fit.count_measurements()
-    independent = float(fit.count_measurements())
-    if fit.compute_chi_squared() > rounding:
+    rounding = ROUNDING**2 * fit.measurement_count
+    independent = float(fit.measurement_count)
+    if fit.chi_squared > rounding:
         processes = error_processes(fit, factored)
         pairs = zip(fit.blocks, processes, strict=True)
-        independent = sum(
-            _independent_measurements(b, p) for b, p in pairs if b.count_measurements()
-        )
+        independent = sum(_independent_measurements(b, p) for b, p in pairs if b.measurement_count)
     return Evidence(
-        max(fit.compute_chi_squared(), rounding),
+        max(fit.chi_squared, rounding),
         float(np.sum(fit.prior_residual**2)),
-        fitted=factored.count_determined(),
-        measurements=fit.count_measurements(),
+        fitted=factored.determined_count,
+        measurements=fit.measurement_count,
         independent=independent,
     )
 
@@ -494,7 +492,7 @@ def _independent_measurements(block: ResidualBlock, process: ErrorProcess) -> fl
     # Few samples make channels look alike that are not: that much is taken off tr Σ².
     sum_of_squares = float(np.sum(among**2)) - total / max(process.samples, 1.0)
     channels = float(np.clip(total / max(sum_of_squares, 1e-300), 1.0, len(among)))
-    return block.count_measurements() * channels / len(among) / max(1.0, in_time)
+    return block.measurement_count * channels / len(among) / max(1.0, in_time)
 
 
 # Share of a single recording that is fitted.
@@ -594,10 +592,7 @@ def _names_at_bounds(solution: Solution) -> dict[str, str]:
     parameters = solution.collocation.parameters
     at_bound: dict[str, str] = {}
     for item, coordinate, lower, upper in zip(
-        parameters.free,
-        np.asarray(solution.q, dtype=float),
-        *parameters.compute_bounds_q(),
-        strict=True,
+        parameters.free, np.asarray(solution.q, dtype=float), *parameters.bounds_q, strict=True
     ):
         if coordinate - lower < AT_BOUND:
             at_bound[item.name] = "lower"

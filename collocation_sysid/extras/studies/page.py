@@ -53,8 +53,9 @@ class StudyReport:
     records: Mapping[str, Record]  # mapping of str to Record: records of finished runs by key
     yardstick: SuccessCriterion
 
-    def list_rows(self) -> list[Row]:
-        """Return the one row for each planned run (`run_row`), or for each model (`model_rows`),
+    @property
+    def rows(self) -> list[Row]:
+        """One row for each planned run (`run_row`), or for each model (`model_rows`),
         computed anew at each access.
         """
         if self.kind == MODEL_STUDY:
@@ -71,14 +72,11 @@ class StudyReport:
         sweep estimates, and quality and cost.
         """
         if self.kind == METHOD_STUDY:
-            return comparison_views(method_rows(self.list_rows()))
+            return comparison_views(method_rows(self.rows))
         if self.kind == MODEL_STUDY:
-            disagreements = law_disagreements(self.list_rows())
-            return [
-                *model_views(self.list_rows()),
-                *([law_table(disagreements)] if disagreements else []),
-            ]
-        return sweep_views(self.list_rows(), list(self.planned[0].varied_values))
+            disagreements = law_disagreements(self.rows)
+            return [*model_views(self.rows), *([law_table(disagreements)] if disagreements else [])]
+        return sweep_views(self.rows, list(self.planned[0].varied_values))
 
     def build_headline(self) -> list[str]:
         """Return the result of the study in a few sentences: the advice of a comparison of models,
@@ -86,10 +84,10 @@ class StudyReport:
         the estimates.
         """
         if self.kind == MODEL_STUDY:
-            return [advice(self.list_rows())]
+            return [advice(self.rows)]
         if self.kind == METHOD_STUDY:
-            return [_method_sentence(row) for row in method_rows(self.list_rows())]
-        return sweep_sentences(self.list_rows())
+            return [_method_sentence(row) for row in method_rows(self.rows)]
+        return sweep_sentences(self.rows)
 
     def build_tables(self) -> list[Table]:
         """Return the tables for pages: those of `views` with headings in words, and for a
@@ -98,10 +96,11 @@ class StudyReport:
         views = [
             replace(view, heads=tuple(map(_in_words, view.heads))) for view in self.build_views()
         ]
-        return [*views, run_view(self.list_rows())] if self.kind == METHOD_STUDY else views
+        return [*views, run_view(self.rows)] if self.kind == METHOD_STUDY else views
 
-    def list_failures(self) -> list[str]:
-        """Return the one line for each run that has a record without a result: its label, outcome
+    @property
+    def failures(self) -> list[str]:
+        """One line for each run that has a record without a result: its label, outcome
         and message. Runs without a record do not count.
         """
         return [
@@ -111,14 +110,15 @@ class StudyReport:
             and not {"result", "model"} & record.keys()
         ]
 
-    def list_notes(self) -> list[str]:
-        """Return the notes that explain the tables, the criterion of success of a comparison of
+    @property
+    def notes(self) -> list[str]:
+        """Notes that explain the tables, the criterion of success of a comparison of
         methods, and the number of runs without a record, if there are any.
         """
         missing = len(self.planned) - len(self.records)
         notes = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
         if self.kind == MODEL_STUDY:
-            return [*model_notes(self.list_rows()), *notes]
+            return [*model_notes(self.rows), *notes]
         return [
             *((self.yardstick.describe(), MEDIANS_NOTE) if self.kind == METHOD_STUDY else ()),
             *notes,
@@ -173,8 +173,8 @@ def study_tables(report: StudyReport, folder: Path) -> list[Shown]:
     parts: list[Shown] = [*report.build_headline(), ""] if report.kind == MODEL_STUDY else []
     for table in report.build_views():
         parts += [table, ""]
-    failures = report.list_failures()
-    parts += [*report.list_notes(), *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
+    failures = report.failures
+    parts += [*report.notes, *(Line(each, "doubtful") for each in failures[:SHOWN_FAILURES])]
     if len(failures) > SHOWN_FAILURES:
         more = f"and {len(failures) - SHOWN_FAILURES} more in summary.md"
         parts.append(Line(more, "doubtful"))
@@ -224,7 +224,7 @@ def write_report(report: StudyReport, folder: Path) -> None:
     InputError
         If a file cannot be written.
     """
-    rows = report.list_rows()
+    rows = report.rows
     write_text_file(folder / "runs.csv", as_csv(rows))
     if report.kind == METHOD_STUDY:
         write_text_file(folder / "summary.csv", as_csv(method_rows(rows)))
@@ -249,7 +249,7 @@ def report_json(report: StudyReport) -> dict[str, Any]:
     unknown), "within" and "methods", of models "advice" and "laws", and for a sweep
     "varied_values", the swept keys.
     """
-    rows = report.list_rows()
+    rows = report.rows
     first = report.planned[0]
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -258,9 +258,9 @@ def report_json(report: StudyReport) -> dict[str, Any]:
         "problem": first.problem,
         "runs": rows,
         "headline": report.build_headline(),
-        "notes": report.list_notes(),
+        "notes": report.notes,
         "tables": report.build_tables(),
-        "failures": report.list_failures(),
+        "failures": report.failures,
     }
     if report.kind == METHOD_STUDY:
         content |= {
@@ -294,9 +294,9 @@ def report_section(report: StudyReport) -> TitledParts:
     section with its title, for a paper's appendix or an issue; without failures it has no part on
     them.
     """
-    failures = (Items(tuple(report.list_failures())),) if report.list_failures() else ()
+    failures = (Items(tuple(report.failures)),) if report.failures else ()
     without = tuple(TitledParts("Runs without a result", (each,)) for each in failures)
-    parts = (*report.build_headline(), *report.list_notes(), *report.build_views(), *without)
+    parts = (*report.build_headline(), *report.notes, *report.build_views(), *without)
     return TitledParts(report.title, parts, level=1)
 
 

@@ -298,7 +298,7 @@ def require_predictable(problem: Problem) -> None:
     """
     for each in problem.experiments:
         is_compared = (
-            each.markers.count_samples() or each.sensors_by_grasp or each.specimen is not None
+            each.markers.sample_count or each.sensors_by_grasp or each.specimen is not None
         )
         if not (each.validation or is_compared):
             raise InputError(

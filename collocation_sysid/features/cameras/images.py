@@ -87,8 +87,9 @@ class MeasuredPixels:
     columns: int
     rows: int
 
-    def compute_points_m(self) -> Array:
-        """Return the points (P, 3) in the camera's frame [m]."""
+    @property
+    def points_m(self) -> Array:
+        """Points (P, 3) in the camera's frame [m]."""
         rays = self.camera.points_at_unit_depth(self.pixels)
         return self.depth_m[:, None] * rays
 
@@ -118,7 +119,7 @@ def camera_image_hypotheses(
     """
     nuisance = NuisanceMap.from_experiment(experiment)
     for index, depth in enumerate(experiment.depths):
-        first = depth.find_first_sample_with_points()
+        first = depth.first_sample_with_points
         time_s = float(depth.sample_times_s[first])
         has_image = any(image is not None for image in depth.images_m)
         if not has_image or not _is_at_rest(experiment, time_s):
@@ -288,7 +289,7 @@ class _ImageComparison:
         """Return the best fit of a description of the image among all shapes; cached."""
         if image in self.known:
             return self.known[image]
-        cloud = ExactCloud(image.compute_points_m())
+        cloud = ExactCloud(image.points_m)
         rough = {
             index: self._fit_shape(cloud, index, iterations=ROUGH_ITERATIONS)
             for index in range(0, len(self.surfaces), STRIDE)

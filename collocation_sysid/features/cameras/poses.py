@@ -223,10 +223,8 @@ class _CameraTrial:
         self.skin = VisibleSurface.from_body(experiment.body, depth)
         self.pinhole = camera.matrix is not None
         self.shape_m = self.skin.initial_positions_m(experiment, depth)
-        points_m = depth.points_m[depth.find_first_sample_with_points()]
-        image_m = (
-            depth.images_m[depth.find_first_sample_with_points()] if len(depth.images_m) else None
-        )
+        points_m = depth.points_m[depth.first_sample_with_points]
+        image_m = depth.images_m[depth.first_sample_with_points] if len(depth.images_m) else None
         if len(points_m) < COLLAPSED and image_m is not None:
             points_m = points_from_image(image_m, camera)
         self.tree = KDTree(thinned(points_m))
@@ -234,7 +232,7 @@ class _CameraTrial:
         carrier = np.eye(4)
         if camera.poses is not None:
             rotations, translations = camera.poses.at(
-                depth.sample_times_s[[depth.find_first_sample_with_points()]]
+                depth.sample_times_s[[depth.first_sample_with_points]]
             )
             carrier[:3, :3] = rotations[0]
             carrier[:3, 3] = translations[0]

@@ -245,7 +245,7 @@ class _Trial:
 
     def _sagging_m(self, sag: float) -> Array:
         """Nodes (s, n, 3) of the body whose end sags by a share of its length from the grasp."""
-        down = -self.experiment.compute_upward_direction()
+        down = -self.experiment.upward_direction
         shape = sag * self.reach_m**2 / self.length_m
         return self._carried_m + shape[:, None] * down
 

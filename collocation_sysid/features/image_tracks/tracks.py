@@ -281,7 +281,7 @@ def stated_places(experiment: Experiment) -> dict[str, tuple[Array, float]]:
     if not markers.names:
         return places
     points_m = markers.predict_positions(experiment.body.nodes_m)
-    sigmas_m = experiment.compute_place_sigma_m()
+    sigmas_m = experiment.place_sigma_m
     for k in np.flatnonzero(markers.located).tolist():
         places.setdefault(markers.names[k], (points_m[k], float(sigmas_m[k])))
     return places

@@ -45,14 +45,14 @@ def stress_offset_notes(fit: LinearisedFit, experiments: Sequence[Experiment]) -
         k
         for k, block in enumerate(fit.blocks)
         if block.marker_names == (STRESS_NAME,)
-        and block.count_measurements()
+        and block.measurement_count
         and not any(
             name.startswith(f"{block.name}: stress_zero of {STRESS_NAME}") for name in fit.names
         )
     ]
     residual, slopes, columns = _stacked(fit, offsets)
-    measured = sum(block.count_measurements() for block in fit.blocks)
-    level = np.sqrt(fit.compute_chi_squared() / max(1, measured))
+    measured = sum(block.measurement_count for block in fit.blocks)
+    level = np.sqrt(fit.chi_squared / max(1, measured))
     count = len(offsets)
     priors = int(np.count_nonzero(fit.prior_jacobian))
     free = measured + priors - slopes.shape[1]

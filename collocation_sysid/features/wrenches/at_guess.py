@@ -65,30 +65,33 @@ class WrenchDeviation:
         """Beginning of messages about the wrench."""
         return f"the wrench of '{self.experiment}'"
 
-    def compute_rms_sigmas(self) -> float:
-        """Return the RMS deviation over all components, in standard deviations of the noise."""
+    @property
+    def rms_sigmas(self) -> float:
+        """RMS deviation over all components, in standard deviations of the noise."""
         return _rms(self.measured - self.simulated)
 
-    def compute_rms_n(self) -> float:
-        """Return the RMS deviation of the components of the force [N]; NaN if no force is measured."""
+    @property
+    def rms_n(self) -> float:
+        """RMS deviation of the components of the force [N]; NaN if no force is measured."""
         difference = (self.measured - self.simulated) * self.sigmas
         return _rms(difference[:, :3])
 
-    def compute_offset(self) -> Array:
-        """Return (6,) mean of measured minus simulated components [N, N m]; NaN where not measured."""
+    @property
+    def offset(self) -> Array:
+        """(6,) mean of measured minus simulated components [N, N m]; NaN where not measured."""
         return _column_means(self.measured - self.simulated) * self.sigmas
 
     def note(self) -> str:
         """Return a sentence with the deviation and its mean."""
         mean = ", ".join(
             f"{name} {value:+.3g} {unit}"
-            for name, value, unit in zip(COMPONENTS, self.compute_offset(), UNITS, strict=True)
+            for name, value, unit in zip(COMPONENTS, self.offset, UNITS, strict=True)
             if np.isfinite(value)
         )
-        force = f"{self.compute_rms_n():.3g} N RMS, " if np.isfinite(self.compute_rms_n()) else ""
+        force = f"{self.rms_n:.3g} N RMS, " if np.isfinite(self.rms_n) else ""
         return (
             f"{self.subject} deviates from the simulation at the guess by {force}"
-            f"{self.compute_rms_sigmas():.3g} standard deviations of its noise; mean of measured minus "
+            f"{self.rms_sigmas:.3g} standard deviations of its noise; mean of measured minus "
             f"simulated: {mean}"
         )
 
@@ -97,7 +100,7 @@ class WrenchDeviation:
         an offset that is the largest part of what remains; empty if the deviation is small, or if
         the wrench depends on the stiffness.
         """
-        if self.compute_rms_sigmas() < SMALLEST_MISFIT or not self.is_inertial:
+        if self.rms_sigmas < SMALLEST_MISFIT or not self.is_inertial:
             return []
         hypotheses: list[Hypothesis] = []
         corrected = self.measured

@@ -29,7 +29,7 @@ def simulated_hypotheses(check: SimulatedCheck) -> tuple[Sequence[Hypothesis], S
     unpredicted = {each.experiment for each in deviations}
     hypotheses: list[Hypothesis] = []
     has_both = any(
-        each.wrenches and each.markers.count_samples() for each in check.problem.experiments
+        each.wrenches and each.markers.sample_count for each in check.problem.experiments
     )
     fit_s = check.fit_s(CHECKED_SAMPLES) if has_both else 0.0
     if has_both and not check.is_full and fit_s > LONGEST_FIT_S:

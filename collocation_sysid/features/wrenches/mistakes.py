@@ -128,7 +128,7 @@ def wrench_causes(solution: Solution) -> list[Hypothesis]:
     if not any(map(_misses, solution.parts)):
         return []
     with_markers = [
-        s for s in solution.collocation.transcriptions if s.experiment.markers.count_samples()
+        s for s in solution.collocation.transcriptions if s.experiment.markers.sample_count
     ]
     estimated = {part.transcription.experiment.name: part for part in solution.parts}
     parts = _from_markers(
@@ -151,7 +151,7 @@ def wrench_mistakes(collocation: Collocation) -> tuple[list[Hypothesis], list[st
         s
         for s in collocation.transcriptions
         if s.experiment.wrenches
-        and s.experiment.markers.count_samples()
+        and s.experiment.markers.sample_count
         and not len(s.nuisance.indices_of_rows(*TOOL))
     ]
     shorter = [first_samples(s.experiment, CHECKED_SAMPLES) for s in with_both]
@@ -179,7 +179,7 @@ def _markers_misfit(part: ExperimentIterate) -> float:
     residuals = markers.residuals(positions, part.phi)
     return float(
         np.sqrt(
-            np.sum(residuals**2) / max(1, 3 * part.transcription.experiment.markers.count_samples())
+            np.sum(residuals**2) / max(1, 3 * part.transcription.experiment.markers.sample_count)
         )
     )
 

@@ -83,7 +83,7 @@ class SimdEvaluator:
         key = f"{lanes} {self._points} {hashlib.sha256(kernel.serialized.encode()).hexdigest()}"
         # What points carry adds the length of its row, its places and itself.
         signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
-        if kernel.count_point_data():
+        if kernel.point_data_count:
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         points = self._points
         build = partial(_emit_kernel, kernel, points, lanes)
@@ -144,7 +144,7 @@ class _PhaseLayout:
     def __init__(self, phase: Phase, first: int) -> None:
         self.sx = phase.pieces
         self.contractions = list(phase.contractions.values())
-        size = 3 * phase.count_nodes()
+        size = 3 * phase.node_count
         self.lengths = [self.sx.nnz_out(k) for k in range(self.sx.n_out())]
         self.pieces = np.cumsum([0, *self.lengths]).tolist()
         contracted = {"none": 1, "nodes": size / 9, "pairs": size * (size + 1) / 2 / 81}
@@ -184,7 +184,7 @@ class _KernelEmitter:
         self.points = points
         self.lanes = lanes
         self.vector = ir.VectorType(DOUBLE, lanes)
-        self.nodes = kernel.phases[0].count_nodes()
+        self.nodes = kernel.phases[0].node_count
         self.size = 3 * self.nodes
         # The kernel's own outputs come first among the totals.
         self.last = _PhaseLayout(kernel.phases[-1], 0)
@@ -202,7 +202,7 @@ class _KernelEmitter:
         self.coupling = kernel.coupling
         self.module = ir.Module()
         constants = [DOUBLES, I32S, I32S, DOUBLES, DOUBLES]
-        self.point_data_count = kernel.count_point_data()
+        self.point_data_count = kernel.point_data_count
         if self.point_data_count:
             constants += [I64, I32S, DOUBLES]
         kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)

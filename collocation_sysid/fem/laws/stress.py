@@ -38,7 +38,7 @@ Expression = Callable[[QuadraturePoint, PointLaw], ca.SX]
 def _stress_by_theta(point: QuadraturePoint, law: PointLaw) -> ca.SX:
     """Return ∂S by the material's constants and the logarithm of a field, column after column."""
     slope = point.jacobian(second_piola(point, law), point.stack_differentiated_constants())
-    of_field = slope[:, law.count_constants() :]
+    of_field = slope[:, law.constant_count :]
     return ca.vec(ca.horzcat(slope[:, : len(law.material.constants)], of_field))
 
 
@@ -332,9 +332,7 @@ class StressEvaluator:
             logs = width + np.repeat(np.arange(len(part.cells)), points)
             internal_columns = np.concatenate([internal_columns, logs[:, None, None]], axis=-1)
         internal_columns = (
-            internal_columns[..., : kernel.count_point_data()]
-            if kernel.count_point_data()
-            else None
+            internal_columns[..., : kernel.point_data_count] if kernel.point_data_count else None
         )
         return KernelBatch(
             kernel,

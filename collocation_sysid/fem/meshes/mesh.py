@@ -271,8 +271,9 @@ class TetMesh:
         """Volume of the whole mesh [m³]."""
         return float(self.volumes_m3.sum())
 
-    def compute_bounds_m(self) -> np.ndarray:
-        """Return the lowest and highest coordinates (2, 3) [m]."""
+    @property
+    def bounds_m(self) -> np.ndarray:
+        """Lowest and highest coordinates (2, 3) [m]."""
         return np.array([self.points_m.min(axis=0), self.points_m.max(axis=0)])
 
     @property

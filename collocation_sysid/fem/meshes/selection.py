@@ -411,9 +411,7 @@ def _indices_or_error(
     """Return the indices of a mask, or raise an `InputError` if it is false everywhere."""
     if not mask.any():  # no mid node lies beyond the corners
         missed = missed or f"selects none of the {len(mask)} {of}"
-        raise InputError(
-            f"{what} {missed}; the body spans {_describe_bounds(mesh.compute_bounds_m())}"
-        )
+        raise InputError(f"{what} {missed}; the body spans {_describe_bounds(mesh.bounds_m)}")
     return np.flatnonzero(mask).astype(np.int64)
 
 

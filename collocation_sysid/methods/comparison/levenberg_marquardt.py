@@ -87,7 +87,7 @@ def minimise_levenberg_marquardt(
     point = _MeritPoint.evaluate(merit, z)
     for count in range(max_iterations + 1):
         report(point.z, point.value, point.projected)
-        if point.compute_gradient_norm() <= tolerance:
+        if point.gradient_norm <= tolerance:
             return True
         if count == max_iterations:
             break
@@ -103,7 +103,7 @@ def minimise_levenberg_marquardt(
                 if predicted <= ROUNDING * abs(point.value):
                     # Values cannot judge this step any more; gradients can.
                     after = _MeritPoint.evaluate(merit, trial)
-                    if not after.compute_gradient_norm() <= point.compute_gradient_norm() / 2:
+                    if not after.gradient_norm <= point.gradient_norm / 2:
                         return False
                     ratio = 1.0
                     break
@@ -161,8 +161,9 @@ class _MeritPoint:
             projected=projected,
         )
 
-    def compute_gradient_norm(self) -> float:
-        """Return the largest entry of the projected gradient."""
+    @property
+    def gradient_norm(self) -> float:
+        """Largest entry of the projected gradient."""
         return float(np.abs(self.projected).max(initial=0.0))
 
 
@@ -260,7 +261,7 @@ class _QuadraticModel:
         positive definite.
 
         Each step stays within the bounds of its parameter, and is at most `REACH` times its entry
-        of `compute_reach_p`.
+        of `reach_p`.
         """
         try:
             factor = cholesky(schur, lower=True)
@@ -268,7 +269,7 @@ class _QuadraticModel:
             return None
         border = self.problem.parameter_indices
         problem = self.problem
-        reach = problem.nlp.compute_reach_p()
+        reach = problem.nlp.reach_p
         places = np.where(border < problem.nlp.nq, border, border - len(self.z) + len(reach))
         reach = REACH * reach[places]
         # Rounding may leave a parameter on its bound by a hair.

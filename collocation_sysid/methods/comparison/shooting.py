@@ -190,7 +190,7 @@ class _ShootingSearch:
         self.options = options
         self.recorder = recorder
         self.collocation = collocation = recorder.collocation
-        self.lower, self.upper = collocation.compute_parameter_bounds()
+        self.lower, self.upper = collocation.parameter_bounds
         first = collocation.guess_p if start is None else collocation.parameters_from(start)
         self.first = np.clip(first, self.lower, self.upper)
         self.simulations = self.failures = 0
@@ -230,7 +230,7 @@ class _ShootingSearch:
             self._residual_slope,  # pyright: ignore[reportArgumentType]
             (self.lower - self.first, self.upper - self.first),
             method="dogbox",
-            x_scale=self.collocation.compute_reach_p(),
+            x_scale=self.collocation.reach_p,
             xtol=self.options.tolerance,
             ftol=ROUNDING,
             gtol=self.options.tolerance,

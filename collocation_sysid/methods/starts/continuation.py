@@ -110,7 +110,7 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
         Number of samples; it is increased to three and to the first sample with a marker, and as in
         `shortened_experiment`, but not beyond the recording.
     """
-    first_visible = experiment.markers.find_first_visible_sample()
+    first_visible = experiment.markers.first_visible_sample
     count = max(count, first_visible + 1, FEWEST_SHARED_SAMPLES)
     return shortened_experiment(experiment, min(len(experiment.t_s), count))
 

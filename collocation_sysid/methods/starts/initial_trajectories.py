@@ -32,7 +32,7 @@ def associated_at_guess(collocation: Collocation) -> Collocation:
     the grasp. The given problem is not modified; it is returned itself if all positions are known.
     Every parameter must have a guess.
     """
-    if not any(transcription.count_rows_to_place() for transcription in collocation.transcriptions):
+    if not any(transcription.rows_to_place for transcription in collocation.transcriptions):
         return collocation
     p = collocation.guess_p
     positions = []
@@ -191,5 +191,5 @@ def rigid_trajectory(transcription: Transcription, theta: Array) -> Array:
     shape = (x0.reshape(-1, 3) - translations[0]) @ rotations[0]  # in the grasp's frame
     positions = np.einsum("tij,nj->tni", rotations, shape) + translations[:, None]
     return transcription.with_prescribed_positions(
-        positions.reshape(len(t_s), -1), transcription.compute_guess_phi()
+        positions.reshape(len(t_s), -1), transcription.guess_phi
     )

@@ -143,7 +143,7 @@ def start_problem(
     usual = typical_parameters(collocation.parameters, SOFT_PA)
     if (of_memory := memory_start(collocation, usual)) is not None:
         return collocation.with_parameters(of_memory), None, ""
-    unguessed = collocation.parameters.list_names_without_guess()
+    unguessed = collocation.parameters.names_without_guess
     start = power_law_start(collocation) if unguessed else None
     if start is not None:
         usual = typical_parameters(start.parameters, start.young_pa)
@@ -445,7 +445,7 @@ def _compared_samples(transcription: Transcription, share: float) -> int:
     at least one sample of each measurement; at most all.
     """
     t_s = transcription.experiment.t_s
-    first_samples = [transcription.experiment.markers.find_first_visible_sample()]
+    first_samples = [transcription.experiment.markers.first_visible_sample]
     first_samples += [
         int(np.searchsorted(t_s, residual.first_needed_s)) + residual.observable.delay_steps
         for residual in transcription.residuals

@@ -329,7 +329,7 @@ def _aligned_parameters(camera: DepthCameraModel, body: Body, shapes_m: Array, p
     that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
     prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
     """
-    first = camera.depth.find_first_sample_with_points()
+    first = camera.depth.first_sample_with_points
     surface = VisibleSurface.from_body(body, camera.depth)
     turn, shift_m = align_camera(camera, surface, x=shapes_m[first], image=first)
     moved = camera.with_pose(phi, turn, shift_m=shift_m)

@@ -70,9 +70,9 @@ class VisibleSurface:
         """Return the node positions (n, 3) of the undeformed body in its grasps at the
         camera's first image with points [m].
         """
-        return experiment.rigid_positions(
-            depth.sample_times_s[[depth.find_first_sample_with_points()]]
-        )[0, self.nodes]
+        return experiment.rigid_positions(depth.sample_times_s[[depth.first_sample_with_points]])[
+            0, self.nodes
+        ]
 
     @property
     def plane_triangles(self) -> Index:

@@ -297,7 +297,7 @@ class ActiveDofs:
         """
         numbers = [
             np.where(
-                np.tile(each.find_axes(), each.candidates.nodes.shape[1]),
+                np.tile(each.axes, each.candidates.nodes.shape[1]),
                 number[each.candidates.dofs[each.indices]],
                 -1,
             )

@@ -133,7 +133,7 @@ def continue_simulation(
     x[:done] = known
     # Total force at every evaluation so far.
     forces, previous_histories = forces_and_histories(dynamics, x, row_count=done)
-    intervals = dynamics.compute_intervals_to_next_s()
+    intervals = dynamics.intervals_to_next_s
     guesses: list[Array] = []
     nearest = 1  # guess that missed least at the row before
     for t in range(done, dynamics.row_count):
@@ -259,9 +259,7 @@ class RowEquations(StepEquations):
         self.forces = at_times(dynamics.forces, slice(t, t + 1))
         if previous:
             self.forces = insert_previous_states(
-                self.forces,
-                previous,
-                interval_s=float(dynamics.compute_intervals_to_next_s()[t - 1]),
+                self.forces, previous, interval_s=float(dynamics.intervals_to_next_s[t - 1])
             )
         self.rest = self.forces.without_local_forces()
         self.rest_before = (

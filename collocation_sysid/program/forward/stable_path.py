@@ -85,7 +85,7 @@ def find_branch_change(experiment: Experiment, dynamics: Dynamics, x: Array) -> 
     solvers = NewtonSolvers(experiment)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     forces, previous = forces_and_histories(dynamics, x, row_count=1)
-    intervals = dynamics.compute_intervals_to_next_s()
+    intervals = dynamics.intervals_to_next_s
     for t in range(len(x)):
         solver = solvers.for_prescribed(is_prescribed[t])
         time_s = float(dynamics.t_s[t])

@@ -152,7 +152,7 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
     """
     has_sensors = any(len(s.sensed_dofs) for s in collocation.transcriptions)
     has_complementarity = any(
-        s.dynamics.forces.find_complementarity_terms() for s in collocation.transcriptions
+        s.dynamics.forces.complementarity_terms for s in collocation.transcriptions
     )
     if isinstance(collocation, LiftedCollocation) or not (
         collocation.has_eliminated_histories or has_sensors or has_complementarity
@@ -239,8 +239,8 @@ def lift_variables(
             add(LiftedMemory, reactions=reactions)
         forces = transcription.dynamics.forces
         of_forces = [
-            *((LiftedForceHistory, k) for k in forces.find_terms_with_internal_variables()),
-            *((LiftedPressure, k) for k in forces.find_complementarity_terms()),
+            *((LiftedForceHistory, k) for k in forces.terms_with_internal_variables),
+            *((LiftedPressure, k) for k in forces.complementarity_terms),
         ]
         for history, (kind, k) in enumerate(of_forces, int(transcription.body.has_memory)):
             add(kind, motion_history=history, force_index=k, reactions=reactions)

@@ -128,7 +128,7 @@ class ExpressionPattern:
             _at_evaluations(input_indices, before),
             constants,
         ]
-        size = recursion.state_size + recursion.compute_input_offsets()[-1]
+        size = recursion.state_size + recursion.input_offsets[-1]
         return cls.from_arrays(
             GeneratedFunction(gap, size, data_size=recursion.data_size),
             data,

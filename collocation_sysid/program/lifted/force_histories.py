@@ -132,9 +132,7 @@ class LiftedForceHistory(LiftedVariables):
         dynamics = self.transcription.dynamics
         times = np.arange(first, first + self.shape[1])
         q = dynamics.tables.q / dynamics.step_s
-        for lag, (of_p, of_q) in enumerate(
-            zip(dynamics.compute_state_weights().T, q.T, strict=True)
-        ):
+        for lag, (of_p, of_q) in enumerate(zip(dynamics.state_weights.T, q.T, strict=True)):
             used = (times >= lag) & ((of_p[times] != 0) | (of_q[times] != 0))
             if used.any():
                 here = slice(int(used.argmax()), len(used))
@@ -227,7 +225,7 @@ class LiftedForceHistory(LiftedVariables):
         length_m = self.transcription.length_m
         d = self._points.dofs
         slopes = history.derivatives(slice(None))
-        places = history.find_input_columns()
+        places = history.input_columns
         by = LawDerivatives(*(-each[d:, :, :-1] / length_m for each in slopes))
         blocks = [np.ones(self.count), length_m * by.b[:, :, 1:]]
         blocks += [length_m * each for each in self._position_derivatives(0, by)]
@@ -260,7 +258,7 @@ class LiftedForceHistory(LiftedVariables):
         history, mu = self.weighted_history(iterate, multipliers)
         assert isinstance(history, ForceHistory)
         length_m = self.transcription.length_m
-        places = history.find_input_columns()
+        places = history.input_columns
         second_derivatives = history.mixed_second_derivatives(mu, weights.forces)
         first = self.first_evaluation
         by = LawDerivatives(*(self.unit_m * each[:, :, first:] for each in second_derivatives))

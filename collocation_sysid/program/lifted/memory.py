@@ -174,9 +174,7 @@ class LiftedMemory(LiftedVariables):
     @cached_property
     def _stress_lags(self) -> list[_Lag]:
         """Lags of S_k by x_{k−lag}; the last evaluation has no equation."""
-        return self._nonzero_lags(
-            self.transcription.dynamics.compute_state_weights(), 0, stop=self.shape[0]
-        )
+        return self._nonzero_lags(self.transcription.dynamics.state_weights, 0, stop=self.shape[0])
 
     @cached_property
     def _state_lags(self) -> list[_Lag]:
@@ -279,8 +277,8 @@ class LiftedMemory(LiftedVariables):
     def entry_counts(self) -> tuple[int, int]:
         """Numbers of additional entries of Jacobian and Hessian, computed without index arrays."""
         groups = self._jacobian_blocks(), self._hessian_blocks()
-        return sum(each.count_entries() for each in groups[0]), sum(
-            each.count_entries() for each in groups[1]
+        return sum(each.entry_count for each in groups[0]), sum(
+            each.entry_count for each in groups[1]
         )
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:

@@ -19,8 +19,9 @@ class EntryBlock(NamedTuple):
     rows: Sequence[Index | int]  # summands of the row indices
     columns: Sequence[Index | int]  # summands of the column indices
 
-    def count_entries(self) -> int:
-        """Return the number of entries: the size of the broadcast arrays."""
+    @property
+    def entry_count(self) -> int:
+        """Number of entries: the size of the broadcast arrays."""
         return int(np.prod(np.broadcast_shapes(*map(np.shape, (*self.rows, *self.columns)))))
 
     def indices(self) -> tuple[Index, Index]:

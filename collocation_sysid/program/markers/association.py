@@ -70,7 +70,7 @@ class MarkerAssociation:
         body = experiment.body
         markers = experiment.markers
         placement = markers.placement
-        sigma_m = experiment.compute_place_sigma_m()
+        sigma_m = experiment.place_sigma_m
         points = markers.predict_positions(body.nodes_m)
         k = 2 if markers.on_surface else 3
         association = cls(
@@ -118,7 +118,7 @@ class MarkerAssociation:
         return (
             self.body is experiment.body
             and self.on_surface == experiment.markers.on_surface
-            and np.array_equal(self.sigma_m, experiment.compute_place_sigma_m())
+            and np.array_equal(self.sigma_m, experiment.place_sigma_m)
         )
 
     @cached_property

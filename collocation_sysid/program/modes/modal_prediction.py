@@ -167,7 +167,7 @@ class ModalResponse:
         ).only_loads()
         modes = natural_modes(forces, body.nodes_m, free_dofs=experiment.free_dofs, count=MODES)
         weighted = modes.shapes * forces.mass.inertia_kg[0, ::3, None]
-        omega = modes.compute_angular_frequencies_rad_s()
+        omega = modes.angular_frequencies_rad_s
         return cls(
             markers.predict_positions(body.nodes_m),
             omega / omega[:1],

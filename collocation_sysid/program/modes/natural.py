@@ -42,8 +42,9 @@ class Modes:
     # without grasp, and those in which a state is unstable.
     omitted_count: int = 0
 
-    def compute_angular_frequencies_rad_s(self) -> Array:
-        """Return the undamped angular frequencies ω (k,) [rad/s]."""
+    @property
+    def angular_frequencies_rad_s(self) -> Array:
+        """Undamped angular frequencies ω (k,) [rad/s]."""
         return 2 * np.pi * self.frequencies_hz
 
 

@@ -217,8 +217,9 @@ class ReactionResultant:
             is_prescribed=np.isin(own, grasp.prescribed_dofs).astype(np.float64),
         )
 
-    def compute_clock_limit_s(self) -> float:
-        """Return the largest shift of the sensor's clock [s]; 0 if it is not estimated."""
+    @property
+    def clock_limit_s(self) -> float:
+        """Largest shift of the sensor's clock [s]; 0 if it is not estimated."""
         clock = self.parameter_indices(SENSOR_TIME)
         return float(SENSOR_TIME.high * self.nuisance.scales[clock].sum())
 
@@ -502,9 +503,7 @@ class ReactionResultant:
 
 def sensed_dofs(experiment: Experiment) -> Index:
     """Return the dofs (g,) of the nodes of all grasps that a sensor measures, ascending."""
-    grasp_dofs = [
-        dofs_of(experiment.grasps[k].nodes) for k in experiment.find_instrumented_grasps()
-    ]
+    grasp_dofs = [dofs_of(experiment.grasps[k].nodes) for k in experiment.instrumented_grasps]
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *grasp_dofs]))
 
 

@@ -69,8 +69,9 @@ class LogFrames:
                         edges[edge] = of
         return cls(address.log.name, edges)
 
-    def list_names(self) -> list[str]:
-        """Return the names of the frames, each once."""
+    @property
+    def names(self) -> list[str]:
+        """Names of the frames, each once."""
         return list(dict.fromkeys(name for edge in self.edges for name in edge))
 
     def is_connected(self, parent: str, child: str) -> bool:
@@ -100,7 +101,7 @@ class LogFrames:
         """Names of the other frames that static transforms connect with a frame."""
         return [
             name
-            for name in self.list_names()
+            for name in self.names
             if name != frame and self.static_transform(frame, name) is not None
         ]
 

@@ -54,11 +54,7 @@ def all_pictures(
     truth : mapping, optional
         True values of all estimated parameters by name, see `convergence`; unknown by default.
     """
-    names = [
-        n
-        for n, item in result.parameters.items()
-        if not item.fixed and n in result.collect_estimates()
-    ]
+    names = [n for n, item in result.parameters.items() if not item.fixed and n in result.estimates]
     pictures = (
         {"convergence": convergence(result.history, names, truth=truth)} if result.history else {}
     )

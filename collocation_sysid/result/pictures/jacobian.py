@@ -105,9 +105,7 @@ def _first_steps(collocation: Collocation, z: Array) -> tuple[Collocation, Array
         for transcription in collocation.transcriptions
     ]
     short = replace(collocation, experiments=few, associations={})
-    p = np.concatenate(
-        [z[: collocation.nq], *(s.compute_guess_phi() for s in short.transcriptions)]
-    )
+    p = np.concatenate([z[: collocation.nq], *(s.guess_phi for s in short.transcriptions)])
     pairs = zip(collocation.iterates(z), short.transcriptions, strict=True)
     return short, short.pack(
         p, [part.x[: transcription.grid_times] for part, transcription in pairs]

@@ -140,8 +140,9 @@ class CheckResult(QuickCheck):
     # Expected problems, with the remedy; `warnings` are their sentences.
     concerns: tuple[Concern, ...] = ()
 
-    def find_chosen_cost(self) -> MethodCost | None:
-        """Return the cost of the chosen method; None if it is not known."""
+    @property
+    def chosen_cost(self) -> MethodCost | None:
+        """Cost of the chosen method; None if it is not known."""
         return next((cost for cost in self.costs if cost.method == self.method), None)
 
     @property
@@ -229,7 +230,7 @@ def check_problem(
     lost = [note for each in problem.experiments for note in lost_samples(each)]
     collocation = problem.collocation()
     notes = []
-    if problem.parameters.list_names_without_guess():
+    if problem.parameters.names_without_guess:
         report_progress("searching for initial values, because no guess is given")
         collocation, scan, note = start_problem(collocation)
         problem = replace(problem, parameters=collocation.parameters)
@@ -299,7 +300,7 @@ def check_problem(
         *at_guess,
     )
     notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
-    chosen_cost = findings.find_chosen_cost()
+    chosen_cost = findings.chosen_cost
     notes += cost_notes(chosen_cost, findings.costs) if chosen_cost else []
     if simulated is first:
         notes.append(
@@ -376,7 +377,7 @@ def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> d
         positions_m[part.transcription.experiment.name] = at_samples.reshape(len(at_samples), -1, 3)
     shared_fields = _quick_fields(problem, positions_m)
     recordings = shared_fields["recordings"]
-    distances_m = [r.find_farthest_marker().distance_m for r in recordings if r.markers]
+    distances_m = [r.farthest_marker.distance_m for r in recordings if r.markers]
     return shared_fields | {
         "experiments": len(recordings),
         "samples": sum(recording.samples for recording in recordings),
@@ -443,7 +444,7 @@ def _concerns(
     experiments = problem.experiments
     parameters = problem.parameters
     bodies = findings.bodies
-    chosen = findings.find_chosen_cost()
+    chosen = findings.chosen_cost
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
         *(cause.concern() for cause in (*findings.causes, *copied_measurements(experiments))),

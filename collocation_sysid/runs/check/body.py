@@ -255,7 +255,7 @@ def check_body(
     quality = mesh.quality()
     worst = worst_elements(mesh)
     shape = slenderness(mesh)
-    x, y, z = np.ptp(mesh.compute_bounds_m(), axis=0).tolist()
+    x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
     return BodyCheck(
         experiments,
         nodes=len(body.nodes.points_m),
@@ -326,7 +326,7 @@ def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
         young, poisson = engineering_constants(*lame)
         moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
     constants = zip(body.constants, theta.tolist(), strict=True)
-    coefficients = body.list_field_coefficient_names()
+    coefficients = body.field_coefficient_names
     return moduli | {name: value for name, value in constants if name not in coefficients}
 
 

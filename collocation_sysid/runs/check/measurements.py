@@ -60,12 +60,14 @@ class RecordingCheck:
     # nearest to their first sample, so that their distance says nothing about the poses.
     unplaced: int = 0
 
-    def find_farthest_marker(self) -> MarkerCheck:
-        """Return the marker farthest from the body; `ValueError` without markers."""
+    @property
+    def farthest_marker(self) -> MarkerCheck:
+        """Marker farthest from the body; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.distance_m)
 
-    def find_most_missing_marker(self) -> MarkerCheck:
-        """Return the marker with most samples missing; `ValueError` without markers."""
+    @property
+    def most_missing_marker(self) -> MarkerCheck:
+        """Marker with most samples missing; `ValueError` without markers."""
         return max(self.markers, key=lambda marker: marker.missing)
 
 
@@ -84,7 +86,7 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
         apart_m = markers.predict_positions(positions_m) - markers.positions_m[: len(positions_m)]
         miss = np.sqrt(np.nansum(apart_m**2, axis=2))
     findings = []
-    missing = markers.count_missing()
+    missing = markers.missing_count
     for k, name in enumerate(markers.names):
         present = np.flatnonzero(markers.is_present[:, k])
         findings.append(
@@ -107,7 +109,7 @@ def check_recording(experiment: Experiment, positions_m: Array | None) -> Record
         duration_s=experiment.duration_s,
         rate_hz=1 / experiment.timestep_s,
         frames=max(frames, default=len(experiment.t_s)),
-        samples=markers.count_samples(),
+        samples=markers.sample_count,
         missing=int(missing.sum()),
         markers=tuple(findings),
         instruments=tuple(moduli)
@@ -150,8 +152,8 @@ def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Conce
         named = {"marker": marker.name, "experiment": recording.experiment}
         return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
 
-    farthest = recording.find_farthest_marker()
-    most_missing = recording.find_most_missing_marker()
+    farthest = recording.farthest_marker
+    most_missing = recording.most_missing_marker
     worst = max(recording.markers, key=lambda marker: marker.start_miss_m or 0.0)
     unseen = most_missing.samples == 0
     missing = not unseen and most_missing.missing > LARGEST_MISSING_SHARE * recording.frames

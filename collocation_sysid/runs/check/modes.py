@@ -106,7 +106,7 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
     findings = _mode_findings(modes, experiment, scheme=scheme, step_s=step_s)
     needed = None
     if findings:
-        omega = float(modes.compute_angular_frequencies_rad_s()[0])
+        omega = float(modes.angular_frequencies_rad_s[0])
         limit = _damping_limit(findings[0])
         ratio = _oscillating_damping_ratio(findings[0].damping_ratio)
         needed = substeps_needed(

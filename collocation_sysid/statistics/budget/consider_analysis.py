@@ -200,22 +200,17 @@ def changes_of_nuisances(
     wider = [with_added_nuisances(experiment) for experiment in collocation.experiments]
     wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
-    values = dict(zip(collocation.list_parameter_names(), p.tolist(), strict=True))
-    at = wide.pack(
-        np.array([values.get(name, 0.0) for name in wide.list_parameter_names()]), positions
-    )
+    values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
+    at = wide.pack(np.array([values.get(name, 0.0) for name in wide.parameter_names]), positions)
     new = np.array(
-        [k for k, name in enumerate(wide.list_parameter_names()) if name not in values],
-        dtype=np.int64,
+        [k for k, name in enumerate(wide.parameter_names) if name not in values], dtype=np.int64
     )
     if not len(new):
         return ResidualChanges((), [])
     names: dict[int, str] = {}
     for transcription in wide.transcriptions:
         own = zip(
-            transcription.list_parameter_indices()[wide.nq :],
-            transcription.nuisance.entries,
-            strict=True,
+            transcription.parameter_indices[wide.nq :], transcription.nuisance.entries, strict=True
         )
         names |= {int(place): entry.row.name for place, entry in own}
     blocks = [block.jacobian[..., new] for block in linearise_fit(wide, at).blocks]
@@ -252,7 +247,7 @@ def changed_residuals(
     ResidualChanges
         Not multiplied by Huber's weights.
     """
-    names = tuple(name for row, _ in assumptions for name in row.list_components())
+    names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
     for part in collocation.iterates(z):
         at = ExperimentAtAnswer(
@@ -261,7 +256,7 @@ def changed_residuals(
         effects = [
             (_effect_of(row, at, axis), sigma)
             for row, sigma in assumptions
-            for axis in range(len(row.list_components()))
+            for axis in range(len(row.components))
         ]
         changes += _changes_by_effects(at, effects)
     return ResidualChanges(names, changes)

@@ -70,7 +70,7 @@ def memory_forces_n(
         body, dynamics.theta, relaxation_times_s=relaxation_times_s
     )
     positions, velocities = dynamics.all_evaluation_states(x)
-    intervals_s = dynamics.compute_intervals_to_next_s()
+    intervals_s = dynamics.intervals_to_next_s
     state = MemoryState.at_start(remembering, positions[0], theta, loaded_s=dynamics.loaded_since_s)
     for row, position in enumerate(positions):
         if row:

@@ -84,7 +84,7 @@ def other_section(mesh: TetMesh, points_m: Array) -> OtherSection | None:
     how points (n, 3) of the mesh move with it, by the elliptical map of a square to a disc; None for
     other bodies. The longest extent is along an axis of the coordinates.
     """
-    low, high = mesh.compute_bounds_m()
+    low, high = mesh.bounds_m
     extents = high - low
     along = int(extents.argmax())
     across = [axis for axis in range(3) if axis != along]

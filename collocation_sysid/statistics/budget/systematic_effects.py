@@ -313,15 +313,16 @@ class ExperimentAtAnswer:
             - self.body.tied_damping_rate(self.theta) * self.states[1]
         )
 
-    def compute_buoyancy_n(self) -> Array:
-        """Return the buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
+    @property
+    def buoyancy_n(self) -> Array:
+        """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
         lifted = -self.dynamics.mass.displaced_kg * self.dynamics.forces.weight.gravity
         return np.broadcast_to(lifted, self.iterate.x.shape)
 
     @cached_property
     def air_drag_n(self) -> Array:
         """Drag of the air (N, 3n) in the model [N]; zero in a vacuum and where nothing moves."""
-        term = self.dynamics.forces.find_air_drag()
+        term = self.dynamics.forces.air_drag
         if term is None:
             return np.zeros_like(self.states[1])
         drag = term.force(States(*self.states, self.theta))
@@ -430,7 +431,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
             transcription.prescribed_motion.dofs, obstacle.prescribed_dofs
         )
         displacement_m[:, obstacle_dofs] = np.tile(shift_m, len(obstacle.nodes))
-    air = 3.0 * at.compute_buoyancy_n() + 2.0 * at.air_drag_n
+    air = 3.0 * at.buoyancy_n + 2.0 * at.air_drag_n
     return Effect(
         force + heavier + at.weight_and_drag(mass) + air,
         mass + 3.0 * at.dynamics.mass.added_kg,
@@ -643,7 +644,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
     behind its frame.
 
     Each grasp that is moved along an axis lags behind by the force of the specimen along it, which
-    is `Experiment.find_symmetry` times that of the modelled part; the part takes the share
+    is `Experiment.symmetry` times that of the modelled part; the part takes the share
     `Grasp.displacement_scale` of it. Specimens are treated by
     `_machine_of_specimen`.
     """
@@ -662,7 +663,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
             if driven[here].any():
                 force_n = at.grasp_force_n[:, here].sum(axis=1, keepdims=True)
                 displacement_m[:, here] = -grasp.displacement_scale * force_n
-    return Effect(displacement_m=experiment.find_symmetry() * displacement_m)
+    return Effect(displacement_m=experiment.symmetry * displacement_m)
 
 
 def _machine_of_specimen(
@@ -771,7 +772,7 @@ def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
-    return Effect(at.compute_buoyancy_n()) if at.dynamics.mass.added_kg.any() else None
+    return Effect(at.buoyancy_n) if at.dynamics.mass.added_kg.any() else None
 
 
 def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -1284,8 +1285,9 @@ class Assumptions:
             by_name[name] = defaults[name] if known is None else None if known == "none" else known
         return by_name
 
-    def collect_means(self) -> dict[str, float]:
-        """Return the known effects by name, the mean of each over its standard deviation; other
+    @property
+    def means(self) -> dict[str, float]:
+        """Known effects by name, the mean of each over its standard deviation; other
         assumptions are omitted.
         """
         return {

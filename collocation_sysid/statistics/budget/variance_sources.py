@@ -180,7 +180,7 @@ class VarianceSources:
         free = np.flatnonzero(~fit.at_bound)
         shared = free[free < fit.shared_count]
         all_free, known = (np.zeros((fit.shared_count, fit.shared_count)) for _ in range(2))
-        information = least_squares_of_fit(fit).compute_information()
+        information = least_squares_of_fit(fit).information
         for own, here in ((all_free, free), (known, shared)):
             inverse = np.linalg.pinv(information[np.ix_(here, here)], hermitian=True)
             own[np.ix_(shared, shared)] = inverse[: len(shared), : len(shared)]

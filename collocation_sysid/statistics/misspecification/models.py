@@ -221,7 +221,7 @@ def screened_bodies(
     found: list[tuple[float, Hypothesis]] = []
     first = 1
     for row in rows:
-        own = range(first, first + len(row.list_components()))
+        own = range(first, first + len(row.components))
         first = own.stop
         decrease, amplitudes = linear_step(gram, own, np.ones(len(own)) if row.is_whole else None)
         if is_far and row.name == "law":
@@ -256,7 +256,7 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
     if amplitude < least:
         return
     decrease, _ = linear_step(gram, [1], np.array([amplitude]))
-    sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.count_measurements()))
+    sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.measurement_count))
     if decrease > LEAST_DECREASE and sigmas > LEAST_SIGMAS:
         linear = any(body.element.name == "tet4" for body in bodies)
         data = {

@@ -121,14 +121,14 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     markers = experiment.markers
     body = experiment.body
     places_m = markers.predict_positions(experiment.rigid_positions(experiment.t_s))
-    size_m = float(np.linalg.norm(np.ptp(body.mesh.compute_bounds_m(), axis=0)))
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
 
     def remaining_misfit(tracks_m: Array) -> float:
         """Return the median distance [m] from the rigid positions, with a floor."""
         distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
         return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
-    if markers.count_samples():
+    if markers.sample_count:
         trial = HypothesisTest(
             remaining_misfit(markers.positions_at_samples_m),
             remaining_misfit,

@@ -60,7 +60,7 @@ def size_and_density_hypotheses(body: Body) -> tuple[Hypothesis, ...]:
     A strength of 1 or less is plausible. The density is the mass of the body over the volume of the
     mesh.
     """
-    size_m = float(np.linalg.norm(np.ptp(body.mesh.compute_bounds_m(), axis=0)))
+    size_m = float(np.linalg.norm(np.ptp(body.mesh.bounds_m, axis=0)))
     density_kg_m3 = body.mass_kg / body.mesh.volume_m3
     little_m, much_m = SIZES_M
     thin, dense = DENSITIES_KG_M3

@@ -494,7 +494,7 @@ class _Refitter:
             return None
         p = changed.guess_p
         phi = dict(zip(part.transcription.nuisance.names, part.phi.tolist(), strict=True))
-        names = changed.list_parameter_names()[changed.nq :]
+        names = changed.parameter_names[changed.nq :]
         p[changed.nq :] = [
             phi.get(n, guess) for n, guess in zip(names, p[changed.nq :], strict=True)
         ]
@@ -589,7 +589,7 @@ def _lag_s(fitted: Solution) -> float:
         for each, values in pairs
         if isinstance(values, np.ndarray) and len(values) > 1
     ]
-    if experiment.markers.count_samples():
+    if experiment.markers.sample_count:
         numbers = [pair for pair in numbers if pair[0] is experiment.markers]
     lagged = moved = 0.0
     for each, values in numbers:

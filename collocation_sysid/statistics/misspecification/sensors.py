@@ -69,7 +69,7 @@ def sensor_hypotheses(
         if misfit > least_misfit
         and (
             isinstance(each, CustomSensor)
-            or (isinstance(each, Wrench) and not experiment.markers.count_samples())
+            or (isinstance(each, Wrench) and not experiment.markers.sample_count)
         )
     ]
     if not missed:

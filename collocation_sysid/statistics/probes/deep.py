@@ -140,7 +140,7 @@ def _part_probe(
     at: SolvedFit, kind: Kind, name: str, alone: LinearisedFit, step: Array
 ) -> Iterator[Probe]:
     """Yield the probe of a part of the data, unless it has fewer measurements than parameters."""
-    if alone.count_measurements() <= len(alone.names):
+    if alone.measurement_count <= len(alone.names):
         return
     uncertainty = at.uncertainty_of_refit(
         alone, at.read_parameters()[: alone.shared_count] + step[: alone.shared_count]

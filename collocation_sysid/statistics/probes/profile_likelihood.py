@@ -293,7 +293,7 @@ class Refits:
         fixed = self._fixed(near, at)
         p, positions = fixed.unpack(z)
         p = p + np.delete(self._changes, self._k) * (at - before)
-        p = np.clip(p, *fixed.compute_parameter_bounds())
+        p = np.clip(p, *fixed.parameter_bounds)
         with search_activity(f"profile likelihood of {self.item.name}, value {len(self._known)}"):
             # Short parts of the recording are not fitted before: they would leave the minimum.
             refit = ReducedSpace(ladder=(1.0,))(fixed, start=fixed.pack(p, positions))

@@ -251,7 +251,7 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
         "assumption", name, chi_squared=decrease, moves=fit.changes_of_estimates(uncertainty)
     )
     probe = replace(probe, size=float(unit * own[worst]), size_error=float(unit * errors[worst]))
-    excess = stated - fit.fit.count_measurements()
+    excess = stated - fit.fit.measurement_count
     suffices = _are_noise(uncertainty) or decrease >= SUFFICIENT * excess
     return replace(probe, relevance=relevance(fit, probe), suffices=suffices)
 

@@ -308,7 +308,7 @@ def analyse_dependence(fit: LinearisedFit, information: Information) -> Dependen
     Without consecutive samples `lag1` is 0 with an infinite deviation. Huber's weights are those of
     the residuals of the fit.
     """
-    if fit.compute_chi_squared() <= ROUNDING**2 * fit.count_measurements():
+    if fit.chi_squared <= ROUNDING**2 * fit.measurement_count:
         return Dependence(0.0, np.inf, shared_p=1.0)
     pairs = zip(fit.blocks, information.scaled_jacobians, strict=True)
     tested = (each for each in pairs if not each[0].has_noise_floor)

@@ -128,7 +128,7 @@ def _diagnose_marker(
         experiment=block.name,
         marker=block.marker_names[marker],
         samples=samples,
-        wild=int(block.find_outliers()[:, marker].sum()),
+        wild=int(block.outliers[:, marker].sum()),
         rms_m=_rms_m(block, marker),
         noise_factor=level.factors[name],
         offset_m=mean,

@@ -76,8 +76,9 @@ class NoiseLevel:
         """Standard deviation of the errors of each marker over σ, by the marker's name."""
         return dict(zip(self.names, np.sqrt(self.variances).tolist(), strict=True))
 
-    def compute_unevenness(self) -> float:
-        """Return the factor by which unequal markers increase the standard deviation of a mean over
+    @property
+    def unevenness(self) -> float:
+        """Factor by which unequal markers increase the standard deviation of a mean over
         all of them; 1 if they are equal.
         """
         if not self.is_unequal():
@@ -177,7 +178,7 @@ def _prior_score_covariance(block: ResidualBlock, slope: Array) -> Array:
     """Return DᵀD (r, r) times the mean square of residuals, at least once."""
     rows = slope.reshape(slope.shape[0] * slope.shape[1], slope.shape[2])
     share = rows.T @ rows
-    degrees_of_freedom = max(1.0, block.count_measurements() - float(np.trace(share)))
+    degrees_of_freedom = max(1.0, block.measurement_count - float(np.trace(share)))
     factor = max(
         1.0, float(np.sum(block.residual**2)) / shortened_power(block) / degrees_of_freedom
     )
@@ -306,7 +307,7 @@ def shortened_power(block: ResidualBlock) -> float:
 
     It is E min(χ², k²) / E χ² for three axes and the largest shortened residual k.
     """
-    if not block.find_outliers().any():
+    if not block.outliers.any():
         return 1.0
-    squared = float(np.sum(block.residual[block.find_outliers()] ** 2, axis=1).max())
+    squared = float(np.sum(block.residual[block.outliers] ** 2, axis=1).max())
     return float(squared * chi2_sf(squared, 3) / 3 + chi2_cdf(squared, 5))

@@ -64,8 +64,9 @@ class RecordingComparison:
     # standard deviation between recordings; column n k + e for parameter k and recording e, from 0.
     sensitivities: Array
 
-    def compute_chi_squared(self) -> Array:
-        """Return χ² of the disagreement on each parameter (nq,); recordings that do not determine
+    @property
+    def chi_squared(self) -> Array:
+        """χ² of the disagreement on each parameter (nq,); recordings that do not determine
         it (NaN) are left out.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -73,8 +74,9 @@ class RecordingComparison:
             mean = np.nansum(weight * self.differences, axis=0) / weight.sum(axis=0)
         return np.nansum(weight * np.nan_to_num(self.differences - mean) ** 2, axis=0)
 
-    def count_degrees_of_freedom(self) -> NDArray[np.int64]:
-        """Return the degrees of freedom (nq,) of χ²: the number of recordings that determine the
+    @property
+    def degrees_of_freedom(self) -> NDArray[np.int64]:
+        """Degrees of freedom (nq,) of χ²: the number of recordings that determine the
         parameter, less one, at least 0.
         """
         return np.maximum(np.isfinite(self.deviations).sum(axis=0) - 1, 0)
@@ -83,8 +85,8 @@ class RecordingComparison:
         """Return the mask (nq,) of the parameters on which the recordings disagree more than by
         chance: p-value of χ² below `SIGNIFICANT` over the number of parameters.
         """
-        freedom = self.count_degrees_of_freedom()
-        p = chi2_sf(self.compute_chi_squared(), np.maximum(freedom, 1))
+        freedom = self.degrees_of_freedom
+        p = chi2_sf(self.chi_squared, np.maximum(freedom, 1))
         return np.asarray((freedom > 0) & (p < SIGNIFICANT / len(freedom)))
 
     def widen(self, variances: Array) -> Array:
@@ -92,7 +94,7 @@ class RecordingComparison:
         recordings disagree: to χ²/f times the lesser of the variance and that of the mean of the
         recordings, if that is more. The argument is not modified.
         """
-        ratio = self.compute_chi_squared() / np.maximum(self.count_degrees_of_freedom(), 1)
+        ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
         with np.errstate(invalid="ignore", divide="ignore"):
             of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
             enough = np.maximum(variances, ratio * np.minimum(variances, of_all))
@@ -192,11 +194,11 @@ def compare_recordings(
 def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
     """Return `RecordingComparison.sensitivities` (p, nq n)."""
     own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
-    each = np.array([o.compute_information() for o in own])
-    scores = np.array([o.compute_score() for o in own])
+    each = np.array([o.information for o in own])
+    scores = np.array([o.score for o in own])
     together = least_squares_of_fit(fit)
-    information = together.compute_information()
-    score = together.compute_score()
+    information = together.information
+    score = together.score
     free = np.flatnonzero(~fit.at_bound)
     inverse = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)
     shared = free[free < fit.shared_count]
