@@ -259,9 +259,9 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
 @pytest.mark.slow
 def test_intervals_contain_the_truth_at_their_nominal_rate():
     """Of twins with noise alike over three pixels and a bias; see scripts/studies/study_depth.py."""
-    from study_depth import holds
+    from study_depth import contains_truth
 
-    assert 0.9 <= np.mean([holds(seed) for seed in range(40)]) <= 1.0
+    assert 0.9 <= np.mean([contains_truth(seed) for seed in range(40)]) <= 1.0
 
 
 def test_a_dropout_is_a_cloud_without_points():
