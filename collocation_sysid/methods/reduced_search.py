@@ -308,11 +308,6 @@ class ReducedSearch:
         complete = all(map(_oscillates, self.collocation.transcriptions))
         return self.options.ladder[-1:] if complete else self.options.ladder
 
-    @property
-    def loss(self) -> float:
-        """Loss of the best point; 0 before the first."""
-        return self.point.loss if self.point else 0.0
-
     def horizon_of_share(self, share: float) -> Horizon:
         """Return the problem on a share of the recording, one of `ladder`."""
         rows = [

@@ -122,7 +122,8 @@ class ReducedSpace(SearchOptions):
                     status = search.minimise(horizon, share == search.ladder[-1])
                     if status is Status.ITERATION_LIMIT:
                         break
-                    if share != search.ladder[-1] and search.loss > self.largest_loss:
+                    assert search.point is not None  # a solve accepts one
+                    if share != search.ladder[-1] and search.point.loss > self.largest_loss:
                         status = Status.STALLED
                         break
             status = status or Status.CONVERGED

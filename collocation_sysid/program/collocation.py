@@ -323,6 +323,13 @@ class Collocation:
                 names[place] = name
         return tuple(names)
 
+    def with_values(self, values: Mapping[str, float], p: Array) -> Array:
+        """Return p (np,) with other values of the entries whose names, see `parameter_names`, have
+        one.
+        """
+        pairs = zip(self.parameter_names, p.tolist(), strict=True)
+        return np.array([values.get(name, value) for name, value in pairs], dtype=np.float64)
+
     def prior_residuals(self, p: Array) -> tuple[Array, Array]:
         """Return residuals (nq + nphi,) of the priors at p, and the derivative (nq + nphi,) of each
         by its own parameter, both in standard deviations.

@@ -426,7 +426,6 @@ def _extended(
         each.experiment.name: x
         for each, x in zip(collocation.transcriptions, positions, strict=True)
     }
-    of_names = (by_name.get(name, 0.0) for name in wide.parameter_names)
     motions = []
     for each in wide.transcriptions:
         if (motion := known.get(each.experiment.name)) is None:
@@ -436,4 +435,4 @@ def _extended(
             if failure is not None:
                 raise failure
         motions.append(motion)
-    return wide, wide.pack(np.fromiter(of_names, dtype=float), motions)
+    return wide, wide.pack(wide.with_values(by_name, np.zeros(wide.nq + wide.nphi)), motions)

@@ -201,7 +201,7 @@ def changes_of_nuisances(
     wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
     p, positions = collocation.unpack(z)
     values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
-    at = wide.pack(np.array([values.get(name, 0.0) for name in wide.parameter_names]), positions)
+    at = wide.pack(wide.with_values(values, np.zeros(wide.nq + wide.nphi)), positions)
     new = np.array(
         [k for k, name in enumerate(wide.parameter_names) if name not in values], dtype=np.int64
     )

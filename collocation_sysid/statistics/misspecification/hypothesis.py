@@ -9,13 +9,13 @@ the factor by which the misfit decreases. An accepted hypothesis becomes a conce
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...common.step_counting import search_activity
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
@@ -152,6 +152,15 @@ def clock_hypothesis(
         "do": "add this to" if is_late else "subtract this from",
     }
     return Hypothesis("clock", subject, data=data, corrected=corrected, handicap=handicap)
+
+
+def exchanged_names(names: Sequence[str], real: Index) -> str:
+    """Return the names of markers with those that they really are, the indices `real` (M,), where
+    these are others.
+    """
+    return ", ".join(
+        f"{name} is {names[k]}" for name, k in zip(names, real, strict=True) if name != names[k]
+    )
 
 
 def rank(hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:

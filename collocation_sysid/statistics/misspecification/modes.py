@@ -23,7 +23,7 @@ from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, place_markers
 from ..axes import with_other_axes
 from ..thresholds import FITTED, LARGEST_MISFIT, LEAST_IMPROVEMENT, ONE_OF_MANY
-from .hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, rank
+from .hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, exchanged_names, rank
 from .initial_motion import initial_motion_hypotheses
 from .plausibility import (
     load_sign_hypotheses,
@@ -342,10 +342,8 @@ class ModalComparison:
             _with_markers(declared, declared.tracks_m[:, order], markers=exchanged)
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
-        listed = ", ".join(f"{names[k]} is {names[chosen[k]]}" for k in exchanged)
-        hypothesis = Hypothesis(
-            "markers-exchanged", declared.name, data={"names": listed}, corrected=renamed
-        )
+        data = {"names": exchanged_names(names, chosen)}
+        hypothesis = Hypothesis("markers-exchanged", declared.name, data=data, corrected=renamed)
         yield from HypothesisTest(
             self.misfit_m(few), self.misfit_m, required_factor=LEAST_IMPROVEMENT
         ).accepted([hypothesis])

@@ -31,7 +31,7 @@ from ...recording.obstacle import Obstacle
 from ...recording.poses import Frame
 from ..concerns import Concern
 from ..thresholds import AGAINST, CLEARLY, DENSITY_DEVIATION, SECTION_RATIO, SUDDEN, TAMED
-from .hypothesis import Hypothesis
+from .hypothesis import Hypothesis, exchanged_names
 
 # Densities of soft objects [kg/m³].
 DENSITIES_KG_M3 = (10.0, 25_000.0)
@@ -467,9 +467,8 @@ def name_exchange_hypotheses(
         "on" if end == len(t_s) else f"to {t_s[end - 1]:.4g} s"
     )
     real = np.argsort(right)[order[first]]
-    listed = ", ".join(f"{names[k]} is {names[real[k]]}" for k in np.flatnonzero(wrong[first]))
     also = ", and at other times" if affected[-1] >= end else ""
-    data = {"when": f"{when}{also}", "names": listed}
+    data = {"when": f"{when}{also}", "names": exchanged_names(names, real)}
     return (
         Hypothesis("markers-exchanged/later", f"'{experiment.name}'", data=data, strength=strength),
     )

@@ -197,7 +197,6 @@ def _refit_hypotheses(
     stated = alone.fit(first)
     if stated is None:
         return []
-    alone.stated_loss = stated.history[-1].loss
     fitted_m = stated.readings_m[0]
     trial = HypothesisTest(
         _discrepancy(stated),
@@ -405,7 +404,6 @@ class _Refitter:
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
         self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
-        self.stated_loss = UNLIMITED / REFUTED
         self.near_answer: set[Experiment] = set()
         # Experiments whose fits may take twice the sweeps: that of another direction of gravity than
         # the one to which a fit turned the body begins far from its answer.
@@ -458,11 +456,13 @@ class _Refitter:
         if self.sweeps <= 0:
             return None
         is_far = experiment in self.longer
+        stated = self.known.get(self.declared)
+        loss = UNLIMITED if stated is None or is_far else REFUTED * stated.history[-1].loss
         method = ReducedSpace(
             max_iterations=min(self.each * (1 + is_far), self.sweeps),
             tolerance=TOLERANCE,
             least_decrease=LEAST_DECREASE,
-            largest_loss=UNLIMITED if is_far else REFUTED * self.stated_loss,
+            largest_loss=loss,
         )
         start = None
         try:
@@ -492,13 +492,8 @@ class _Refitter:
             part.transcription.dynamics.t_s[: len(x)], times_s
         ):
             return None
-        p = changed.guess_p
         phi = dict(zip(part.transcription.nuisance.names, part.phi.tolist(), strict=True))
-        names = changed.parameter_names[changed.nq :]
-        p[changed.nq :] = [
-            phi.get(n, guess) for n, guess in zip(names, p[changed.nq :], strict=True)
-        ]
-        return changed.pack(p, [x])
+        return changed.pack(changed.with_values(phi, changed.guess_p), [x])
 
 
 def _clock_hypotheses(

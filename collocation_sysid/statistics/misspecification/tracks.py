@@ -19,7 +19,7 @@ from ...recording.measurement import Measurement
 from ...recording.nuisance import PLACE
 from ..distributions import normal_isf
 from ..thresholds import RARE
-from .hypothesis import Hypothesis
+from .hypothesis import Hypothesis, exchanged_names
 
 # RMS distance of two tracks over that of independent noise at one place, up to which they are the
 # same.
@@ -65,11 +65,10 @@ def exchanged_places(part: ExperimentIterate) -> Iterator[Hypothesis]:
         root_mean(distances_m[exchanged, k] ** 2) for k in (exchanged, chosen[exchanged])
     )
     if own_m > OTHER_PLACE * other_m:
-        names = ", ".join(f"{markers.names[k]} is {markers.names[chosen[k]]}" for k in exchanged)
         yield Hypothesis(
             "markers-exchanged",
             f"'{part.transcription.experiment.name}'",
-            data={"names": names},
+            data={"names": exchanged_names(markers.names, chosen)},
             strength=own_m / max(other_m, 1e-12),
         )
 
