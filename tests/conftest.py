@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -16,6 +18,14 @@ from collocation_sysid.recording import environment
 from collocation_sysid.result import run_record, solve_progress
 
 BodyFactory = Callable[..., Body]
+
+# Tests are independent of the terminal in which they are started. A background command of a shell
+# ignores SIGINT, and its children inherit that.
+os.environ["TERM"] = "xterm-256color"
+for name in ("NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES"):
+    os.environ.pop(name, None)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session", autouse=True)
