@@ -207,7 +207,7 @@ def log(
     as_json: AsJson = False,
 ) -> None:
     """List the topics in a robot's log, their uses, and how a problem file names them."""
-    from ..recording.formats.topics import list_topics
+    from ..recording.sources.topics import list_topics
 
     with shown_progress(f"reading {log}"), located(log):
         listed = list_topics(log)

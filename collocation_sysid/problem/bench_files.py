@@ -16,7 +16,7 @@ from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..recording import Experiment, Grasp, Wrench
-from ..recording.formats.columns import (
+from ..recording.sources.columns import (
     DISPLACEMENT,
     DISPLACEMENTS,
     FORCE,
@@ -29,7 +29,7 @@ from ..recording.formats.columns import (
     Quantity,
     name_and_unit,
 )
-from ..recording.formats.units import si_factor
+from ..recording.sources.units import si_factor
 from .recording_schema import (
     DisplacementSection,
     ExperimentSection,

@@ -13,8 +13,8 @@ from ..common.validated_types import Finite, Positive, Text
 from ..errors import InputError, located
 from ..recording import Depth, DepthCamera, read_poses
 from ..recording.depth_camera import points_from_image, samples_with_outlines
-from ..recording.formats.depth_files import DepthFileContent, read_depth
-from ..recording.formats.units import METRES_PER_UNIT
+from ..recording.sources.depth_files import DepthFileContent, read_depth
+from ..recording.sources.units import METRES_PER_UNIT
 from ..recording.time_tables import is_within_experiment
 from .measurement_section import MeasurementSection, RecordingFolder, require_file_name
 from .named_files import existing_file

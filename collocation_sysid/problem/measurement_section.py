@@ -21,7 +21,7 @@ from pydantic import AfterValidator, BeforeValidator, create_model
 from ..common.array_types import Array
 from ..common.schema_tables import Section
 from ..errors import InputError, located
-from ..recording.formats.logs import stored_files
+from ..recording.sources.logs import stored_files
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
 from .named_files import existing_file
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..common.files import require_regular
 from ..errors import InputError, hint_at
-from ..recording.formats.logs import stored_files
+from ..recording.sources.logs import stored_files
 
 
 def existing_file(folder: Path, name: str, key: str) -> Path:

@@ -17,9 +17,9 @@ from ..common.array_types import Array
 from ..common.checked_arrays import point_text
 from ..errors import InputError, hint_at, located
 from ..recording.experiment import EARTH_M_S2
-from ..recording.formats.log_frames import LogFrames, TopicFrames, topic_frames
-from ..recording.formats.logs import TopicAddress
 from ..recording.poses import Frame
+from ..recording.sources.log_frames import LogFrames, TopicFrames, topic_frames
+from ..recording.sources.logs import TopicAddress
 from .recording_schema import ExperimentSection, ForceSensorSection
 
 # Names of frames that are level by convention, or their endings; the first are more reliable.

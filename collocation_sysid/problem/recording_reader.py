@@ -37,10 +37,10 @@ from ..recording import (
     read_wrench,
 )
 from ..recording.alignment import AlignedRecording
-from ..recording.formats.logs import stored_files
 from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.sources.logs import stored_files
 from ..recording.time_tables import is_within_experiment
 from ..statistics.misspecification.modes import find_misspecifications_by_modes
 from .bench_files import strain_length_m

@@ -17,7 +17,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
   `hysteresis` compares loading and unloading.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
-displacements, pressures, custom sensors) and the subpackage `formats`; `writers` writes
+displacements, pressures, custom sensors) and the subpackage `sources`; `writers` writes
 them. `alignment`, `sample_times`, `frame_times`, `gap_interpolation` and `rigid_fit` prepare data:
 one time grid, sample times, samples of lost or jittered frames, interpolation between consecutive
 samples, rigid fits. `experiment_refinement` and

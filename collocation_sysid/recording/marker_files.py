@@ -14,11 +14,11 @@ from ..common.checked_arrays import float_converter, read_only_coordinates
 from ..common.declarations import declaration, key
 from ..common.time_dependence import over_time
 from ..errors import InputError, hint_at, listed
-from .formats import c3d, motive, plain_csv, qualisys, trc
-from .formats.raw_tracks import LabelChooser, RawTracks
-from .formats.text import decode, names_file_in_errors, read_bytes
-from .formats.units import METRES_PER_UNIT, require_length_unit
 from .sample_times import first_unordered_time
+from .sources import c3d, motive, plain_csv, qualisys, trc
+from .sources.raw_tracks import LabelChooser, RawTracks
+from .sources.text import decode, names_file_in_errors, read_bytes
+from .sources.units import METRES_PER_UNIT, require_length_unit
 
 # A frame rate and a column of times agree within this part.
 _RATE_TOLERANCE = 0.01

@@ -26,10 +26,10 @@ from ..common.schema_tables import Noise, Vector
 from ..common.time_dependence import at_times, over_time
 from ..common.validated_types import AtLeastOne, PositivePerSample
 from ..errors import InputError
-from .formats.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
 from .measurement import Measurement, checked_ratios, split_sigma
 from .poses import Frame
 from .sample_times import first_unordered_time
+from .sources.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
 from .time_tables import axis_components, without_rounding
 from .writers import write_columns_csv
 

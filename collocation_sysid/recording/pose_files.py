@@ -12,8 +12,9 @@ from ..common.array_files import load_arrays
 from ..common.array_types import Array
 from ..common.files import DAMAGE
 from ..errors import InputError
-from .formats.columns import find_time, name_and_unit
-from .formats.text import (
+from .poses import PoseSequence, first_matrix_fault, first_pose_fault
+from .sources.columns import find_time, name_and_unit
+from .sources.text import (
     Row,
     TextTable,
     decode,
@@ -24,9 +25,8 @@ from .formats.text import (
     read_table,
     times_in_column,
 )
-from .formats.topics import POSE
-from .formats.units import METRES_PER_UNIT, expected_units, require_length_unit, si_factor
-from .poses import PoseSequence, first_matrix_fault, first_pose_fault
+from .sources.topics import POSE
+from .sources.units import METRES_PER_UNIT, expected_units, require_length_unit, si_factor
 
 POSE_COLUMNS = ("t_s", *POSE)
 

@@ -20,7 +20,8 @@ from ..common.array_types import Array
 from ..common.time_dependence import over_time
 from ..errors import InputError
 from .experiment import Experiment
-from .formats.columns import (
+from .homogeneous_deformation import AXES, CELL_SIZE_M, DEFORMATIONS, transverse_stretch
+from .sources.columns import (
     DISPLACEMENT,
     FORCE,
     FREQUENCY,
@@ -53,9 +54,8 @@ from .formats.columns import (
     read_columns,
     similar_column_names,
 )
-from .formats.text import TextTable, names_file_in_errors
-from .formats.units import si_factor
-from .homogeneous_deformation import AXES, CELL_SIZE_M, DEFORMATIONS, transverse_stretch
+from .sources.text import TextTable, names_file_in_errors
+from .sources.units import si_factor
 from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME, moduli_per_stress
 
 # Name of a column that no column of a table fits.

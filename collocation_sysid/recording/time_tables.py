@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..errors import InputError, hint_at
-from .formats.columns import (
+from .poses import PoseSequence
+from .sample_times import TIME_TOLERANCE_S, unrounded_s
+from .sources.columns import (
     DISPLACEMENT,
     DISPLACEMENTS,
     FORCES,
@@ -23,7 +25,7 @@ from .formats.columns import (
     find_time,
     read_columns,
 )
-from .formats.text import (
+from .sources.text import (
     decode,
     names_file_in_errors,
     numeric_cells,
@@ -31,8 +33,6 @@ from .formats.text import (
     read_table,
     times_in_column,
 )
-from .poses import PoseSequence
-from .sample_times import TIME_TOLERANCE_S, unrounded_s
 
 # Largest plausible pressure [Pa]: larger ones are likely in another unit.
 LARGEST_PA = 1e8

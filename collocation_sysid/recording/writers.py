@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.files import replaced_file
-from .formats.plain_csv import SIGMA
 from .marker_files import MarkerTable
 from .pose_files import POSE_COLUMNS
 from .poses import PoseSequence
+from .sources.plain_csv import SIGMA
 
 _DIGITS = "%.12g"
 

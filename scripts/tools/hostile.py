@@ -67,7 +67,7 @@ from collocation_sysid.fem.kernels import jit
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, read_poses
-from collocation_sysid.recording.formats import topics  # noqa: F401
+from collocation_sysid.recording.sources import topics  # noqa: F401
 from collocation_sysid.result import check_sections, run_record, solve_progress  # noqa: F401
 from collocation_sysid.result.pictures import all_pictures  # noqa: F401
 from collocation_sysid.runs.check import quick_check

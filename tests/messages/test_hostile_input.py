@@ -36,8 +36,8 @@ from collocation_sysid.fem.meshes.structured import (
 from collocation_sysid.problem import Problem, loading
 from collocation_sysid.problem import size as problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
-from collocation_sysid.recording.formats.depth_files import read_depth
-from collocation_sysid.recording.formats.text import read_bytes
+from collocation_sysid.recording.sources.depth_files import read_depth
+from collocation_sysid.recording.sources.text import read_bytes
 from collocation_sysid.result import run_writers
 from collocation_sysid.runs.check import cost as memory
 

@@ -23,8 +23,8 @@ from kit.problem_files import (
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.recording.formats import c3d
 from collocation_sysid.recording.marker_files import read_markers
+from collocation_sysid.recording.sources import c3d
 
 MARKERS, POSES = "swing_markers.csv", "swing_motion.csv"
 RED = "\x1b[31m"

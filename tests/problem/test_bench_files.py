@@ -24,8 +24,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
-from collocation_sysid.recording.formats.units import si_factor
 from collocation_sysid.recording.hysteresis import loading_branch, unloading_difference
+from collocation_sysid.recording.sources.units import si_factor
 from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report
 from collocation_sysid.result.run_summary import run_summary

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.recording.formats.calibration_files import read_calibration
+from collocation_sysid.recording.sources.calibration_files import read_calibration
 
 MATRIX = [[812.3, 0.0, 641.7], [0.0, 809.1, 357.2], [0.0, 0.0, 1.0]]
 BROWN = [-0.28, 0.11, 8e-4, -6e-4, -0.031, 0.05, -0.02, 0.007]

@@ -27,9 +27,9 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.extras.live.frames import FrameReader
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, read_poses, read_wrench
-from collocation_sysid.recording.formats.depth_files import read_depth
-from collocation_sysid.recording.formats.logs import stored_files
-from collocation_sysid.recording.formats.topics import list_topics
+from collocation_sysid.recording.sources.depth_files import read_depth
+from collocation_sysid.recording.sources.logs import stored_files
+from collocation_sysid.recording.sources.topics import list_topics
 from collocation_sysid.recording.time_tables import read_custom_sensor, read_pressure
 
 T_S = np.arange(40) / 50.0

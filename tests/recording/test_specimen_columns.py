@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.recording.formats.columns import name_and_unit
-from collocation_sysid.recording.formats.units import si_factor
+from collocation_sysid.recording.sources.columns import name_and_unit
+from collocation_sysid.recording.sources.units import si_factor
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 
 VIDEO = "Tensile strain (Video axial) (%)"

@@ -13,8 +13,8 @@ from kit.logs import json_mcap
 
 import collocation_sysid as cs
 from collocation_sysid.features.image_tracks.files import read_tracks
-from collocation_sysid.recording.formats.calibration_files import read_calibration
-from collocation_sysid.recording.formats.topics import list_topics
+from collocation_sysid.recording.sources.calibration_files import read_calibration
+from collocation_sysid.recording.sources.topics import list_topics
 
 RNG = np.random.default_rng(7)
 PIXELS = np.round(RNG.uniform(10, 600, (5, 2, 2)), 3)

@@ -25,10 +25,10 @@ from ...problem import Problem
 from ...problem.gripper_transforms import gripper_transforms
 from ...program.streaming import StreamingModel
 from ...recording.custom_sensor import CustomSensor
-from ...recording.formats.text import number_from_text
-from ...recording.formats.topics import POSE
 from ...recording.measured_wrench import WRENCH_COLUMNS, Wrench
 from ...recording.poses import first_matrix_fault, first_pose_fault
+from ...recording.sources.text import number_from_text
+from ...recording.sources.topics import POSE
 
 Pose = Any
 

@@ -30,8 +30,8 @@ from ...errors import InputError, hint_at, listed, located
 from ...problem.reading import parse_toml, read_text
 from ...problem.schema import CodeSection
 from ...problem.validation_messages import explain_validation_error
-from ...recording.formats.columns import find_time
-from ...recording.formats.text import decode, numeric_cells, read_bytes, read_table, times_in_column
+from ...recording.sources.columns import find_time
+from ...recording.sources.text import decode, numeric_cells, read_bytes, read_table, times_in_column
 
 HandAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
-from ...recording.formats.logs import require_packages
+from ...recording.sources.logs import require_packages
 from ..design.hand_motion import angular_motion
 from .motion_plan import MotionPlan
 

@@ -25,7 +25,7 @@ from ...errors import InputError
 from ...problem import Problem
 from ...problem.reading import read_problem_file
 from ...problem.schema import ParameterSection, ProblemFile
-from ...recording.formats.logs import stored_files
+from ...recording.sources.logs import stored_files
 from .arguments import require_few
 from .model_variants import ModelVariant
 

@@ -35,8 +35,8 @@ from ...common.array_types import Array
 from ...common.checked_arrays import float_array
 from ...common.files import DAMAGE
 from ...errors import InputError, listed
-from ...recording.formats.columns import find_time
-from ...recording.formats.text import (
+from ...recording.sources.columns import find_time
+from ...recording.sources.text import (
     Row,
     TextTable,
     decode,

@@ -16,8 +16,8 @@ from ...problem.measurement_section import MeasurementSection, RecordingFolder
 from ...problem.named_files import existing_file
 from ...recording import read_poses
 from ...recording.camera import Camera, ImageSize, PoseMatrix
-from ...recording.formats.calibration_files import read_calibration
-from ...recording.formats.units import METRES_PER_UNIT
+from ...recording.sources.calibration_files import read_calibration
+from ...recording.sources.units import METRES_PER_UNIT
 from ...recording.time_tables import is_within_experiment
 from .files import TrackFile, read_tracks
 from .tracks import ImageTracks, PoseSigma

@@ -1,5 +1,5 @@
-"""File formats of recordings; they are used through `recording.marker_files`, `pose_files` and
-`time_tables`.
+"""Sources of recordings, files and topics of logs; they are used through `recording.marker_files`,
+`pose_files` and `time_tables`.
 
 - `text`, `columns`, `units`: CSV tables, columns recognised by name, units.
 - `raw_tracks`: marker tracks as they are in a file; `c3d`, `trc`, `qualisys`, `motive` and
