@@ -3,7 +3,7 @@
 Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
 check), `run_commands` (refine, export, plot, report, animate), `study_commands`
 (compare-methods, compare-models, sweep), `design_commands` (design, plan), `stream_commands` (live,
-replay), `benchmark_commands` (benchmark), `installation_commands` (doctor) and `texts`
+replay), `installation_commands` (doctor) and `texts`
 (methods, schema, explain, log, new). `command_options` makes command-line options from parameters,
 `common` has exit codes and output, and `markdown` shows documentation on a terminal.
 
@@ -40,7 +40,6 @@ FAMILIES = (
     "design_commands",
     "run_commands",
     "stream_commands",
-    "benchmark_commands",
     "texts",
     "installation_commands",
 )
@@ -49,7 +48,7 @@ COMMAND_GROUPS = {
     "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
     "Inspect a run": ("report", "plot", "animate"),
     "Extend a study": ("simulate", "compare-models", "compare-methods", "sweep", "design", "plan"),
-    "Exchange data": ("log", "export", "benchmark"),
+    "Exchange data": ("log", "export"),
     "Reference and installation": ("explain", "methods", "schema", "doctor"),
 }
 # Commands that were replaced, with the message to who types their old name.

@@ -82,19 +82,13 @@ def listed_hashes(folder: Path) -> dict[str, str]:
         return {}
 
 
-def is_written_here(file: Path, folder: Path | None = None) -> bool:
+def is_written_here(file: Path) -> bool:
     """Return whether a regular file is on the list of its folder, with the content that was listed;
     false for links and missing files.
-
-    Parameters
-    ----------
-    folder : Path, optional
-        The folder with the list, at or above the file; the file's own folder by default.
     """
-    folder = folder or file.parent
     if file.is_symlink() or not file.is_file():
         return False
-    known = listed_hashes(folder).get(file.relative_to(folder).as_posix())
+    known = listed_hashes(file.parent).get(file.name)
     return known is not None and known == _hash(file)
 
 

@@ -4,5 +4,4 @@
 - `studies`: plans of many runs, comparisons of methods and of models.
 - `design`: motions that determine the parameters best.
 - `export`: identified bodies and motions in the formats of simulators and viewers.
-- `benchmark`: measured bodies as files for any simulator, and scores of its predictions.
 """
