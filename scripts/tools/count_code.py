@@ -1,24 +1,49 @@
-"""Size of the package: files, functions, classes, tokens, docstrings, and numbers of modules.
+"""Size of the project: package, keys, tests, scripts, documentation, and the path of a solve.
 
-    python scripts count_code [FOLDER ...]
+    python scripts count_code [CHECKOUT ...]
 
-One column for each folder with a package, such as those of two checkouts.
+One column for each checkout. The last rows count the files and functions of the package that
+`collocation-sysid solve problems/foam_cylinder/recording.toml` executes.
 """
 
 from __future__ import annotations
 
 import ast
 import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import tokenize
 from collections import Counter
 from pathlib import Path
 
 from script_arguments import make_parser
 
-PACKAGE = Path(__file__).parents[2] / "collocation_sysid"
+ROOT = Path(__file__).parents[2]
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 # Tokens without content: brackets, separators and layout.
 EMPTY = (tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT)
+# Executes a command line, and prints the numbers of files and functions of the package.
+EXECUTED = """
+import inspect, sys, threading
+found = set()
+def note(frame, event, _):
+    code = frame.f_code  # of a function, not of a module, a class or an expression
+    is_function = code.co_flags & inspect.CO_OPTIMIZED and "<" not in code.co_name
+    if event == "call" and is_function and "collocation_sysid/" in code.co_filename:
+        found.add((code.co_filename, code.co_firstlineno))
+threading.setprofile(note)
+sys.setprofile(note)
+from collocation_sysid.cli import main
+try:
+    main()
+except SystemExit:
+    pass
+sys.setprofile(None)
+print(len({file for file, _ in found}), len(found))
+"""
 
 
 def is_data_class(node: ast.ClassDef) -> bool:
@@ -54,7 +79,7 @@ def count_tokens(text: str, docstrings: set[int]) -> int:
     )
 
 
-def count(folder: Path) -> dict[str, int]:
+def count_package(folder: Path) -> dict[str, int]:
     """Return the counts of a package by what is counted."""
     counts = Counter[str]()
     calls = Counter[str]()
@@ -85,13 +110,61 @@ def count(folder: Path) -> dict[str, int]:
     return dict(sorted(counts.items()))
 
 
+def count_keys(node: object) -> Counter[str]:
+    """Return the numbers of keys and of tables in a JSON schema."""
+    counts = Counter[str]()
+    if isinstance(node, dict):
+        properties = node.get("properties")
+        if isinstance(properties, dict) and properties:
+            counts += Counter({"keys of the schema": len(properties), "tables of the schema": 1})
+        node = list(node.values())
+    if isinstance(node, list):
+        for each in node:
+            counts += count_keys(each)
+    return counts
+
+
+def count_executed(checkout: Path) -> dict[str, int]:
+    """Return how many files and functions of the package a solve executes."""
+    with tempfile.TemporaryDirectory() as folder:
+        problem = checkout / "problems/foam_cylinder/recording.toml"
+        command = ["solve", str(problem), "--out", str(Path(folder) / "run"), "--quiet"]
+        done = subprocess.run(
+            [sys.executable, "-c", EXECUTED, *command],
+            env=os.environ | {"PYTHONPATH": str(checkout)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    files, functions = map(int, done.stdout.split()[-2:])
+    return {"files that solve executes": files, "functions that solve executes": functions}
+
+
+def count(checkout: Path) -> dict[str, int]:
+    """Return the counts of a checkout by what is counted."""
+    schema = json.loads((checkout / "problems/schema.json").read_text(encoding="utf-8"))
+    pages = [*checkout.glob("docs/**/*.md")]
+    lines = {
+        name: sum(file.read_text(encoding="utf-8").count("\n") for file in folder.rglob("*.py"))
+        for name in ("tests", "scripts")
+        if (folder := checkout / name)
+    }
+    return {
+        **count_package(checkout / "collocation_sysid"),
+        **count_keys(schema),
+        **{f"lines of {name}": number for name, number in lines.items()},
+        "words of documentation": sum(len(page.read_text("utf-8").split()) for page in pages),
+        **count_executed(checkout),
+    }
+
+
 def main() -> None:
     parser = make_parser(__doc__)
-    parser.add_argument("folders", nargs="*", type=Path, default=[PACKAGE])
-    folders = parser.parse_args().folders
-    columns = [count(folder) for folder in folders]
-    print("| | " + " | ".join(map(str, folders)) + " |")
-    print("|---|" + "---|" * len(folders))
+    parser.add_argument("checkouts", nargs="*", type=Path, default=[ROOT])
+    checkouts = [each.resolve() for each in parser.parse_args().checkouts]
+    columns = [count(checkout) for checkout in checkouts]
+    print("| | " + " | ".join(each.name for each in checkouts) + " |")
+    print("|---|" + "---|" * len(checkouts))
     for name in columns[0]:
         print(f"| {name} | " + " | ".join(f"{each[name]:,}" for each in columns) + " |")
 
