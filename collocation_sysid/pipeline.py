@@ -22,7 +22,6 @@ from .common.validated_classes import validated
 from .errors import InputError, SimulationError
 from .features.specimens.notes import one_kind_notes
 from .features.specimens.offsets import stress_offset_notes
-from .fem.two_phase import TwoPhaseModes
 from .methods.experiment_executors import connect_executor
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Method, Solution, Status, Watch
@@ -221,7 +220,7 @@ def run(
         checks_s = time.perf_counter() - searched_s - finer_s
         return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
 
-    problem = _with_estimated_fields(problem, solution)
+    problem = _with_estimated_lengths(problem, solution)
     answer = Run(problem, solution, rollouts={}, uncertainty=None)
     missing = "the result has no error bars and was not checked by a forward simulation"
     solver = problem.solver(method)
@@ -275,23 +274,15 @@ def run(
             return timed(replace(answer, rollouts=rollouts, omitted_checks=missing))
 
 
-def _with_estimated_fields(problem: Problem, solution: Solution) -> Problem:
-    """Return the problem with the correlation lengths of its fields that the solve used, and with
-    the modes of its two-phase fields.
-    """
-    fields = {
-        part.field_name: part.field
-        for transcription in solution.collocation.transcriptions
-        for part in transcription.body.parts
-        if part.field
-    }
-    problem = problem.with_lengths({name: field.length_m for name, field in fields.items()})
-    two_phase_fields = {
-        name: field for name, field in fields.items() if isinstance(field, TwoPhaseModes)
-    }
-    if two_phase_fields:
-        return problem.with_fields(two_phase_fields)
-    return problem
+def _with_estimated_lengths(problem: Problem, solution: Solution) -> Problem:
+    """Return the problem with the correlation lengths of its fields that the solve used."""
+    return problem.with_lengths(
+        {
+            name: length_m
+            for transcription in solution.collocation.transcriptions
+            for name, length_m in transcription.body.field_lengths_m.items()
+        }
+    )
 
 
 def _with_problem_notes(answer: Run) -> Run:

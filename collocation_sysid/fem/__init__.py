@@ -5,7 +5,7 @@ Bodies:
 - `body`: a deformable body with internal forces and their derivatives; start here.
 - `coarse_body`: the same body on a coarser mesh, for the start of a search.
 - `regions`: parts of a body with their own material, and the vector θ of all constants.
-- `spatial_field`, `two_phase`: constants that vary in space.
+- `spatial_field`: constants that vary in space.
 - `rest_shape`, `rest_point_layout`: stress-free shape of a body that was scanned under gravity.
 - `air`: buoyancy, added mass and drag of the surrounding air.
 

@@ -44,8 +44,7 @@ from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
-from .spatial_field import Field, FieldModes
-from .two_phase import PhaseSamples, TwoPhaseModes
+from .spatial_field import Field
 
 
 @dataclass(frozen=True, eq=False)
@@ -428,28 +427,6 @@ class Body(Discretisation):
         )
         return self.with_parts(
             tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
-        )
-
-    def list_phase_samples(self) -> tuple[PhaseSamples, ...]:
-        """Return the posterior samples of the phases of two-phase fields; empty before a solution
-        is known.
-        """
-        fields = (part.field for part in self.parts)
-        return tuple(
-            field.samples
-            for field in fields
-            if isinstance(field, TwoPhaseModes) and field.samples is not None
-        )
-
-    def with_fields(self, fields: Mapping[str, FieldModes]) -> Body:
-        """Return a copy of this body with other fields, by the names of their constants.
-
-        Fields that are not named stay; names of constants without a field are ignored.
-        """
-        return self.with_parts(
-            tuple(
-                replace(part, field=fields.get(part.field_name, part.field)) for part in self.parts
-            )
         )
 
     def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
@@ -839,8 +816,7 @@ class Body(Discretisation):
         for number, outputs in self._field_outputs("linearisation", rows):
             columns = self.field_slices[number]
             spread = self.field_assemblies[number]
-            slopes = spread.field.jacobian(np.asarray(theta)[columns])
-            spread.assemble_nodal(outputs["by_theta"], slopes, out=by_theta[:, :, columns])
+            spread.assemble_nodal(outputs["by_theta"], out=by_theta[:, :, columns])
         for column, slope in self._damping_derivatives(theta, tied_kg):
             # A density also changes the stress-free shape of a mesh made under gravity.
             by_theta[:, :, column] += -slope * v
@@ -932,7 +908,7 @@ class Body(Discretisation):
             drag = -slope * w
             curvature.velocity_theta[:, :, column] += drag
             curvature.theta[:, column] += np.einsum("ti,ti->t", drag, v)
-        self._set_field_curvature(curvature, rows, theta=theta)
+        self._set_field_curvature(curvature, rows)
         self._apply_stiffening_to_curvature(curvature, memory_input)
         for gamma, mass_slopes in zip(self._gamma_m_indices, self._mass_slopes, strict=True):
             for place, slope in mass_slopes.items():
@@ -963,20 +939,18 @@ class Body(Discretisation):
             velocity_velocity=np.zeros((count, 0)),
         )
 
-    def _set_field_curvature(self, curvature: SecondDerivatives, rows: Array, theta: Theta) -> None:
+    def _set_field_curvature(self, curvature: SecondDerivatives, rows: Array) -> None:
         """Set derivatives by coefficients of fields from those by the logarithms of cells."""
         for number, outputs in self._field_outputs("curvature", rows):
             columns = self.field_slices[number]
             spread = self.field_assemblies[number]
-            coefficients = np.asarray(theta)[columns]
-            slopes = spread.field.jacobian(coefficients)
+            slopes = spread.field.shapes
             for output, by_nodes in (
                 ("position_theta", curvature.position_theta),
                 ("velocity_theta", curvature.velocity_theta),
             ):
-                spread.assemble_nodal(outputs[output], slopes, out=by_nodes[:, :, columns])
-            by_logarithm = outputs["gradient_theta"]
-            curvature.theta[:, columns] = by_logarithm @ slopes
+                spread.assemble_nodal(outputs[output], out=by_nodes[:, :, columns])
+            curvature.theta[:, columns] = outputs["gradient_theta"] @ slopes
             first = self.starts[number]
             count = self.parts[number].point_constant_count
             constants = slice(first, first + count)
@@ -984,9 +958,8 @@ class Body(Discretisation):
             mixed = np.einsum("tek,em->tkm", second[:, :, :count], slopes)
             curvature.theta_theta[:, constants, columns] = mixed
             curvature.theta_theta[:, columns, constants] = mixed.swapaxes(1, 2)
-            by_coefficients = spread.field.weighted_hessian(coefficients, by_logarithm)
-            curvature.theta_theta[:, columns, columns] = (
-                slopes.T @ (second[:, :, count, None] * slopes) + by_coefficients
+            curvature.theta_theta[:, columns, columns] = slopes.T @ (
+                second[:, :, count, None] * slopes
             )
 
     def _apply_stiffening_to_curvature(

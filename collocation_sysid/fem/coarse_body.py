@@ -16,7 +16,6 @@ import scipy.sparse as sp
 from scipy.spatial import KDTree
 
 from ..common.array_types import Array, Index
-from ..errors import InputError
 from .meshes.coarsening import CoarseMesh, coarsen_mesh
 from .meshes.mesh import ElementNodes
 from .meshes.refinement import on_mesh
@@ -188,12 +187,6 @@ def _coarse_field(source: BodyPart, part: BodyPart, body: Body, coarse: Body) ->
     modes = source.field
     if modes is None:
         return None
-    if type(modes) is not FieldModes:
-        raise InputError(
-            f"the two-phase field of {source.field_name} has values that belong to the elements of "
-            "its own mesh, so that it cannot be transferred to a coarse mesh; expected a body "
-            "without field, or a field with prior = 'smooth'"
-        )
     nearest = _nearest_cells(source, part, body, coarse)
     return modes.on_cells(nearest, coarse.mesh.volumes_m3[part.cells])
 

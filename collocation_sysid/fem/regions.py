@@ -19,7 +19,7 @@ from ..common.array_types import Array, Index
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Text
 from ..errors import InputError, hint_at
-from .laws.constants import CONTRAST, DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, TAU, Constant
+from .laws.constants import DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, TAU, Constant
 from .laws.damping_admissibility import require_admissible_damping
 from .laws.fibres import Fibres, reinforced
 from .laws.materials import (
@@ -36,8 +36,7 @@ from .laws.time_shift import TimeShift
 from .meshes.mesh import TetMesh
 from .meshes.selection import Selection
 from .node_force import NodeForce
-from .spatial_field import TWO_PHASE, Field, FieldModes
-from .two_phase import TwoPhaseModes
+from .spatial_field import Field, FieldModes
 
 
 @validated
@@ -254,8 +253,7 @@ def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
     if field is None:
         return part
     law = (*part.material.constants, *part.damping.constants)
-    kind = TwoPhaseModes if field.prior == TWO_PHASE else FieldModes
-    return replace(part, field=kind.from_field(field, mesh, cells=part.cells, law=law))
+    return replace(part, field=FieldModes.from_field(field, mesh, cells=part.cells, law=law))
 
 
 def _densities(
@@ -443,10 +441,10 @@ class ConstantsModel:
         -------
         set of str
             The names among `known` that give constants of the parts, and always those of field
-            coefficients, contrasts, custom forces and coefficients of friction.
+            coefficients, custom forces and coefficients of friction.
         """
         used = {name for source in self.constant_sources(known) for name in source.names.values()}
-        used.update(self.field_coefficient_names, self.find_contrast_deviations())
+        used.update(self.field_coefficient_names)
         used.update(*(part.shift.constants for part in self.parts if part.shift))
         further = (force.constants for force in self.forces)
         return used.union(*({c.name for c in some} for some in (*further, self.frictions)))
@@ -472,8 +470,8 @@ class ConstantsModel:
         ----------
         values : mapping of str to number or expression
             Constants, or moduli and `mass_kg` in their place. Names that the body does not use are
-            ignored. A coefficient of a field or a contrast that is missing has its usual value: 0
-            for a coefficient, so that the field equals its mean.
+            ignored. A coefficient of a field that is missing is 0, its usual value, so that the
+            field equals its mean.
 
         Raises
         ------
@@ -559,25 +557,15 @@ class ConstantsModel:
         return tuple(name for names in self.group_field_coefficients().values() for name in names)
 
     def group_field_coefficients(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the coefficients of each smooth field in the order of θ, by the name
-        of their vector: "field", or "core.field" for the field of the region "core".
+        """Return the names of the coefficients of each field in the order of θ, by the name of
+        their vector: "field", or "core.field" for the field of the region "core".
         """
         return {
             part.full_name(FIELD_COEFFICIENT.name): tuple(
                 part.full_name(constant.name) for constant in part.field_constants
             )
             for part in self.parts
-            if part.field and part.field.field.prior != TWO_PHASE
-        }
-
-    def find_contrast_deviations(self) -> dict[str, float]:
-        """Return the prior deviations of the logarithms of the contrasts of two-phase fields, by
-        name.
-        """
-        return {
-            part.full_name(CONTRAST.name): part.field.field.deviation
-            for part in self.parts
-            if part.field and part.field.field.prior == TWO_PHASE
+            if part.field
         }
 
     @cached_property

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sp
@@ -39,9 +39,6 @@ from .meshes.mesh import TetMesh
 ALL_MODULI = YOUNG.name
 # Number of random sign vectors for the estimate of a trace (Hutchinson's estimator).
 PROBES = 50
-SMOOTH: Literal["smooth"] = "smooth"
-TWO_PHASE: Literal["two-phase"] = "two-phase"
-Prior = Literal["smooth", "two-phase"]
 Lengths = Annotated[Positive | Annotated[tuple[Positive, ...], MinLen(1)], ByForm((int, float))]
 
 
@@ -62,19 +59,13 @@ class Field:
         every time step.
     amplitude : float, optional
         Prior standard deviation of the logarithm of the constant, 0.5 by default; for a density,
-        prior standard deviation of its ratio to the stated density, 0.3 by default. With prior =
-        "two-phase", the prior standard deviation of the logarithm of the contrast, 1 by default.
-    prior : {"smooth", "two-phase"}
-        "smooth": the logarithm of the constant is a smooth normal field. "two-phase": the constant
-        has two values with a boundary between them; the parameter contrast is the ratio of the
-        value in inclusions to that in the surroundings.
+        prior standard deviation of its ratio to the stated density, 0.3 by default.
     """
 
     length_m: float | tuple[float, ...] = key(Lengths)
     parameter: str = key(Text, default=ALL_MODULI)
     modes: int = key(AtLeastOne, default=40)
     amplitude: float | None = key(Positive | None, default=None)
-    prior: Prior = key(Prior, default=SMOOTH)
 
     @property
     def lengths_m(self) -> tuple[float, ...]:
@@ -83,14 +74,12 @@ class Field:
 
     @property
     def deviation(self) -> float:
-        """Prior standard deviation: the amplitude, or its default for None, which depends on prior
-        and parameter.
+        """Prior standard deviation: the amplitude, or its default for None, which depends on the
+        parameter.
 
         The default of a density is smaller, because a density, unlike a logarithm, could become
         negative.
         """
-        if self.prior == TWO_PHASE:
-            return self.amplitude or 1.0
         return self.amplitude or (0.3 if self.parameter == DENSITY.name else 0.5)
 
 
@@ -252,25 +241,6 @@ class FieldModes:
         """
         return self.shapes @ coefficients
 
-    def jacobian(self, coefficients: Array) -> Array:
-        """Return the derivatives (E, k) of `logarithms` by the coefficients (k,), on which they do
-        not depend here.
-        """
-        return self.shapes
-
-    def weighted_hessian(self, coefficients: Array, weights: Array) -> Array:
-        """Return the weighted sum over cells of the second derivatives of `logarithms`, (T, k, k).
-
-        It is zero here, because the logarithms are linear in the coefficients.
-
-        Parameters
-        ----------
-        coefficients : (k,)
-        weights : (T, E)
-            Weights of the cells.
-        """
-        return np.zeros((len(weights), len(coefficients), len(coefficients)))
-
     @cached_property
     def variance_share(self) -> float:
         """Share of the prior variance that the shapes represent, between 0 and 1."""
@@ -358,15 +328,13 @@ class FieldAssembly:
         entry_codes = np.arange(1, rows.size + 1)
         return sp.csr_array((entry_codes, (rows, columns)), shape=(self.size, cells))
 
-    def assemble_nodal(self, values: Array, slopes: Array, out: Array) -> None:
+    def assemble_nodal(self, values: Array, out: Array) -> None:
         """Write derivatives of nodal values by the coefficients of the field to `out`.
 
         Parameters
         ----------
         values : (T, E · d)
             Derivatives by the logarithm of each cell.
-        slopes : (E, k)
-            Derivatives of these logarithms by the coefficients.
         out : (T, size, k)
             Result; overwritten.
         """
@@ -376,4 +344,4 @@ class FieldAssembly:
             matrix = sp.csr_array(
                 (value[order], incidence.indices, incidence.indptr), incidence.shape
             )
-            derivatives[:] = matrix @ slopes
+            derivatives[:] = matrix @ self.field.shapes

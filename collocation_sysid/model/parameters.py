@@ -503,39 +503,19 @@ class Parameters:
         )
 
     def with_fields(self, bodies: Iterable[Body]) -> Parameters:
-        """Return these parameters with those of the bodies' fields: a contrast for each two-phase
-        field, and the vector of coefficients for each smooth one.
+        """Return these parameters with the vector of coefficients of each field of the bodies.
 
-        Those that are not here yet are appended, contrasts first. A stated contrast that is neither
-        fixed nor has a prior gets the prior of its field; stated coefficients become components of
-        their vector. Vectors and components that no body has are kept, see `without`.
+        Those that are not here yet are appended; stated coefficients become components of their
+        vector. Vectors and components that no body has are kept, see `without`.
         """
-        bodies = tuple(bodies)
         vectors = {
             vector: names
             for body in bodies
             for vector, names in body.group_field_coefficients().items()
         }
-        priors = {
-            name: (1.0, deviation)
-            for body in bodies
-            for name, deviation in body.find_contrast_deviations().items()
-        }
         stated = {item.name: item for item in self.components}
         coefficients = {name for names in vectors.values() for name in names}
-        own_items = (
-            replace(item, prior=priors[item.name])
-            if item.name in priors and item.prior is None and not item.is_fixed
-            else item
-            for item in self.scalars
-            if item.name not in coefficients
-        )
-        contrasts = (
-            # Not 1, at which the loss would not depend on the phases.
-            complete_parameter(name, Unknown(2.0, prior=prior))
-            for name, prior in priors.items()
-            if name not in stated
-        )
+        own_items = (item for item in self.scalars if item.name not in coefficients)
         other_components = {
             field.name: tuple(
                 component for component in field.components if component.name not in coefficients
@@ -553,12 +533,7 @@ class Parameters:
             for vector, names in vectors.items()
         )
         return Parameters(
-            (
-                *own_items,
-                *contrasts,
-                *fields,
-                *itertools.starmap(FieldCoefficients, other_components.items()),
-            )
+            (*own_items, *fields, *itertools.starmap(FieldCoefficients, other_components.items()))
         )
 
     def without(self, names: Container[str]) -> Parameters:

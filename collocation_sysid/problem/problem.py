@@ -15,8 +15,6 @@ from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.laws.constants import with_undamped
-from ..fem.spatial_field import FieldModes
-from ..fem.two_phase import TwoPhaseModes
 from ..methods import METHODS, require_method
 from ..methods.interior_point import InteriorPoint
 from ..methods.solution import Method
@@ -236,42 +234,6 @@ class Problem:
         bodies = {id(body): body.with_field_lengths(lengths_m) for body in self.bodies}
         return replace(
             self, experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments]
-        )
-
-    def find_two_phase_fields(self) -> dict[str, TwoPhaseModes]:
-        """Return the two-phase fields of the bodies, by name of the constant; empty if there are
-        none.
-        """
-        return {
-            part.field_name: part.field
-            for body in self.bodies
-            for part in body.parts
-            if isinstance(part.field, TwoPhaseModes)
-        }
-
-    def with_fields(self, fields: Mapping[str, FieldModes]) -> Problem:
-        """Return the problem with other fields of spatially varying constants, by name of the
-        constant.
-
-        Coefficients and contrasts that no longer belong to a field of any body are removed from the
-        parameters, and those of the new fields are added. Fields that the mapping does not name
-        remain. This problem is not modified.
-        """
-        bodies = {id(body): body.with_fields(fields) for body in self.bodies}
-        removed_names = {
-            n
-            for b in self.bodies
-            for n in (*b.field_coefficient_names, *b.find_contrast_deviations())
-        }
-        removed_names -= {
-            n
-            for b in bodies.values()
-            for n in (*b.field_coefficient_names, *b.find_contrast_deviations())
-        }
-        return replace(
-            self,
-            experiments=[replace(e, body=bodies[id(e.body)]) for e in self.experiments],
-            parameters=self.parameters.without(removed_names),
         )
 
     def choose_first_substeps(self) -> int:

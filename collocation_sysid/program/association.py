@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ..common.array_types import Array
-from ..fem.body import Body
 from .correspondences import Correspondences
 from .markers.association import MarkerAssociation
 
@@ -43,10 +42,6 @@ class Association:
         body.
         """
         return replace(self, markers=self.markers.centred_at(places_m))
-
-    def on_body(self, body: Body) -> Association:
-        """Return the association for a body with the same mesh."""
-        return replace(self, markers=replace(self.markers, body=body))
 
     def updated(
         self,

@@ -1,7 +1,7 @@
 """Runs: the operations on a problem, and their results.
 
 - `check`: examine a problem before it is solved.
-- `solving`: solve it, with `two_phases` and `phase_posterior` for two-phase fields,
+- `solving`: solve it,
 `second_start` and `several_starts` for local minima, `warm_start` for a start from an earlier run,
 `coarse_start` for a start on a coarser mesh, and `thinned_start` for one with fewer points of
 cameras.

@@ -222,10 +222,6 @@ def plan_coarse_start(problem: Problem, method: ReducedSpace) -> CoarseStart | N
     distances = {each.name: n for each in fitted if (n := sample_distance(each)) > 1}
     if not large and not distances:
         return None
-    if problem.find_two_phase_fields():
-        raise NoCoarseStartError(
-            "the phases of a two-phase field belong to the elements of the given mesh"
-        )
     try:
         coarse = {key: _coarse_body(body, problem) for key, body in large.items()}
         relations = {each.name: coarse[id(each.body)] for each in fitted if id(each.body) in coarse}

@@ -219,12 +219,7 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
     is_determined = estimate.is_informed
     if not np.isfinite(estimate.deviation).all():
         return FieldResult(
-            modes.describe_resolution(),
-            ends,
-            determined_share=None,
-            identified=None,
-            likelier={},
-            phases=estimate.phases,
+            modes.describe_resolution(), ends, determined_share=None, identified=None, likelier={}
         )
     share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
     likelier = {f"{each:g}": estimate.log_evidence_ratio(each) for each in modes.field.lengths_m}
@@ -234,7 +229,6 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
         determined_share=share,
         identified=estimate.identified_mode_count,
         likelier=likelier,
-        phases=estimate.phases,
     )
 
 

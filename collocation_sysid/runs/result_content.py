@@ -15,7 +15,6 @@ from ..errors import InputError
 from ..features.measurement_results import FitResult, ForwardResult
 from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
-from ..fem.two_phase import PhaseSummary
 from ..methods.solution import Iteration, Timing
 from ..methods.starts.stiffness_scan import ScanSummary
 from ..statistics.assessment import Assessment
@@ -154,11 +153,9 @@ class FieldResult:
     # mapping of length in metres to float: logarithm of the evidence of other correlation lengths,
     # relative to the chosen one.
     likelier: Mapping[str, float]
-    # Contrast and volume of the inclusion of a two-phase field; None for a smooth field.
-    phases: PhaseSummary | None = None
 
     def coefficient_names(self, name: str) -> list[str]:
-        """Return the names of the coefficients of a smooth field; none for a two-phase one.
+        """Return the names of the coefficients of the field.
 
         Parameters
         ----------
@@ -166,8 +163,7 @@ class FieldResult:
             Name of the constant that varies, with its region.
         """
         region, dot, _ = name.rpartition(".")
-        count = self.shapes.modes if self.phases is None else 0
-        return [f"{region}{dot}{field_coefficient(k).name}" for k in range(count)]
+        return [f"{region}{dot}{field_coefficient(k).name}" for k in range(self.shapes.modes)]
 
     def sentence(self, name: str) -> str:
         """Return a one-line summary of the field; `name` is the name of its constant."""
@@ -175,15 +171,6 @@ class FieldResult:
         sentence = f"{symbol_of(name)} from {least:.3g} to {most:.3g} {unit_of(name)}".strip()
         if self.identified is None or self.determined_share is None:
             return sentence
-        if self.phases is not None:
-            lower, contrast, upper = self.phases.contrast
-            least_m3, volume_m3, most_m3 = self.phases.volume_m3
-            return (
-                f"{sentence}: two phases, contrast {contrast:.3g} ({lower:.3g} to {upper:.3g}), "
-                f"inclusion {1e6 * volume_m3:.3g} cm³ ({1e6 * least_m3:.3g} to "
-                f"{1e6 * most_m3:.3g}); the phase is determined in {self.determined_share:.0%} of "
-                "the volume"
-            )
         shapes = f"{self.identified} of the {self.shapes.modes} shapes of its field"
         share = f"halve the prior uncertainty in {self.determined_share:.0%} of the volume"
         details = [

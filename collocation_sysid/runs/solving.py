@@ -45,7 +45,6 @@ from .thinned_start import (
     thinned_problem,
     thinned_start_note,
 )
-from .two_phases import solve_two_phases
 from .warm_start import WarmStart
 
 # Outcomes of a failed search, after which another start may help.
@@ -93,7 +92,7 @@ def solve(
     There may be several searches, one after another: from the results of a scan, if guesses are
     missing or a search from guesses fails; a second one in reduced space, where the first may have
     ended in a worse optimum or on the way, see `second_start`; with correspondences of measurements that
-    the estimates change; with other correlation lengths or phases of fields; and, of a large body,
+    the estimates change; with other correlation lengths of fields; and, of a large body,
     one on a coarser mesh first, see `coarse_start`. `watch` receives the iterations of all of them,
     and one of them gives the solution: its history and counts are of that search alone, and its
     times too, with those of the search on a coarser mesh if it started from there. Nothing is
@@ -125,11 +124,10 @@ def solve(
     InputError
         For a custom sensor without values, an unknown method, a start that is no run or shares no
         parameter name, if no start is found, if the machine lacks memory, for a scheduler that does
-        not answer or a method that cannot use it, for two-phase fields that cannot be searched, and
-        when the solver refuses the problem.
+        not answer or a method that cannot use it, and when the solver refuses the problem.
     SimulationError
         If the equations of motion are singular at a solution with a field whose correlation
-        length or phases are searched.
+        length is searched.
     """
     if not isinstance(problem, Problem):
         problem = Problem.read(problem)
@@ -197,8 +195,6 @@ def _solve_by(
         )
     with connect_executor(scheduler) as workers:
         solve_once = partial(_solve_once, solver=solver, watch=watch, workers=workers)
-        if any(not modes.has_phases() for modes in problem.find_two_phase_fields().values()):
-            return solve_two_phases(problem, start, solve_once=solve_once)
         solution = solve_once(problem, start)
         tried = [problem.lengths_m]
         lengths_m = _likeliest_lengths(problem, solution)

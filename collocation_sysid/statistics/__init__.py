@@ -6,8 +6,8 @@ Basis
 Error bars
     `uncertainty` computes the statistical intervals, from the noise, correlated errors and
     differences between recordings (package `residuals`) and the noise of the poses (`pose_noise`);
-    `estimates` expresses them in the user's parameters. `field_estimates`, `phase_sampling` and
-    `potts_prior` treat spatially varying constants.
+    `estimates` expresses them in the user's parameters. `field_estimates` treats
+    spatially varying constants.
 Combined intervals
     The package `budget` adds the discretisation error and systematic effects (type B) and computes
     the intervals to publish. `remedies` says what to measure.

@@ -509,21 +509,6 @@ TOPICS: dict[str, Topic] = {
         messages={
             "amplitude": "{name} varies more within the body than the prior of its field allows: "
             "the data suggest an amplitude of about {likely:.2g}, not {stated:.2g}",
-            "one-phase": "the data do not show two materials: the contrast of {name} is "
-            "{median:.3g} ({lower:.3g} to {upper:.3g}), which contains 1; use prior = 'smooth' "
-            "or no field",
-            "narrow": "the samples of the two phases of {name} have not converged (potential scale "
-            "reduction of the contrast {reduction:.2g}): its intervals are inaccurate; measure "
-            "more deformation near the inclusion or, if the boundary is known, use regions",
-            "linear": "intervals of the two phases of {name} may be too narrow: they follow from "
-            "linearised measurements only, because their samples could not be simulated; take "
-            "the intervals as lower limits",
-            "few": "the smaller phase of {name} has only {elements} elements: its intervals have "
-            "been verified for inclusions of some 80 elements, not for fewer than {fewest}; refine "
-            "the mesh there",
-            "phases": "two phases of {name} do not describe the body: χ² per measurement is "
-            "{misfit:.3g}, with a smooth field {smooth:.3g}; there may be more than two "
-            "materials, or a gradual change: use prior = 'smooth', or regions",
             "negative": "{name} is zero or negative in {below} of {elements} elements (minimum "
             "{least:.3g}): lower the amplitude of its field, {stated:.2g}, or raise its "
             "length_m",

@@ -21,7 +21,6 @@ element, which vanishes for a homogeneous body.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -33,7 +32,6 @@ from ..common.array_types import Array, Index
 from ..fem.body import Body
 from ..fem.laws.moduli import engineering_constants
 from ..fem.spatial_field import ALL_MODULI, FieldModes
-from ..fem.two_phase import PhaseSummary, TwoPhaseModes
 from ..model.generated_functions import GeneratedFunction
 from ..model.parameters import NOTHING, Parameters, ThetaMap
 from ..program.collocation import Collocation
@@ -51,54 +49,8 @@ LIKELIER = 3.0
 WIDER = 1.1
 # Largest number of elements, evenly taken, of which an averaging kernel consists.
 KERNEL_ELEMENTS = 1000
-# By this factor χ² per measurement of two phases is above that of a smooth field, or of noise,
-# where two phases do not describe the body: chance moves it by a few per cent.
-WORSE = 1.1
-# Elements of the smaller phase below which its intervals have not been verified: the study has
-# inclusions of about 80 elements, and shapes of a few elements are coarse.
-FEWEST_ELEMENTS = 50
-# Potential scale reduction from which on chains of samples have not explored all phases: with it an
-# interval would become narrower by a third if the chains were continued.
-MOST_SCALE_REDUCTION = 1.5
-# Ends of a 95 % interval, as quantiles.
-ENDS = (0.025, 0.975)
 # Factors of the amplitude that are tried.
 AMPLITUDES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-
-
-def phase_concerns(phases: PhaseSummary, name: str) -> list[Concern]:
-    """Return concerns about a two-phase field, all "check".
-
-    "field/linear" if samples could not be simulated, and "field/narrow" if the chains of samples
-    differ by more than `MOST_SCALE_REDUCTION`; "field/one-phase" if the interval of the contrast
-    contains 1, "field/few" if the smaller phase has fewer than `FEWEST_ELEMENTS` elements,
-    "field/phases" if χ² per measurement exceeds `WORSE` times the larger of 1 and that of the
-    smooth field.
-
-    Parameters
-    ----------
-    phases : PhaseSummary
-        Result of the two-phase field.
-    name : str
-        Name of the constant, with its region in front.
-    """
-    concerns = []
-    if not phases.is_simulated:
-        concerns.append(Concern("field/linear", data={"name": name}))
-    if phases.scale_reduction > MOST_SCALE_REDUCTION:
-        apart = {"name": name, "reduction": phases.scale_reduction}
-        concerns.append(Concern("field/narrow", data=apart))
-    lower, median, upper = phases.contrast
-    if lower <= 1 <= upper:
-        ends = {"name": name, "lower": lower, "median": median, "upper": upper}
-        concerns.append(Concern("field/one-phase", data=ends))
-    if phases.elements < FEWEST_ELEMENTS:
-        few = {"name": name, "elements": phases.elements, "fewest": FEWEST_ELEMENTS}
-        concerns.append(Concern("field/few", data=few))
-    if phases.misfit > WORSE * max(1.0, phases.smooth_misfit):
-        both = {"name": name, "misfit": phases.misfit, "smooth": phases.smooth_misfit}
-        concerns.append(Concern("field/phases", data=both))
-    return concerns
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,22 +70,15 @@ class FieldEstimate:
     covariance: Array
     # Stated density that the deviation refers to [kg/m³]; None for other constants.
     declared_density_kg_m3: float | None = None
-    # (lower, upper) or None: ends (k,) of the 95 % intervals from samples; None if they follow from
-    # the deviation.
-    sampled_intervals: tuple[Array, Array] | None = None
-    phases: PhaseSummary | None = None  # result of a two-phase field; None for a smooth field
     # (k,) or None: standard deviation of the estimated field under the averaging kernel of each
     # element, in the unit of `deviation`; None where it is zero.
     smoothing: Array | None = None
 
     @property
     def statistical95(self) -> tuple[Array, Array]:
-        """Lower and upper ends (k,) of the 95 % intervals: those from samples if there are any,
-        symmetric about the value for a density, else symmetric in the logarithm. NaN without
-        error bars. They contain `smoothing`.
+        """Lower and upper ends (k,) of the 95 % intervals: symmetric about the value for a density,
+        else symmetric in the logarithm. NaN without error bars. They contain `smoothing`.
         """
-        if self.sampled_intervals is not None:
-            return self.sampled_intervals
         smoothing = 0.0 if self.smoothing is None else self.smoothing
         deviation = np.hypot(self.deviation, smoothing)
         if self.declared_density_kg_m3 is not None:
@@ -144,11 +89,10 @@ class FieldEstimate:
 
     @property
     def deviation_over_prior(self) -> Array:
-        """Standard deviation (k,) of the logarithm over that of the prior about the
-        mean; for sampled phases over `PhaseSummary.deviation`. NaN without error bars.
+        """Standard deviation (k,) of the logarithm over that of the prior about the mean. NaN
+        without error bars.
         """
-        prior = self.modes.field.deviation if self.phases is None else self.phases.deviation
-        return self.deviation / prior
+        return self.deviation / self.modes.field.deviation
 
     @property
     def is_informed(self) -> NDArray[np.bool_]:
@@ -194,7 +138,7 @@ class FieldEstimate:
         """Return ln Z(D) − ln Z(I) for another correlation length [m], or for the amplitude times a
         factor.
 
-        0 for two-phase fields, where error bars exceed the prior, and where a coefficient is fixed.
+        0 where error bars exceed the prior, and where a coefficient is fixed.
 
         Parameters
         ----------
@@ -208,7 +152,7 @@ class FieldEstimate:
         Positive values favour the other prior. A length equal to the present one counts as None.
         """
         size = len(self.coefficients)
-        if self.phases is not None or len(self.covariance) < size or self._is_wider_than_prior:
+        if len(self.covariance) < size or self._is_wider_than_prior:
             return 0.0
         prior = factor**2 * np.eye(size)
         if length_m is not None and length_m != self.modes.length_m:
@@ -225,15 +169,12 @@ class FieldEstimate:
         return float(score @ prior @ np.linalg.solve(both, score) - np.linalg.slogdet(both)[1]) / 2
 
     def list_concerns(self) -> list[Concern]:
-        """Return the concerns about the field: for two phases those of `phase_concerns`; for a
-        smooth field values of zero or less in some elements ("doubtful", first), and an amplitude
-        or a length that the data contradict.
+        """Return the concerns about the field: values of zero or less in some elements
+        ("doubtful", first), and an amplitude or a length that the data contradict.
 
         The amplitude is reported if the best of `AMPLITUDES` is larger than the stated one and its
         log-evidence ratio exceeds `LIKELIER`, the length if that of half the length does.
         """
-        if self.phases is not None:
-            return phase_concerns(self.phases, self.name)
         amplitude = self.modes.field.deviation
         contradicted = dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.log_evidence_ratio(factor=factor))
@@ -302,7 +243,7 @@ def field_estimates(
         declared = None
         if part.stress_field is None:
             declared = part.density_kg_m3
-        gradient = slopes + modes.jacobian(theta[coefficients]) @ by_q[coefficients]
+        gradient = slopes + modes.shapes @ by_q[coefficients]
         # What is at a bound has no variance: it is taken for known.
         used = np.flatnonzero(gradient.any(axis=0) & ~np.isnan(np.diag(covariance)))
         own = gradient[:, used]
@@ -321,10 +262,7 @@ def field_estimates(
             covariance=covariance[np.ix_(free, free)],
             declared_density_kg_m3=declared,
         )
-        if isinstance(modes, TwoPhaseModes):
-            contrast = theta[coefficients.stop - 1]
-            estimate = _with_phases(estimate, modes, contrast=float(contrast))
-        elif uncertainty is not None and len(free) == len(modes.shapes.T):
+        if uncertainty is not None and len(free) == len(modes.shapes.T):
             estimate = replace(estimate, smoothing=_smoothing(estimate))
         estimates.append(estimate)
     return estimates
@@ -342,43 +280,6 @@ def _smoothing(estimate: FieldEstimate) -> Array:
     field = others @ estimate.coefficients
     mean = weights @ field
     return np.sqrt(np.maximum(weights @ field**2 - mean**2, 0.0))
-
-
-def _with_phases(estimate: FieldEstimate, modes: TwoPhaseModes, contrast: float) -> FieldEstimate:
-    """Return the estimate of a two-phase field with intervals from its samples.
-
-    Intervals are quantiles of the samples, widened to contain the value, so that an element at the
-    boundary has an interval from one phase to the other. Without samples, or without error bars,
-    the phases count as known, and the estimate is returned unchanged.
-    """
-    samples = modes.samples
-    if samples is None or not np.isfinite(estimate.deviation).all():
-        return estimate
-    lower, upper = np.exp(np.quantile(samples.logarithms, ENDS, axis=0))
-    # Half of the elements of either phase would differ by half the contrast's logarithm.
-    typical = np.log(contrast) ** 2 / 4 + samples.contrasts.var() / 2
-    finding = PhaseSummary(
-        contrast=_quantiles(np.exp(samples.contrasts)),
-        volume_m3=_quantiles(samples.volumes_m3),
-        deviation=float(np.sqrt(typical)),
-        misfit=samples.misfit,
-        smooth_misfit=samples.smooth_misfit,
-        elements=int(min(modes.phase.sum(), (1 - modes.phase).sum())),
-        scale_reduction=samples.scale_reduction,
-        is_simulated=samples.is_simulated,
-    )
-    return replace(
-        estimate,
-        deviation=samples.logarithms.std(axis=0),
-        sampled_intervals=(np.minimum(lower, estimate.value), np.maximum(upper, estimate.value)),
-        phases=finding,
-    )
-
-
-def _quantiles(values: Array) -> tuple[float, float, float]:
-    """Return the 2.5 %, 50 % and 97.5 % quantiles of samples (any shape, not empty)."""
-    lower, median, upper = np.quantile(values, [ENDS[0], 0.5, ENDS[1]])
-    return float(lower), float(median), float(upper)
 
 
 def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEstimate]:
@@ -400,37 +301,6 @@ def field_estimates_at(collocation: Collocation, z: Array) -> dict[str, FieldEst
         for field in field_estimates(body, collocation.parameters, q=z[:nq], uncertainty=known):
             estimates.setdefault(field.name, field)
     return estimates
-
-
-def mean_logarithm(
-    body: Body, parameters: Parameters, q: Array, *, part_index: int, names: Sequence[str]
-) -> tuple[float, Array]:
-    """Return the logarithm of the mean of a part's field, and its derivatives by some parameters;
-    for a density the ratio to the stated density in place of the logarithm.
-
-    Parameters
-    ----------
-    parameters : Parameters
-        Shared parameters.
-    q : (nq,) array
-        Estimates in the solver's coordinates.
-    part_index : int
-        Index of the part, which must have a field.
-    names : sequence of str
-        Names of the estimated parameters of the derivatives, in their order.
-
-    Returns
-    -------
-    (float, (k,) array)
-        The value, and its derivatives by q of each of the `names`.
-    """
-    modes = body.parts[part_index].field
-    assert modes is not None
-    mean, slopes = _mean_logarithm(
-        ThetaMap(parameters, body), part_index, modes=modes
-    ).evaluate_with_jacobian(q, NOTHING)
-    free = [item.name for item in parameters.free]
-    return float(mean[0]), slopes.reshape(-1)[[free.index(name) for name in names]]
 
 
 def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> GeneratedFunction:

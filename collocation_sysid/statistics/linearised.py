@@ -220,9 +220,6 @@ class LinearisedFit:
         Parameters that ended at a bound.
     derived : DerivedModuli
         Moduli that follow from the shared parameters.
-    phase_covariance : (shared, shared) array or None
-        Covariance of q due to unknown phases of a two-phase field, in the solver's coordinates;
-        None without such a field.
     """
 
     blocks: tuple[ResidualBlock, ...]
@@ -232,7 +229,6 @@ class LinearisedFit:
     prior_jacobian: Array
     at_bound: Mask
     derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
-    phase_covariance: Array | None = None
 
     @property
     def measurement_count(self) -> int:
@@ -337,21 +333,7 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
         derived=DerivedModuli.from_bodies(
             (s.constants for s in collocation.transcriptions), p[: collocation.nq]
         ),
-        phase_covariance=_covariance_by_phases(collocation),
     )
-
-
-def _covariance_by_phases(collocation: Collocation) -> Array | None:
-    """Return the covariance (nq, nq) due to unknown phases; None without samples of them."""
-    names = [item.name for item in collocation.parameters.free]
-    covariance: Array | None = None
-    for body in dict.fromkeys(transcription.body for transcription in collocation.transcriptions):
-        for samples in body.list_phase_samples():
-            places = [k for k, name in enumerate(samples.names) if name in names]
-            own = [names.index(samples.names[k]) for k in places]
-            covariance = np.zeros((len(names), len(names))) if covariance is None else covariance
-            covariance[np.ix_(own, own)] += samples.deviations[np.ix_(places, places)]
-    return covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -212,8 +212,7 @@ def uncertainty_from_fit(
     Notes
     -----
     If several recordings are fitted, each is also fitted alone, by a Gauss–Newton step and with the
-    same assumptions, to compare them. Covariances of a two-phase field's phases are added after the
-    choice of the error model.
+    same assumptions, to compare them.
     """
     factored = factorise_information(fit)
     shared = fit.shared_count
@@ -308,11 +307,6 @@ def _error_bars(
             used = "autocorrelated"
             of_score = of_correlated
     determined = factored.fit.root @ of_score @ factored.fit.root.T
-    if fit.phase_covariance is not None:
-        shared = slice(fit.shared_count)
-        covariance = covariance.copy()
-        covariance[shared, shared] += fit.phase_covariance
-        determined[shared, shared] += fit.phase_covariance
     basis = ErrorBasis(kind, used, level, dependence, unexplained, outliers)
     return covariance, determined, student_ppf(0.975, freedom), basis
 

@@ -5,8 +5,7 @@ half, or a stiff ball inside: one field of Young's modulus over the whole body i
 table has the share of elements whose 95 % interval contains the true value: of all elements, and of
 those that the data determine, whose interval is less than half as wide as that of the prior. The
 tracks are simulated with the scheme of the fit, each with its own noise, on a mesh that follows the
-boundary between the materials. For two phases the ball has another centre in each twin, and the
-intervals of the contrast are listed.
+boundary between the materials.
 
     nice -n 15 python scripts study_field --twins 10
     nice -n 15 python scripts study_field --cost
@@ -25,7 +24,6 @@ from synthetic import swing
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.spatial_field import Prior
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
@@ -43,17 +41,6 @@ OTHER_TRUTHS = {"poisson": 0.45, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}
 # Centre and radius of the stiff ball [m].
 BALL_M = np.array([0.022, 0.02, 0.06])
 RADIUS_M = 0.015
-# Centres of the ball in twins with two phases [m]; the seed selects one.
-CENTRES_M = (
-    (0.022, 0.02, 0.06),
-    (0.018, 0.021, 0.045),
-    (0.02, 0.02, 0.07),
-    (0.024, 0.017, 0.052),
-    (0.016, 0.023, 0.064),
-    (0.021, 0.019, 0.035),
-    (0.019, 0.022, 0.08),
-    (0.023, 0.024, 0.055),
-)
 
 
 @dataclass(frozen=True)
@@ -76,8 +63,6 @@ class FieldTwin:
         Standard deviation of the logarithm of stiffness in the prior.
     markers, steps : int
         Numbers of markers and of samples.
-    prior : str
-        "smooth" or "two-phase".
     """
 
     name: str
@@ -88,22 +73,15 @@ class FieldTwin:
     amplitude: float = 0.5
     markers: int = 48
     steps: int = 40
-    prior: Prior = "smooth"
-
-    def centre_m(self, seed: int) -> Array:
-        """Return the centre (3,) of the ball [m]."""
-        if self.prior == "smooth":
-            return BALL_M
-        return np.array(CENTRES_M[seed % len(CENTRES_M)])
 
 
-def stiff_cells(kind: str, mesh: cs.TetMesh, centre_m: Array = BALL_M) -> NDArray[np.bool_]:
+def stiff_cells(kind: str, mesh: cs.TetMesh) -> NDArray[np.bool_]:
     """Return the mask (cells,) of the stiffer cells; `kind` as in the twin."""
     centres = mesh.points_m[mesh.tetrahedra].mean(axis=1)
     if kind == "half":
         return centres[:, 2] < SIZE_M[2] / 2
     if kind == "ball":
-        return np.linalg.norm(centres - centre_m, axis=1) < RADIUS_M
+        return np.linalg.norm(centres - BALL_M, axis=1) < RADIUS_M
     return np.zeros(len(centres), dtype=bool)
 
 
@@ -128,7 +106,7 @@ def hanging_block(body: Body, count: int, steps: int) -> cs.Experiment:
 def problem_of(twin: FieldTwin, seed: int) -> tuple[cs.Problem, Array]:
     """Return the problem of a twin, and the logarithm of the true E in every cell (cells,)."""
     mesh = cs.box_mesh(SIZE_M, tuple(round(size / EDGE_M) for size in SIZE_M))
-    stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
+    stiff = stiff_cells(twin.kind, mesh)
     regions = [cs.Region("stiff", stiff)] if stiff.any() else []
     true_body = Body(mesh, density_kg_m3=1000.0, regions=regions)
     values = {"young_pa": YOUNG_PA, "stiff.young_pa": twin.ratio * YOUNG_PA, **OTHER_TRUTHS}
@@ -136,8 +114,7 @@ def problem_of(twin: FieldTwin, seed: int) -> tuple[cs.Problem, Array]:
     simulation = cs.simulate(
         hanging_block(true_body, twin.markers, twin.steps), true_values, "midpoint", substeps=1
     )
-    amplitude = twin.amplitude if twin.prior == "smooth" else None
-    field = cs.Field(twin.length_m, modes=twin.modes, amplitude=amplitude, prior=twin.prior)
+    field = cs.Field(twin.length_m, modes=twin.modes, amplitude=twin.amplitude)
     described = hanging_block(
         Body(mesh, density_kg_m3=1000.0, field=field), twin.markers, twin.steps
     )
@@ -154,10 +131,6 @@ TWINS = (
     FieldTwin("the same, 12 markers", "half", 2.0, 0.04, 60, markers=12),
     FieldTwin("stiff ball, twice", "ball", 2.0, 0.03, 80),
     FieldTwin("stiff ball, three times", "ball", 3.0, 0.03, 80),
-    FieldTwin("half three times, two phases", "half", 3.0, 0.04, 60, prior="two-phase"),
-    FieldTwin("ball three times, two phases", "ball", 3.0, 0.03, 80, prior="two-phase"),
-    FieldTwin("ball five times, two phases", "ball", 5.0, 0.03, 80, prior="two-phase"),
-    FieldTwin("even, two phases", "none", 1.0, 0.04, 60, prior="two-phase"),
     FieldTwin("even", "none", 1.0, 0.04, 60),
     FieldTwin("half, amplitude 0.1", "half", 2.0, 0.04, 60, 0.1),
     FieldTwin("half, length 0.4 m", "half", 2.0, 0.4, 60),
@@ -177,15 +150,12 @@ class FieldAnswer:
     mesh : TetMesh
     processor_time_s : float
         Processor time of the solve [s].
-    contrast95 : tuple or None
-        95 % interval of the ratio of two phases; None for a smooth field.
     """
 
     field: FieldEstimate
     truth: Array
     mesh: cs.TetMesh
     processor_time_s: float
-    contrast95: tuple[float, float] | None
 
 
 def identify(twin: FieldTwin, seed: int) -> FieldAnswer:
@@ -199,10 +169,7 @@ def identify(twin: FieldTwin, seed: int) -> FieldAnswer:
     uncertainty = uncertainty_at(collocation, solution.z)
     body = collocation.transcriptions[0].body
     (field,) = field_estimates(body, collocation.parameters, solution.q, uncertainty)
-    estimate = uncertainty.estimates.get("contrast")
-    return FieldAnswer(
-        field, truth, body.mesh, processor_time_s, estimate and estimate.statistical95
-    )
+    return FieldAnswer(field, truth, body.mesh, processor_time_s)
 
 
 def table_row(twin: FieldTwin, seeds: range) -> str:
@@ -217,7 +184,7 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
         processor_time_s = answer.processor_time_s
         low, high = np.log(field.statistical95)
         contains_truth = (low < truth) & (truth < high)
-        stiff = stiff_cells(twin.kind, mesh, twin.centre_m(seed))
+        stiff = stiff_cells(twin.kind, mesh)
         log = np.log(field.value)
         ratio = np.exp(log[stiff].mean() - log[~stiff].mean()) if stiff.any() else np.nan
         z_m = mesh.points_m[mesh.tetrahedra].mean(axis=1)[:, 2]
@@ -243,9 +210,6 @@ def table_row(twin: FieldTwin, seeds: range) -> str:
                 inclusion_coverage,
             )
         )
-        if answer.contrast95 is not None:
-            lower, upper = answer.contrast95
-            notes |= {f"contrast {lower:.3g} to {upper:.3g}"}
         notes |= {concern.code for concern in field.list_concerns()}
         notes |= {f"length {field.modes.length_m:g}"} if isinstance(twin.length_m, tuple) else set()
     mean = np.mean(rows, axis=0)

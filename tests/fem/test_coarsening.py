@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from collocation_sysid import Body, Field, Region, cylinder_mesh
-from collocation_sysid.errors import InputError
 from collocation_sysid.fem.coarse_body import coarsen_body
 from collocation_sysid.fem.meshes.coarsening import coarsen_mesh
 from collocation_sysid.fem.meshes.mesh import TetMesh
@@ -108,10 +107,3 @@ def test_a_field_has_the_values_of_the_same_places():
         own.shapes[np.argsort(body.mesh.centres_m[:, 0]), 0],
     )
     assert np.corrcoef(its.shapes[:, 0], along)[0, 1] > 0.98
-
-
-def test_phases_of_elements_are_refused():
-    field = Field(0.05, modes=3, prior="two-phase")
-    body = Body(BOX, density_kg_m3=1000.0, field=field)
-    with pytest.raises(InputError, match="values that belong to the elements of its own mesh"):
-        coarsen_body(body, len(BOX.points_m) // 6, [])

@@ -158,11 +158,9 @@ def differing(moved: Experiment, scheme: str = "midpoint", values=GUESS, **body)
     made = made.with_free_densities(made.parts_with_free_density(values.names))
     known = values.with_fields([made])
     uneven = {name: 0.4 * (-1) ** k for k, name in enumerate(made.field_coefficient_names)}
-    uneven |= dict.fromkeys(made.find_contrast_deviations(), 1.7)
     return program(replace(moved, body=made), parameters=known.with_guess(uneven), scheme=scheme)
 
 
-TWO_PHASES = cs.Field(0.1, modes=3, prior="two-phase")
 IN_MASS, OF_DENSITY = (
     cs.Field(0.1, "density_kg_m3", 3),
     Parameters.from_mapping({"density_kg_m3": cs.Unknown(25.0)}),
@@ -440,14 +438,6 @@ PROGRAMS: dict[str, Make] = {
     "field, bdf2": lambda: differing(swung(), "bdf2"),
     "field, damping in material form": lambda: differing(swung(), damping="material"),
     "field, paper's damping": lambda: differing(swung(), damping="rayleigh"),
-    "field, two phases": lambda: differing(swung(), field=TWO_PHASES),
-    "field, two phases, bdf2": lambda: differing(swung(), "bdf2", field=TWO_PHASES),
-    "field, two phases, memory": lambda: differing(
-        measured(hung_cube(3, (1, 1, 2))),
-        values=guesses(TWO, 1.1),
-        prony=["prony_1", "prony_2"],
-        field=TWO_PHASES,
-    ),
     "field, shear": lambda: differing(swung(), field=cs.Field(0.1, "mu_pa", 2)),
     "field, density": lambda: differing(swung(), field=IN_MASS),
     "field, density, free, bdf2": lambda: differing(

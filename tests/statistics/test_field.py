@@ -569,7 +569,7 @@ def test_intervals_inside_a_stiff_ball_contain_its_stiffness(name, seed):
     """The prior smooths the edge of the ball: without that, 40 to 70 % of them contain it."""
     (twin,) = (each for each in study_field.TWINS if each.name == name)
     answer = study_field.identify(twin, seed)
-    inside = study_field.stiff_cells(twin.kind, answer.mesh, twin.centre_m(seed))
+    inside = study_field.stiff_cells(twin.kind, answer.mesh)
     low, high = np.log(answer.field.statistical95)
     contains = (low < answer.truth) & (answer.truth < high)
     assert contains[inside].mean() > 0.9

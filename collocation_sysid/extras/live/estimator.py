@@ -169,18 +169,6 @@ class LiveUpdate:
         return f"Update(t = {self.t_s:.4g} s: {values}; {self.trust.verdict})"
 
 
-def _require_phases(problem: Problem) -> None:
-    """Raise an `InputError` for a problem with a two-phase field without known phases, which live
-    estimation cannot find.
-    """
-    for name, modes in problem.find_two_phase_fields().items():
-        if not modes.has_phases():
-            raise InputError(
-                f"the phases of {name} are unknown, and a live estimate does not search for them; "
-                "expected the problem of a result, `cs.run(problem).problem`, or prior = 'smooth'"
-            )
-
-
 class LiveEstimator:
     """Estimator of a problem's parameters from frames, one after another.
 
@@ -231,7 +219,6 @@ class LiveEstimator:
         self.problem = problem
         self.options = options
         self.clock = clock
-        _require_phases(problem)
         self.model = model_from_problem(problem)
         model = self.model
         self.names = self.model.experiment.markers.names

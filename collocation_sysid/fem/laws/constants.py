@@ -305,14 +305,6 @@ FIELD_COEFFICIENT = Constant(
     usual=0.0,
     prior=(0.0, 1.0),
 )
-# Contrast of a field with prior "two-phase", see `two_phase`; 1 in a body of one material.
-CONTRAST = Constant(
-    "contrast",
-    "contrast",
-    meaning="ratio of inclusion to surroundings",
-    bounds=(0.02, 50.0),
-    usual=1.0,
-)
 # Constants of fibres, see `fibres`.
 FIBRE_STIFFNESS = Constant(
     "fibre_pa", "E_f", meaning="stiffness that fibres add along themselves", bounds=STIFFNESS
@@ -371,7 +363,6 @@ KNOWN: Mapping[str, Constant] = {
         DENSITY,
         MASS,
         FRICTION,
-        CONTRAST,
         FIBRE_STIFFNESS,
         FIBRE_EXPONENT,
         FIBRE_DISPERSION,

@@ -164,7 +164,7 @@ class StressEvaluator:
                     derivatives[:, j, part_columns] += theta_q[first + k, j] * by_constant[:, k]
                 if field:
                     field_columns = body.field_slices[number]
-                    logs = field.jacobian(theta[field_columns]) @ theta_q[field_columns]
+                    logs = field.shapes @ theta_q[field_columns]
                     for j in np.flatnonzero(logs.any(axis=0)):
                         point_values = np.tile(np.repeat(logs[:, j], body.geometry.shape[1]), 6)
                         derivatives[:, j, part_columns] += point_values * by_constant[:, count]
