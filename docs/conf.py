@@ -9,8 +9,6 @@ from latex2mathml.converter import convert
 from sphinx.ext.napoleon import NumpyDocstring
 
 sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts" / "tools"))
-from badges import badges, repository_url
 from reference import PUBLISHED, write_pages
 
 from collocation_sysid.datasets.public_data import data_folder
@@ -27,12 +25,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
 ]
 myst_enable_extensions = ["dollarmath", "amsmath", "substitution"]
-# Badges of the tutorial's notebooks, empty until pyproject.toml states the repository.
-_pyproject = Path(__file__).parents[1] / "pyproject.toml"
-myst_substitutions = {
-    "release": release,
-    "badges": badges(repository_url(_pyproject.read_text(encoding="utf-8"))),
-}
+myst_substitutions = {"release": release}
 myst_heading_anchors = 3
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = ["_build", "gallery"]

@@ -22,14 +22,12 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from shutil import which
 from typing import Any, Literal
 
 import numpy as np
@@ -44,13 +42,7 @@ from peer_case import (
     cylinder,
     recording,
 )
-from peer_simulators import (
-    MUJOCO_STEP_S,
-    RECORDING_STEP_S,
-    UnstableSimulationError,
-    simulate_flex,
-    simulate_with_calculix,
-)
+from peer_simulators import MUJOCO_STEP_S, RECORDING_STEP_S, UnstableSimulationError, simulate_flex
 from scipy.optimize import least_squares, minimize
 from studies import markdown
 
@@ -244,20 +236,6 @@ def search_with_own_simulation(experiment: cs.Experiment, progress: Progress) ->
     search(simulate, experiment, progress)
 
 
-def search_with_scikit_fem(experiment: cs.Experiment, progress: Progress) -> None:
-    """Search by SciPy with a simulation of scikit-fem."""
-    from peer_scikit_fem import ScikitFemCylinder
-
-    search(ScikitFemCylinder().simulate, experiment, progress)
-
-
-def search_with_calculix(experiment: cs.Experiment, progress: Progress) -> None:
-    """Search by SciPy with runs of CalculiX in a temporary folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        simulate = partial(simulate_with_calculix, folder=Path(folder))
-        search(simulate, experiment, progress)
-
-
 def descend_with_warp(experiment: cs.Experiment, progress: Progress) -> None:
     """Minimise the loss by L-BFGS-B, with gradients through a simulation in Warp.
 
@@ -337,8 +315,6 @@ class Candidate:
         Distribution that it needs; None: none.
     module : str or None
         Module of the distribution, or None where both names are the same.
-    program : str or None
-        Program that it needs; None: none.
     is_compiled : bool
         True: the first run compiles code, and the second one is measured.
     """
@@ -347,7 +323,6 @@ class Candidate:
     run: Callable[[cs.Experiment, Progress], None]
     package: str | None = None
     module: str | None = None
-    program: str | None = None
     is_compiled: bool = False
 
     def missing_requirement(self) -> str | None:
@@ -355,17 +330,12 @@ class Candidate:
         module = self.module or self.package
         if module is not None and find_spec(module) is None:
             return f"`pip install {self.package}`"
-        if self.program is not None and which(self.program) is None:
-            return f"the program `{self.program}`"
         return None
 
     def version(self) -> str | None:
-        """Return the name and version of the distribution or program, or None if not needed."""
+        """Return the name and version of the distribution, or None if not needed."""
         if self.package is not None:
             return f"{self.package} {version(self.package)}"
-        if self.program is not None:
-            done = subprocess.run([self.program, "-v"], capture_output=True, text=True, check=False)
-            return f"{self.program}: {done.stdout.strip()}"
         return None
 
 
@@ -404,15 +374,6 @@ CANDIDATES = {
         package="warp-lang",
         module="warp",
         is_compiled=True,
-    ),
-    "calculix": Candidate(
-        "SciPy `least_squares` with CalculiX", search_with_calculix, program="ccx"
-    ),
-    "scikit-fem": Candidate(
-        "SciPy `least_squares` with scikit-fem",
-        search_with_scikit_fem,
-        package="scikit-fem",
-        module="skfem",
     ),
 }
 # Name of the process that computes the best answer.

@@ -1,36 +1,18 @@
-"""Simulations of the swung cylinder by MuJoCo's flex and by CalculiX.
-
-`simulate_flex` needs the package `mujoco`, `simulate_with_calculix` the program ``ccx``. The
-cylinder and the motion of the hand are those of `peer_case`.
-"""
+"""Simulation of the swung cylinder of `peer_case` by MuJoCo's flex."""
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from peer_case import (
-    GRAVITY_M_S2,
-    NODE_MASS_KG,
-    SAMPLE_COUNT,
-    SAMPLE_S,
-    STEPS_PER_SAMPLE,
-    cylinder,
-    grasped_nodes,
-    grasped_positions,
-    hand_motion,
-)
+from peer_case import NODE_MASS_KG, SAMPLE_COUNT, SAMPLE_S, grasped_nodes, hand_motion
 
 import collocation_sysid as cs
 
 Array = NDArray[np.float64]
-
-# MuJoCo -------------------------------------------------------------------------------------------
 
 # The body settles at the implicit integrator's large steps, which damp it strongly.
 SETTLING_STEP_S = 5e-3
@@ -167,144 +149,3 @@ def _flex_description(mesh: cs.TetMesh, values: Mapping[str, float]) -> str:
 def _words(array: Any) -> str:
     """Return numbers separated by spaces."""
     return " ".join(map(str, np.ravel(array).tolist()))
-
-
-# CalculiX -----------------------------------------------------------------------------------------
-
-# Name of CalculiX's files in the folder of a simulation.
-JOB = "cylinder"
-# Density of the elements, which carry no mass but must have some [kg/m³].
-NO_DENSITY_KG_M3 = 1e-6
-
-
-def simulate_with_calculix(
-    values: Mapping[str, float], folder: Path, *, is_damped: bool = True
-) -> Array:
-    """Simulate the cylinder by CalculiX's implicit dynamics, in steps of the trapezoidal rule.
-
-    CalculiX has Rayleigh damping β K instead of the damping stress of `peer_case`; γ_r is its β.
-
-    Parameters
-    ----------
-    values : dict of str to float
-        Values of the parameters of `peer_case.TRUTH`.
-    folder : path
-        Existing folder for CalculiX's files, which are overwritten.
-    is_damped : bool
-        False: without damping.
-
-    Returns
-    -------
-    positions_m : (T, n, 3) array
-        Positions of the nodes at the samples [m].
-
-    Raises
-    ------
-    UnstableSimulationError
-        If CalculiX fails, with the end of what it printed.
-    """
-    mesh = cylinder()
-    deck = _calculix_deck(mesh, values, is_damped=is_damped)
-    (folder / f"{JOB}.inp").write_text(deck, encoding="ascii")
-    process = subprocess.run(
-        ["ccx", "-i", JOB], cwd=folder, capture_output=True, text=True, check=False
-    )
-    blocks = (folder / f"{JOB}.dat").read_text().split("displacements")[1:]
-    if process.returncode or len(blocks) != SAMPLE_COUNT:
-        raise UnstableSimulationError(f"CalculiX: {process.stdout[-300:]}")
-    displacements_m = [_displacements(block) for block in blocks]
-    return np.array(displacements_m) + mesh.points_m
-
-
-def _displacements(block: str) -> Array:
-    """Return the displacements (n, 3) [m] of a block of CalculiX's table of nodes."""
-    lines = [line.split() for line in block.splitlines()[1:]]
-    rows = [line[1:] for line in lines if len(line) == 4 and line[0].isdigit()]
-    return np.array(rows, dtype=float)
-
-
-def _calculix_deck(mesh: cs.TetMesh, values: Mapping[str, float], *, is_damped: bool) -> str:
-    """Return CalculiX's input: a static step under gravity, then the motion of the hand."""
-    grasped = grasped_nodes(mesh)
-    free = np.setdiff1d(np.arange(len(mesh.points_m)), grasped)
-    elements = np.asarray(mesh.tetrahedra) + 1
-    lumps = [[len(elements) + 1 + k, n + 1] for k, n in enumerate(free)]
-    weight_n = NODE_MASS_KG * GRAVITY_M_S2[2]
-    loads = "\n".join(f"{n + 1},3,{weight_n:.12e}" for n in free)
-    damping = f"*DAMPING,ALPHA=0.,BETA={values['gamma_r_s']:.12e}"
-    step_s = SAMPLE_S / STEPS_PER_SAMPLE
-    times_s = step_s * np.arange((SAMPLE_COUNT - 1) * STEPS_PER_SAMPLE + 1)
-    displacements_m = grasped_positions(mesh, times_s) - mesh.points_m[grasped]
-    return f"""*NODE,NSET=ALL
-{_rows(enumerate(mesh.points_m, start=1))}
-*ELEMENT,TYPE=C3D4,ELSET=BODY
-{_rows(enumerate(elements, start=1))}
-*ELEMENT,TYPE=MASS,ELSET=LUMPS
-{_rows((lump[0], lump[1:]) for lump in lumps)}
-*MASS,ELSET=LUMPS
-{NODE_MASS_KG:.12e}
-*MATERIAL,NAME=FOAM
-*ELASTIC
-{values["young_pa"]:.12e},{values["poisson"]:.12e}
-*DENSITY
-{NO_DENSITY_KG_M3}
-{damping if is_damped else "**"}
-*SOLID SECTION,ELSET=BODY,MATERIAL=FOAM
-{_amplitudes(grasped, times_s, displacements_m)}
-*STEP,NLGEOM,INC=1000
-*STATIC
-0.25,1.
-*BOUNDARY
-{_rows((n + 1, (1, 3, 0.0)) for n in grasped)}
-*CLOAD
-{loads}
-*NODE PRINT,NSET=ALL,FREQUENCY=1000
-U
-*EL PRINT,ELSET=BODY,TOTALS=ONLY,FREQUENCY=1000
-ELSE
-*END STEP
-*STEP,NLGEOM,INC=100000
-*DYNAMIC,DIRECT,ALPHA=0.
-{step_s:.12e},{times_s[-1]:.12e}
-{_boundary_conditions(grasped)}
-*CLOAD
-{loads}
-*NODE PRINT,NSET=ALL,FREQUENCY={STEPS_PER_SAMPLE}
-U
-*END STEP
-"""
-
-
-def _amplitudes(
-    grasped: NDArray[np.intp], times_s: NDArray[np.floating], displacements_m: Array
-) -> str:
-    """Return CalculiX's tables of the displacements (k, g, 3) [m] of the grasped nodes."""
-    tables = []
-    for k, node in enumerate(grasped):
-        for axis in range(3):
-            rows = np.column_stack([times_s, displacements_m[:, k, axis]])
-            lines = "\n".join(f"{t:.12e},{u:.12e}" for t, u in rows)
-            tables.append(f"*AMPLITUDE,NAME=A{node}_{axis}\n{lines}")
-    return "\n".join(tables)
-
-
-def _boundary_conditions(grasped: NDArray[np.intp]) -> str:
-    """Return CalculiX's conditions that the grasped nodes follow their tables."""
-    return "\n".join(
-        f"*BOUNDARY,AMPLITUDE=A{n}_{axis}\n{n + 1},{axis + 1},{axis + 1},1."
-        for n in grasped
-        for axis in range(3)
-    )
-
-
-def _rows(rows: Iterable[tuple[int, Any]]) -> str:
-    """Return lines of a number and further numbers, of at most 20 characters each."""
-    return "\n".join(
-        ",".join([str(number), *(_number(value) for value in values)]) for number, values in rows
-    )
-
-
-def _number(value: float) -> str:
-    """Return an integer without decimals, and another number with 13 digits."""
-    is_integer = isinstance(value, (int, np.integer))
-    return str(value) if is_integer else f"{value:.12e}"

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import study_faults
 import study_methods
-import study_mismatch
-import study_noise
 import study_table1
 from assumed_twins import _body
 from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, run_variants, worst_error
@@ -18,8 +16,6 @@ from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, run_variants, w
 from collocation_sysid.statistics.budget.shape_error import thickness_m
 
 pytestmark = pytest.mark.long
-
-SIGMA_M = 1e-3
 
 
 def cells(table: str) -> list[list[str]]:
@@ -89,66 +85,6 @@ def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
     monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
     rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS, tmp_path)
     assert {len(each) for each in rows.values()} == {1}
-
-
-# Integrators --------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def fits() -> dict[str, list[study_mismatch.SchemeFit]]:
-    experiment = study_mismatch.exact_recording(layers=2, samples=15, fine_s=1e-3)
-    return {
-        scheme: [study_mismatch.identify(experiment, scheme, m) for m in (2, 4)]
-        for scheme in ("backward-euler", "midpoint")
-    }
-
-
-def test_finer_steps_bias_the_parameters_less(fits):
-    for coarse, fine in fits.values():
-        assert coarse.converged
-        assert fine.converged
-        assert np.abs(fine.errors).max() < np.abs(coarse.errors).max()
-
-
-def test_the_midpoint_rule_biases_stiffness_by_the_square_of_the_step(fits):
-    assert study_mismatch.orders(fits["midpoint"])[1] == pytest.approx(2, abs=0.4)
-
-
-def test_steps_with_an_estimate_at_its_bound_give_no_order():
-    fits = [
-        study_mismatch.SchemeFit(
-            "midpoint", h, True, np.full(4, -3 * h), np.arange(4) == bounded, 0.0, 0.0
-        )
-        for h, bounded in ((0.01, None), (0.02, None), (0.04, 2))
-    ]
-    assert study_mismatch.orders(fits) == pytest.approx(1)
-    assert np.isnan(study_mismatch.orders(fits[1:])).all()
-    assert [line[4] for line in cells(study_mismatch.table(fits))] == ["-3", "-6", "-12*"]
-    everything, finest = cells(study_mismatch.order_table(fits[1:]))
-    assert everything[1:] == finest[1:] == ["–"] * 4
-
-
-# Noise --------------------------------------------------------------------------------------------
-
-
-def test_methods_turn_the_same_noise_into_the_same_error():
-    expected = np.array(study_noise.predicted(SIGMA_M))
-    reduced, shooting = (study_noise.run(case, SIGMA_M, 0) for case in study_noise.CASES[:2])
-    assert reduced.converged
-    assert shooting.converged
-    assert reduced.errors == pytest.approx(shooting.errors, abs=1e-4)
-    assert (np.abs(reduced.errors) < 5 * expected).all()
-
-
-def test_noise_is_summed_up_over_converged_runs():
-    errors = [np.full(4, 0.01), np.full(4, -0.01), np.full(4, 9.0)]
-    outcomes = [
-        study_noise.NoiseOutcome(converged, each, 1.0)
-        for converged, each in zip((True, True, False), errors, strict=True)
-    ]
-    predicted, line = cells(study_noise.table({"some": outcomes}, [0.02] * 4))
-    assert predicted[4] == "2"
-    assert line[:5] == ["some", "3", "2", "+0 ± 1", "1.41"]
 
 
 def test_tables_are_markdown():

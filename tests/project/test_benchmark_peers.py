@@ -57,9 +57,9 @@ def test_the_table_shows_reached_and_missing_solvers():
     tracks = {
         "reduced-space": track_of(1.5, 1.001),
         "warp": track_of(2.0, 1.8, 1.5, 1.0),
-        "calculix": track_of(1.5, 1.2, has_ended=False),
+        "mujoco-sysid": track_of(1.5, 1.2, has_ended=False),
     }
-    lines = table(tracks, {"scikit-fem": "not installed"}, TRUTH).splitlines()
+    lines = table(tracks, {"mujoco-sysid-default": "not installed"}, TRUTH).splitlines()
     cells = [[cell.strip() for cell in line.split("|")] for line in lines[2:]]
     assert cells[0][2:7] == ["1", "2", "20", "9", "90"]
     assert cells[1][2:4] == ["2", "4"]
@@ -71,8 +71,8 @@ def test_the_table_shows_reached_and_missing_solvers():
 
 def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(monkeypatch, capsys, tmp_path):
     def measure(name: str) -> Track:
-        if name == "calculix":
-            raise subprocess.CalledProcessError(3, "ccx")
+        if name == "mujoco-sysid":
+            raise subprocess.CalledProcessError(3, "python")
         return track_of(1.5, 1.0)
 
     def requirement(candidate: Candidate) -> str | None:
@@ -83,7 +83,7 @@ def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(monkeypatch,
     monkeypatch.setattr(Candidate, "missing_requirement", requirement)
     monkeypatch.setattr(Candidate, "version", lambda _: None)
     out = tmp_path / "new" / "peers.md"
-    compare(["calculix", "warp", "reduced-space"], out)
+    compare(["mujoco-sysid", "warp", "reduced-space"], out)
     text = out.read_text(encoding="utf-8")
     assert "failed with exit code 3" in text
     assert "not installed: `pip install warp-lang`" in text
@@ -104,12 +104,10 @@ def test_only_better_fits_are_entries_and_the_limit_stops_a_search(monkeypatch):
     assert progress.counts == [1, 3]
 
 
-def test_missing_packages_and_programs_are_named():
+def test_missing_packages_are_named():
     run = CANDIDATES["warp"].run
     package = Candidate("a", run, package="no-such-tool", module="no_such_tool")
     assert package.missing_requirement() == "`pip install no-such-tool`"
-    program = Candidate("b", run, program="no-such-program")
-    assert program.missing_requirement() == "the program `no-such-program`"
     assert Candidate("c", run, package="numpy").missing_requirement() is None
 
 
