@@ -25,7 +25,7 @@ from ..program.sweep import Sweep
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
-from .starts.stiffness_scan import Scan
+from .starts.start import Scan
 
 
 class Status(Enum):

@@ -26,7 +26,7 @@ from ..features.measurement_results import (
 from ..features.measurements import prediction_error, stated_sigmas, units_by_name
 from ..fem.laws.constants import GAMMA_R
 from ..methods.solution import pooled_wrench_rms
-from ..methods.starts.stiffness_scan import ScanSummary
+from ..methods.starts.start import ScanSummary
 from ..model.contact.summary import friction_summaries
 from ..model.schemes import as_scheme
 from ..problem import Problem

@@ -16,7 +16,7 @@ from ..features.measurement_results import FitResult, ForwardResult
 from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution
 from ..methods.solution import Iteration, Timing
-from ..methods.starts.stiffness_scan import ScanSummary
+from ..methods.starts.start import ScanSummary
 from ..statistics.assessment import Assessment
 from ..statistics.budget.alternatives import Alternative, OriginAnswer
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds

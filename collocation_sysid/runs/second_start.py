@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from ..fem.laws.constants import (
 )
 from ..methods.solution import Solution
 from ..methods.starts.power_law import power_law_start
+from ..methods.starts.start import Start
 from ..model.parameters import Parameter, Parameters, can_be_widened, with_widest_bounds
 from ..statistics.linearised import AT_BOUND, parameter_values
 
@@ -47,20 +48,15 @@ LEAST_SHARE = 0.01
 LITTLE_MEMORY = 1e-3
 
 
-@dataclass(frozen=True)
-class SecondStart:
-    """Start of a second search."""
+def second_start(solution: Solution) -> Start | None:
+    """Return the start of a second search after a solution; None if a worse optimum is unlikely.
 
-    parameters: Parameters  # parameters with the start as guesses
-    reason: str  # why there is a second search, and its start: a sentence without its predicate
-
-
-def second_start(solution: Solution) -> SecondStart | None:
-    """Return the start of a second search after a solution; None if a worse optimum is unlikely."""
+    The note of a second start says why there is one: a sentence without its predicate.
+    """
     return _usual_poisson_start(solution) or _power_law_start(solution)
 
 
-def start_beyond_bounds(solution: Solution) -> SecondStart | None:
+def start_beyond_bounds(solution: Solution) -> Start | None:
     """Return the estimates of a solution as a start within the `widest` bounds of its constants;
     None if no parameter ended at a default bound that can be widened.
 
@@ -89,11 +85,10 @@ def start_beyond_bounds(solution: Solution) -> SecondStart | None:
     listed = " and ".join(f"{name} = {bound:.4g}" for name, bound in ended.items())
     values = {item.name: known[item.name] for item in parameters.free}
     values |= _negative_terms(solution, values, ended)
-    return SecondStart(
-        parameters.map_components(lambda item: _widened(item, values, ended, locks)).with_estimates(
-            values
-        ),
-        f"the search ended at the default bound{'s' * (len(ended) > 1)} {listed}; a second one, "
+    wider = parameters.map_components(lambda item: _widened(item, values, ended, locks))
+    return Start(
+        solution.collocation.with_parameters(wider.with_estimates(values)),
+        note=f"the search ended at the default bound{'s' * (len(ended) > 1)} {listed}; a second one, "
         "with wider bounds,",
     )
 
@@ -166,7 +161,7 @@ def _widened(
     return widened
 
 
-def _usual_poisson_start(solution: Solution) -> SecondStart | None:
+def _usual_poisson_start(solution: Solution) -> Start | None:
     """Return the parameters at a solution, as guesses, with high Poisson's ratios replaced by the
     usual one at the same Young's modulus.
 
@@ -185,13 +180,12 @@ def _usual_poisson_start(solution: Solution) -> SecondStart | None:
             if len(own) == 2 or own == [name]:
                 young_pa = values[region + "young_pa"]
                 changed |= {each: _usual_modulus(each, young_pa) for each in own}
-    if not changed:
+    if not changed or any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
         return None
-    return _changed_start(
-        collocation.parameters,
-        values,
-        changed,
-        reason="Poisson's ratio ended near one half; a second start, from the usual "
+    estimates = {name: values[name] for name in free} | changed
+    return Start(
+        collocation.with_parameters(collocation.parameters.with_estimates(estimates)),
+        note="Poisson's ratio ended near one half; a second start, from the usual "
         f"{USUAL_POISSON},",
     )
 
@@ -210,7 +204,7 @@ def _usual_modulus(name: str, young_pa: float) -> float:
     return value
 
 
-def _power_law_start(solution: Solution) -> SecondStart | None:
+def _power_law_start(solution: Solution) -> Start | None:
     """Return the start of `power_law_start`; None where there is none, and where the solution has
     the same exponents or fits as well by the closed forms.
     """
@@ -219,7 +213,7 @@ def _power_law_start(solution: Solution) -> SecondStart | None:
     if start is None:
         return None
     values = parameter_values(collocation, solution.q)
-    guesses = start.parameters.guesses
+    guesses = start.collocation.parameters.guesses
     exponents = [
         sorted(value for name, value in each.items() if name.startswith("alpha_"))
         for each in (values, guesses)
@@ -231,19 +225,5 @@ def _power_law_start(solution: Solution) -> SecondStart | None:
     if is_same or solution.history[-1].loss <= (1 + LEAST_SHARE) * start.loss:
         return None
     found = ", ".join(f"{exponent:.3g}" for exponent in exponents[1])
-    return SecondStart(
-        start.parameters, f"a second start, from the exponents {found} of the closed forms,"
-    )
-
-
-def _changed_start(
-    parameters: Parameters, values: Mapping[str, float], changed: Mapping[str, float], reason: str
-) -> SecondStart | None:
-    """Return the start from values of the estimated parameters, some of them changed, all by name;
-    None if a changed value is not within its bounds.
-    """
-    free = {item.name: item for item in parameters.free}
-    if any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
-        return None
-    start = {name: values[name] for name in free} | dict(changed)
-    return SecondStart(parameters.with_estimates(start), reason)
+    note = f"a second start, from the exponents {found} of the closed forms,"
+    return replace(start, note=note)

@@ -16,7 +16,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Iteration, Method, Solution, Status, Watch
-from ..methods.starts.stiffness_scan import Scan
+from ..methods.starts.stiffness_scan import Scan, Start
 from ..program.collocation import Collocation
 
 # Difference of losses below which two solutions are the same minimum with other correspondences:
@@ -103,11 +103,11 @@ def _is_at(line: Iteration, solution: Solution) -> bool:
 
 
 def follow_starts(
-    solver: Method, collocation: Collocation, scan: Scan, solve: Solve
-) -> tuple[Collocation, Scan, Solution | None, str]:
+    solver: Method, start: Start, scan: Scan, solve: Solve
+) -> tuple[Start, Solution | None]:
     """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
-    The best start of the scan is returned without a solution if the scan found only one start, if
+    The best start of the scan, `start`, is returned without a solution if the scan found only one start, if
     the problem has no local minima, if no start converges, or after an interrupt; an interrupted
     solution is returned with it if the method is reduced space. Exceptions of `solve` are not
     caught.
@@ -117,23 +117,21 @@ def follow_starts(
     solver : Method
         If this is not the reduced-space method, the starts are followed in reduced space, which is
         much faster, and the result has no solution: the solver goes on from the best start.
-    collocation : Collocation
-        Program with the guesses of the scan's best stiffness.
+    start : Start
+        With the guesses of the scan's best stiffness.
     scan : Scan
-        Scan with its starts; not modified.
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
 
     Returns
     -------
-    (collocation, scan, solution, note)
-        Program with the best start as guess, not associated with the body there, the scan with this
-        start as its best, the solution from there if the method is reduced space, and a note on the
-        losses.
+    (start, solution)
+        The best start, not associated with the body there, with the scan that has it as its best and
+        a note on the losses; and the solution from there if the method is reduced space.
     """
-    first = collocation, scan, None, ""
+    collocation = start.collocation
     if not scan.others or not has_local_minima(collocation):
-        return first
+        return start, None
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
     is_own = own == ReducedSpace.name
     method: Method = solver if is_own else ReducedSpace()
@@ -147,11 +145,11 @@ def follow_starts(
             candidates.append((robust_loss(known.solution), number, known.solution))
             continue
         if solution.status is Status.INTERRUPTED:
-            return collocation, scan, solution if is_own else None, ""
+            return start, solution if is_own else None
         if solution.status.converged:
             candidates.append((robust_loss(solution), number, solution))
     if not candidates:
-        return first
+        return start, None
     loss, best, solution = min(candidates, key=lambda each: each[0])
     losses = ", ".join(
         f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in candidates
@@ -164,4 +162,4 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = collocation.with_parameters(scan.starts[best])
-    return started, chosen, solution if is_own else None, note
+    return Start(started, note=note, scan=chosen), solution if is_own else None

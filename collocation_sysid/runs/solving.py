@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,32 +19,17 @@ from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.starts.initial_trajectories import associated_at_guess
-from ..methods.starts.stiffness_scan import Scan, rescue, start_problem
+from ..methods.starts.start import Scan, Start
+from ..methods.starts.stiffness_scan import rescue, start_problem
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from .check.cost import require_memory
-from .coarse_start import (
-    CoarseStart,
-    NoCoarseStartError,
-    interrupted_solution,
-    mesh_error_note,
-    plan_coarse_start,
-    require_determined_moduli,
-    start_note,
-    undetermined_names,
-)
-from .second_start import SecondStart, second_start, start_beyond_bounds, without_limitless_shares
+from .coarse_start import CoarseStart
+from .second_start import second_start, start_beyond_bounds, without_limitless_shares
 from .several_starts import follow_starts
-from .thinned_start import (
-    NoThinnedStartError,
-    collocation_with_all_points,
-    interrupted_with_all_points,
-    point_counts,
-    require_determined,
-    thinned_problem,
-    thinned_start_note,
-)
+from .smaller_problem import NoStartError, SmallerProblem
+from .thinned_start import ThinnedStart
 from .warm_start import WarmStart
 
 # Outcomes of a failed search, after which another start may help.
@@ -219,115 +204,62 @@ def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float]
     }
 
 
-def _solve_by_coarse_start(
-    problem: Problem, solver: ReducedSpace, watch: Watch | None, workers: ExperimentExecutor | None
-) -> Solution | None:
-    """Solve a problem with fixed correlation lengths on a coarser mesh first, and from there on its
-    own; None if the method's options or the sizes of the bodies do not call for a coarse start.
-    """
-    coarse_start = plan_coarse_start(problem, solver)
-    if coarse_start is None:
-        return None
-    coarse = _solve_on_coarse_mesh(coarse_start, solver=solver, watch=watch, workers=workers)
-    if coarse.status is Status.INTERRUPTED:
-        return interrupted_solution(coarse_start, problem, coarse)
-    if not coarse.status.converged:
-        raise NoCoarseStartError(
-            f"the solve on {coarse_start.describe_size()} ended with: {coarse.message}"
-        )
-    undetermined = undetermined_names(coarse)
-    require_determined_moduli(undetermined)
-    return _solve_from_coarse(
-        problem,
-        coarse_start,
-        coarse=coarse,
-        undetermined=undetermined,
-        solver=solver,
-        watch=watch,
-        workers=workers,
-    )
-
-
-def _solve_on_coarse_mesh(
-    coarse_start: CoarseStart,
-    *,
-    solver: ReducedSpace,
-    watch: Watch | None,
-    workers: ExperimentExecutor | None,
-) -> Solution:
-    """Return the solution on a coarser mesh, with a tolerance of at least `COARSE_TOLERANCE`; also
-    if it did not converge. The problem is `coarse_start.problem`, solved from its guesses or a
-    scan; the other arguments are those of `_solve_once`.
-    """
-    tolerance = max(solver.tolerance, COARSE_TOLERANCE)
-    with search_activity(f"coarse start on {coarse_start.describe_size()}"):
-        try:
-            return _solve_once(
-                coarse_start.problem,
-                None,
-                solver=replace(solver, tolerance=tolerance),
-                watch=watch,
-                workers=workers,
-            )
-        except InputError as error:
-            raise NoCoarseStartError(error.message) from error
-
-
-def _solve_from_coarse(
+def _solve_from_smaller(
+    smaller: SmallerProblem,
     problem: Problem,
-    coarse_start: CoarseStart,
-    *,
-    coarse: Solution,
-    undetermined: Sequence[str],
     solver: ReducedSpace,
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Solve a problem from the solution on a coarser mesh.
+    """Solve a smaller problem first, with a tolerance of at least `COARSE_TOLERANCE`, and the given
+    one from there.
 
-    The result counts the iterations and evaluations on the given mesh only, but the times of both
-    solves; the scan and its notes are those of the coarse solve.
+    The result counts the iterations and evaluations on the given problem only, but the times of both
+    solves; the scan is that of the first. After an interruption of the first its point is returned.
+
+    Raises
+    ------
+    NoStartError
+        If one of the two searches fails, or the first gives no start.
     """
-    collocation = coarse_start.given_collocation(problem, coarse, undetermined=undetermined)
+    rough = replace(solver, tolerance=max(solver.tolerance, COARSE_TOLERANCE))
+    with search_activity(smaller.activity):
+        try:
+            first = _solve_once(smaller.problem, None, rough, watch=watch, workers=workers)
+        except InputError as error:
+            raise NoStartError(error.message) from error
+    if first.status is Status.INTERRUPTED:
+        return smaller.interrupted(problem, first)
+    search, size = smaller.search
+    if not first.status.converged:
+        raise NoStartError(f"the {search} {size} ended with: {first.message}")
+    collocation = smaller.given_collocation(problem, first)
     try:
         require_memory(problem, collocation, method=solver)
     except InputError as error:
         raise error.located(problem.path) from error
-    collocation = associated_at_guess(collocation)
-    collocation = WarmStart.of(coarse).apply_to_places(collocation)
-    tolerance = max(solver.tolerance, solver.coarse_start_tolerance)
-    method = with_workers(replace(solver, tolerance=tolerance), workers)
+    start = smaller.start(collocation, first)
+    method = with_workers(replace(solver, tolerance=smaller.tolerance(solver)), workers)
     solution = solve_with_renewed_correspondences(
-        method,
-        collocation,
-        watch=watch,
-        start=coarse_start.simulated_variables(collocation, coarse),
+        method, start.collocation, watch=watch, start=start.variables
     )
     if solution.status in FAILED_STATUSES:
-        raise NoCoarseStartError(
-            f"the search from the solution on {coarse_start.describe_size()} ended with: "
-            f"{solution.message}"
-        )
-    where = "on the coarse mesh" if coarse_start.relations else "with some samples"
-    notes = [
-        start_note(coarse_start, coarse, solution),
-        *(f"{where}: {note}" for note in coarse.notes),
-    ]
-    if solution.status.converged:
-        error_note = mesh_error_note(coarse_start, coarse, solution)
-        notes += [error_note] if error_note else []
+        raise NoStartError(f"the search from the solution {size} ended with: {solution.message}")
+    replaced = [*_feature_notes(solution), *_feature_notes(first)]
+    notes = smaller.notes(first, solution, replaced)
+    if smaller.has_second_start and solution.status.converged:
         solution = best_of_second_start(method, solution, watch=watch)
     return replace(
         solution,
-        scan=coarse.scan,
-        timing=solution.timing + coarse.timing,
+        scan=first.scan,
+        timing=solution.timing + first.timing,
         notes=(*notes, *solution.notes, *_feature_notes(solution)),
     )
 
 
 def _solve_once(
     problem: Problem,
-    start: str | Path | WarmStart | None,
+    given_start: str | Path | WarmStart | None,
     solver: Method,
     watch: Watch | None,
     workers: ExperimentExecutor | None,
@@ -336,42 +268,35 @@ def _solve_once(
     solution.
     """
     notes: list[str] = []
-    if start is None and isinstance(solver, ReducedSpace):
-        try:
-            solution = _solve_by_coarse_start(problem, solver, watch=watch, workers=workers)
-        except NoCoarseStartError as reason:
-            solution = None
-            notes.append(f"the search had no coarse start: {reason}")
-        if solution is not None:
-            return solution
-        try:
-            solution = _solve_by_thinned_start(problem, solver, watch=watch, workers=workers)
-        except NoThinnedStartError as reason:
-            notes.append(f"the search was not started with fewer points: {reason}")
-        if solution is not None:
-            return replace(solution, notes=(*notes, *solution.notes))
-    warm_start = WarmStart.read(start) if isinstance(start, (str, Path)) else start
+    if given_start is None and isinstance(solver, ReducedSpace):
+        for kind in (CoarseStart, ThinnedStart):
+            try:
+                smaller = kind.of(problem, solver)
+                if smaller is None:
+                    continue
+                solution = _solve_from_smaller(smaller, problem, solver, watch, workers)
+            except NoStartError as reason:
+                notes.append(f"{kind.missing}: {reason}")
+            else:
+                return replace(solution, notes=(*notes, *solution.notes))
+    is_folder = isinstance(given_start, (str, Path))
+    warm_start = WarmStart.read(given_start) if is_folder else given_start
     if warm_start is not None:
         problem = warm_start.apply_to_problem(problem)
     try:
-        collocation, scan, variables, note = _program_and_start(
-            problem, solver, warm_start=warm_start
-        )
+        start = _program_and_start(problem, solver, warm_start=warm_start)
+        scan = start.scan
         solver = with_workers(solver, workers)
         solution = None
-        comparison = ""
         if scan is not None:
-            collocation, scan, solution, comparison = follow_starts(
-                solver,
-                collocation,
-                scan=scan,
-                solve=partial(solve_with_renewed_correspondences, watch=watch),
-            )
+            solve_again = partial(solve_with_renewed_correspondences, watch=watch)
+            start, solution = follow_starts(solver, start, scan, solve=solve_again)
+            scan = start.scan
             if solution is None:
-                collocation = associated_at_guess(collocation)
+                start = replace(start, collocation=associated_at_guess(start.collocation))
         if solution is None:
             solution = solve_with_renewed_correspondences(
-                solver, collocation, watch=watch, start=variables
+                solver, start.collocation, watch=watch, start=start.variables
             )
         if scan is None and solution.status in FAILED_STATUSES:
             scan, solution = _solve_from_scan(solver, solution, watch=watch)
@@ -384,7 +309,7 @@ def _solve_once(
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, where="solver")
     if scan is not None:
         notes.append(scan.sentence)
-    notes += [each for each in (comparison, note) if each]
+    notes += [start.note] if start.note else []
     return replace(
         solution,
         scan=scan or solution.scan,
@@ -392,61 +317,8 @@ def _solve_once(
     )
 
 
-def _solve_by_thinned_start(
-    problem: Problem, solver: ReducedSpace, watch: Watch | None, workers: ExperimentExecutor | None
-) -> Solution | None:
-    """Solve a problem with thinned clouds of its cameras first, and from there with all
-    points; None if no cloud has many points.
-
-    The result counts the sweeps with all points only, but the times of both searches. After an
-    interrupt of the first its point is returned, see `interrupted_with_all_points`. The arguments
-    are those of `_solve_once`.
-    """
-    thinned = thinned_problem(problem)
-    if thinned is None:
-        return None
-    tolerance = max(solver.tolerance, COARSE_TOLERANCE)
-    with search_activity("search with fewer points"):
-        rough = _solve_once(
-            thinned, None, solver=replace(solver, tolerance=tolerance), watch=watch, workers=workers
-        )
-    if rough.status is Status.INTERRUPTED:
-        return interrupted_with_all_points(problem, rough)
-    require_determined(rough)
-    collocation = collocation_with_all_points(problem, rough)
-    try:
-        require_memory(problem, collocation, method=solver)
-    except InputError as error:
-        raise error.located(problem.path) from error
-    solution = solve_with_renewed_correspondences(
-        with_workers(solver, workers), collocation, watch=watch, start=rough.z
-    )
-    if solution.status in FAILED_STATUSES:
-        raise NoThinnedStartError(
-            f"the search from the solution with {point_counts(rough.collocation)} ended with: "
-            f"{solution.message}"
-        )
-    fit_notes = _feature_notes(solution)
-    replaced_notes = [*solution.notes, *fit_notes, *_feature_notes(rough)]
-    return replace(
-        solution,
-        scan=rough.scan,
-        timing=solution.timing + rough.timing,
-        notes=(
-            thinned_start_note(rough, solution),
-            *(note for note in rough.notes if note not in replaced_notes),
-            *solution.notes,
-            *fit_notes,
-        ),
-    )
-
-
-def _program_and_start(
-    problem: Problem, solver: Method, warm_start: WarmStart | None
-) -> tuple[Collocation, Scan | None, Array | None, str]:
-    """Return the nonlinear program of a problem with complete guesses, the start of its search, and
-    a note on it.
-    """
+def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart | None) -> Start:
+    """Return the start of the search in the nonlinear program of a problem."""
     for experiment in problem.experiments:
         lost_samples(experiment)
     collocation = problem.collocation()
@@ -459,18 +331,15 @@ def _program_and_start(
     if has_guesses:
         require_memory(problem, collocation, method=solver)
     with time_limit(_start_limit_s(problem, solver)):
-        collocation, scan, note = start_problem(
-            collocation, getattr(solver, "needs_complete_start", False)
-        )
+        start = start_problem(collocation, getattr(solver, "needs_complete_start", False))
     if not has_guesses:  # the estimate evaluates the program at a guess
-        require_memory(problem, collocation, method=solver)
-    if scan is not None:
-        return collocation, scan, None, note
-    collocation = associated_at_guess(collocation)
+        require_memory(problem, start.collocation, method=solver)
+    if start.scan is not None:
+        return start
+    start = replace(start, collocation=associated_at_guess(start.collocation))
     if warm_start is None:
-        return collocation, None, None, note
-    collocation = warm_start.apply_to_places(collocation)
-    return collocation, None, warm_start.simulated_variables(collocation), note
+        return start
+    return replace(warm_start.start(start.collocation), note=start.note)
 
 
 def _feature_notes(solution: Solution) -> list[str]:
@@ -557,10 +426,7 @@ def continued_beyond_bounds(solver: Method, first: Solution, watch: Watch | None
 
 
 def _better_of(
-    solver: Method,
-    first: Solution,
-    watch: Watch | None,
-    choose: Callable[[Solution], SecondStart | None],
+    solver: Method, first: Solution, watch: Watch | None, choose: Callable[[Solution], Start | None]
 ) -> Solution:
     """Return the better of a solution and of that from the start chosen for it."""
     if first.status in FINAL_STATUSES or not first.history:
@@ -569,7 +435,7 @@ def _better_of(
         other = choose(first)
         if other is None:
             return first
-        again = associated_at_guess(first.collocation.with_parameters(other.parameters))
+        again = associated_at_guess(other.collocation)
         second = solve_with_renewed_correspondences(solver, again, watch=watch)
     except KeyboardInterrupt:
         return _as_interrupted(first)
@@ -578,15 +444,15 @@ def _better_of(
     gain = first.history[-1].loss - second.history[-1].loss if second.history else 0.0
     if first.status.converged and not second.status.converged and gain > LEAST_GAIN:
         note = (
-            f"{other.reason} fitted better (χ² lower by {gain:.3g}), but did not converge: "
+            f"{other.note} fitted better (χ² lower by {gain:.3g}), but did not converge: "
             f"{second.message}"
         )
         return replace(first, notes=(*first.notes, note))
     if not second.status.converged or (first.status.converged and gain <= LEAST_GAIN):
         return first
-    note = f"{other.reason} found a better fit (χ² lower by {gain:.3g})"
+    note = f"{other.note} found a better fit (χ² lower by {gain:.3g})"
     if not first.status.converged:
-        note = f"{other.reason} converged, after a first search that did not"
+        note = f"{other.note} converged, after a first search that did not"
     return replace(second, notes=(note, *second.notes))
 
 

@@ -4,22 +4,23 @@ first.
 Every search of correspondences and every residual costs time for each point, but a few points per
 face determine the shape almost as well as all. So the scan of the stiffness, the alignment of the
 camera and all searches from several starts use thinned clouds, and the search with all points
-begins at their solution. Its criterion of convergence is the same as without a thinned start.
+begins at their solution.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from ..fem.laws.constants import symbol_of
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Solution, Status
-from ..methods.solve_recorder import Recorder
+from ..methods.solution import Solution
+from ..methods.starts.start import Start
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.measurement_models import with_correspondences
 from ..recording.measurement_selection import thinned_experiment
-from .coarse_start import undetermined_names
+from .smaller_problem import NoStartError, SmallerProblem, undetermined_names
 
 # Largest number of points of a thinned cloud: then other parts of a search take as long as the
 # points.
@@ -29,38 +30,72 @@ THINNED_POINTS = 1500
 MANY_POINTS = 4000
 
 
-class NoThinnedStartError(Exception):
-    """Reason why a problem is not started from thinned clouds, as a part of a sentence."""
+@dataclass(frozen=True, eq=False)
+class ThinnedStart(SmallerProblem):
+    """Problem with thinned clouds, which determines the same parameters as the given one."""
 
+    missing = "the search was not started with fewer points"
+    has_second_start = False
 
-def thinned_problem(problem: Problem) -> Problem | None:
-    """Return the problem with at most `THINNED_POINTS` unlabelled points in each sample of its
-    sensors, without notes; None if none of the fitted experiments has more than `MANY_POINTS` in
-    one. The problem is not modified.
-    """
-    experiments = [
-        each if each.validation else thinned_experiment(each, many=MANY_POINTS, most=THINNED_POINTS)
-        for each in problem.experiments
-    ]
-    pairs = zip(experiments, problem.experiments, strict=True)
-    if all(thinned is given for thinned, given in pairs):
-        return None
-    return replace(problem, experiments=experiments, notes=())
+    @classmethod
+    def of(cls, problem: Problem, method: ReducedSpace) -> ThinnedStart | None:
+        """Return the problem with at most `THINNED_POINTS` unlabelled points in each sample of its
+        sensors, without notes; None if none of the fitted experiments has more than `MANY_POINTS` in
+        one. The problem is not modified.
+        """
+        experiments = [
+            each
+            if each.validation
+            else thinned_experiment(each, many=MANY_POINTS, most=THINNED_POINTS)
+            for each in problem.experiments
+        ]
+        pairs = zip(experiments, problem.experiments, strict=True)
+        if all(thinned is given for thinned, given in pairs):
+            return None
+        return cls(replace(problem, experiments=experiments, notes=()))
 
+    @property
+    def activity(self) -> str:
+        return "search with fewer points"
 
-def require_determined(thinned: Solution) -> None:
-    """Raise `NoThinnedStartError` if a solution with thinned clouds did not converge, or does not
-    determine an estimated parameter, see `undetermined_names`: all points may have the optimum
-    elsewhere. Nothing is returned.
-    """
-    if not thinned.status.converged:
-        raise NoThinnedStartError(
-            f"the search with {point_counts(thinned.collocation)} ended with: {thinned.message}"
+    @property
+    def search(self) -> tuple[str, str]:
+        return "search", f"with {point_counts(self.problem.collocation())}"
+
+    def given_collocation(self, problem: Problem, solution: Solution) -> Collocation:
+        """Return the program of a problem with the parameters, places and clocks of a solution with
+        thinned clouds, and the correspondences of all points with its shapes.
+
+        Its variables are those of the solution, which has the same parameters.
+
+        Raises
+        ------
+        NoStartError
+            If the solution does not determine a parameter: all points may have the optimum
+            elsewhere.
+        """
+        for name in undetermined_names(solution):
+            raise NoStartError(
+                f"{point_counts(solution.collocation)} do not determine {symbol_of(name)}"
+            )
+        return collocation_with_all_points(problem, solution)
+
+    def start(self, collocation: Collocation, solution: Solution) -> Start:
+        return Start(collocation, solution.z)
+
+    def interrupted_start(self, problem: Problem, solution: Solution) -> Start:
+        note = (
+            f"interrupted during the search with {point_counts(solution.collocation)}: the values "
+            "do not fit all points best"
         )
-    for name in undetermined_names(thinned):
-        raise NoThinnedStartError(
-            f"{point_counts(thinned.collocation)} do not determine {symbol_of(name)}"
-        )
+        return Start(collocation_with_all_points(problem, solution), solution.z, note)
+
+    def notes(self, first: Solution, given: Solution, replaced: Sequence[str]) -> list[str]:
+        return [
+            f"searched with {point_counts(first.collocation)} first, then with "
+            f"{point_counts(given.collocation)} in {given.iterations} sweeps",
+            *(note for note in first.notes if note not in (*given.notes, *replaced)),
+        ]
 
 
 def collocation_with_all_points(problem: Problem, thinned: Solution) -> Collocation:
@@ -74,7 +109,7 @@ def collocation_with_all_points(problem: Problem, thinned: Solution) -> Collocat
     problem : Problem
         Given problem.
     thinned : Solution
-        Solution of `thinned_problem`.
+        Solution of a `ThinnedStart`'s problem.
     """
     program = thinned.collocation
     given = {each.name: each for each in problem.experiments}
@@ -92,37 +127,6 @@ def collocation_with_all_points(problem: Problem, thinned: Solution) -> Collocat
     return replace(program, experiments=problem.experiments, associations=associations)
 
 
-def interrupted_with_all_points(problem: Problem, thinned: Solution) -> Solution:
-    """Return the present point of an interrupted search with thinned clouds as an interrupted
-    solution of the given problem; its history has one entry, the evaluation at that point.
-
-    Parameters
-    ----------
-    problem : Problem
-        Given problem; not modified.
-    thinned : Solution
-        Solution of `thinned_problem`, interrupted.
-    """
-    collocation = collocation_with_all_points(problem, thinned)
-    recorder = Recorder(ReducedSpace.name, collocation)
-    recorder.add_variables(0, thinned.z, collocation.objective(thinned.z))
-    solution = recorder.solution(
-        Status.INTERRUPTED,
-        Status.INTERRUPTED.sentence,
-        z=thinned.z,
-        multipliers=thinned.initial_multipliers,
-        iterations=0,
-        evaluations=0,
-    )
-    note = (
-        f"interrupted during the search with {point_counts(thinned.collocation)}: the values do "
-        "not fit all points best"
-    )
-    return replace(
-        solution, notes=(note,), scan=thinned.scan, timing=solution.timing + thinned.timing
-    )
-
-
 def point_counts(collocation: Collocation) -> str:
     """Return the number of unlabelled points of all fitted experiments, in words."""
     sensors = [
@@ -134,13 +138,3 @@ def point_counts(collocation: Collocation) -> str:
     count = sum(sum(sensor.point_counts) for sensor in sensors)
     names = dict.fromkeys(sensor.points_name for sensor in sensors)
     return f"{count:,} {' and '.join(names)}"
-
-
-def thinned_start_note(thinned: Solution, solution: Solution) -> str:
-    """Return a note on the numbers of points of a search with thinned clouds and of the search with
-    all points from there, and on the sweeps of the latter.
-    """
-    return (
-        f"searched with {point_counts(thinned.collocation)} first, then with "
-        f"{point_counts(solution.collocation)} in {solution.iterations} sweeps"
-    )

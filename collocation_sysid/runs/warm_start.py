@@ -13,6 +13,7 @@ from ..common.files import RESULT_FILE, damage_refused
 from ..errors import InputError
 from ..methods.solution import Solution
 from ..methods.starts.initial_trajectories import simulate_trajectories
+from ..methods.starts.start import Start
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..program.transcription import Transcription
@@ -167,20 +168,21 @@ class WarmStart:
                     matches += 1
         return p, matches
 
-    def simulated_variables(self, collocation: Collocation) -> Array | None:
-        """Return the variables z (variables,) of a simulation at the guess with the earlier
-        nuisance parameters, limited to their bounds.
+    def start(self, collocation: Collocation) -> Start:
+        """Return the start at the guesses with the earlier places of markers and nuisance parameters,
+        limited to their bounds.
 
-        None if no nuisance parameter or place matches, or if the simulation fails. The places of
-        markers are not changed: `apply_to_places` sets them in `collocation` beforehand. Every
-        parameter must have a guess.
+        It has no variables if no nuisance parameter or place matches, or if the simulation fails.
+        Every parameter must have a guess.
         """
+        collocation = self.apply_to_places(collocation)
         p, matches = self.apply_to_nuisance(collocation)
         matches += sum(
             len(self._known_places(transcription)) for transcription in collocation.transcriptions
         )
         if not matches:
-            return None
+            return Start(collocation)
         p = np.clip(p, *collocation.parameter_bounds)
         positions, failure = simulate_trajectories(collocation, p)
-        return None if failure is not None else collocation.pack(p, positions)
+        variables = None if failure is not None else collocation.pack(p, positions)
+        return Start(collocation, variables)

@@ -39,6 +39,7 @@ from collocation_sysid import cli, pipeline
 from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sources, common
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.methods.solution import Iteration, Status
+from collocation_sysid.methods.starts.start import Start
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
@@ -47,7 +48,6 @@ from collocation_sysid.result import run_record
 from collocation_sysid.result import solve_progress as progress_shown
 from collocation_sysid.result.solve_progress import Heartbeat
 from collocation_sysid.runs import forward_simulation, solving
-from collocation_sysid.runs.second_start import SecondStart
 
 RESULT_KEYS = {
     "schema": set(),
@@ -422,7 +422,7 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch
 
     monkeypatch.setattr(solving, "solve_with_renewed_correspondences", solved)
     monkeypatch.setattr(
-        solving, "second_start", lambda first: SecondStart(first.collocation.parameters, "again")
+        solving, "second_start", lambda first: Start(first.collocation, note="again")
     )
     method = settings("solver.method=reduced-space")
     outcome = run_command("solve", "problem.toml", *method, "--out", "run")

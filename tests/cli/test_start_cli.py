@@ -164,7 +164,7 @@ def test_nuisance_parameters_are_taken_over(folder):
     earlier = WarmStart.read(run)
     problem = earlier.apply_to_problem(cs.Problem.read(file, shift[1::2]))
     collocation = problem.collocation()
-    z = earlier.simulated_variables(collocation)
+    z = earlier.start(collocation).variables
     assert z is not None
     (phi,) = collocation.parameters_from(z)[collocation.nq :] * 0.01
     assert phi == pytest.approx(next(iter(nuisance.values()))["value"])

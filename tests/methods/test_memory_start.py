@@ -37,9 +37,9 @@ def relaxation():
 
 
 def started(experiments, values):
-    collocation, scan, _ = start_problem(cs.Problem(experiments, values).collocation())
-    assert scan is None
-    return collocation.parameters.guesses
+    start = start_problem(cs.Problem(experiments, values).collocation())
+    assert start.scan is None
+    return start.collocation.parameters.guesses
 
 
 def require_truth(found, tolerance):

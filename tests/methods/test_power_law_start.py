@@ -67,7 +67,7 @@ def without_guess(law: str, specimens: list[cs.Specimen], **stated) -> cs.Proble
 def start_of(problem: cs.Problem):
     start = power_law_start(problem.collocation())
     assert start is not None
-    return start, {item.name: item for item in start.parameters.components}
+    return start, {item.name: item for item in start.collocation.parameters.components}
 
 
 @pytest.mark.long
@@ -208,7 +208,7 @@ def test_a_recording_for_validation_does_not_change_the_start():
     tested = replace(problem.experiments[1], validation=True)
     beside, _ = start_of(replace(problem, experiments=[problem.experiments[0], tested]))
     assert beside.loss == alone.loss
-    assert beside.parameters.guesses == alone.parameters.guesses
+    assert beside.collocation.parameters.guesses == alone.collocation.parameters.guesses
 
 
 @pytest.mark.long

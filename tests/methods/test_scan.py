@@ -270,7 +270,8 @@ def test_a_force_that_is_felt_late_is_waited_for():
 
 def test_a_guess_that_gives_more_force_than_there_is_is_replaced():
     bench = unseen(block("z"))
-    collocation, found, _ = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
+    start = start_problem(Problem([bench], guessed(mu_pa=9e3)).collocation())
+    collocation, found = start.collocation, start.scan
     assert found is not None
     assert (
         "the simulation is farther from the measurements than a body that moves" in found.sentence
@@ -292,16 +293,23 @@ def test_a_problem_is_solved_without_a_guess(method):
     assert f"after a scan of {len(solution.scan.young_pa)} stiffnesses in" in solution.notes[0]
 
 
+def require_kept(collocation):
+    start = start_problem(collocation)
+    assert start.collocation is collocation
+    assert start.scan is None
+    assert start.note == ""
+
+
 def test_a_guess_that_can_be_simulated_is_kept():
     collocation = cube(GUESS).collocation()
-    assert start_problem(collocation) == (collocation, None, "")
+    require_kept(collocation)
 
 
 def test_damping_alone_needs_no_scan():
     given = {**{name: TRUTH[name] for name in ("lambda_pa", "mu_pa")}, "gamma_m_1_s": 1.0}
-    collocation, found, _ = start_problem(cube({**given, "gamma_r_s": Unknown()}).collocation())
-    assert found is None
-    assert collocation.parameters.guesses["gamma_r_s"] == pytest.approx(0.003)
+    start = start_problem(cube({**given, "gamma_r_s": Unknown()}).collocation())
+    assert start.scan is None
+    assert start.collocation.parameters.guesses["gamma_r_s"] == pytest.approx(0.003)
 
 
 def test_a_guess_that_cannot_be_simulated_is_rescued_with_a_note():
@@ -316,7 +324,8 @@ def test_a_guess_that_fits_worse_than_a_rigid_body_is_replaced(monkeypatch):
     monkeypatch.setattr(
         "collocation_sysid.methods.starts.stiffness_scan.TrialSimulation.rigid_misfit", 1e-3
     )
-    collocation, found, _ = start_problem(cube(guessed(mu_pa=1e4)).collocation())
+    start = start_problem(cube(guessed(mu_pa=1e4)).collocation())
+    collocation, found = start.collocation, start.scan
     assert found is not None
     assert found.sentence.startswith(
         "at the guess, the simulation is farther from the measurements"
@@ -333,7 +342,7 @@ def test_a_better_guess_than_the_scans_best_stays(monkeypatch):
         "collocation_sysid.methods.starts.stiffness_scan.TrialSimulation.rigid_misfit", 0.0
     )
     collocation = cube(guessed(**{**TRUTH, "mu_pa": 301.0})).collocation()
-    assert start_problem(collocation)[0] is collocation
+    require_kept(collocation)
 
 
 @pytest.mark.long
@@ -356,7 +365,7 @@ def test_a_guess_is_kept_if_the_scan_fits_hardly_better(monkeypatch):
     assert failure is None
     # The scan is better, but hardly.
     assert 1.0 < misfit / result.misfit[result.best] < CLEARLY_BETTER
-    assert start_problem(blurred) == (blurred, None, "")
+    require_kept(blurred)
 
 
 def too_soft() -> dict[str, Unknown | float]:

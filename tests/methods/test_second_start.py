@@ -32,7 +32,7 @@ def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
     start = second_start(first)
     assert start is not None
-    guesses = {item.name: item.guess for item in start.parameters.free}
+    guesses = {item.name: item.guess for item in start.collocation.parameters.free}
     assert guesses["poisson"] == 0.3
     assert guesses["young_pa"] == pytest.approx(first.parameters["young_pa"])
     assert guesses["gamma_r_s"] == pytest.approx(first.parameters["gamma_r_s"])
@@ -66,7 +66,7 @@ def test_a_second_start_keeps_a_parameter_at_its_bound():
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
     start = second_start(first)
     assert start is not None
-    assert start.parameters.guesses["gamma_m_1_s"] == pytest.approx(5.0)
+    assert start.collocation.parameters.guesses["gamma_m_1_s"] == pytest.approx(5.0)
 
 
 @pytest.mark.long

@@ -29,7 +29,7 @@ from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.experiment_coarsening import coarse_experiment, node_sets
 from collocation_sysid.runs import coarse_start
-from collocation_sysid.runs.coarse_start import plan_coarse_start
+from collocation_sysid.runs.coarse_start import CoarseStart
 from collocation_sysid.runs.forward_simulation import simulate_experiments
 from collocation_sysid.runs.solving import solve
 
@@ -156,8 +156,8 @@ def test_a_mesh_that_cannot_be_coarser_is_noted():
 
 def test_small_bodies_and_given_starts_have_no_coarse_start():
     problem = problem_of(measured(hung_cube(10)))
-    assert plan_coarse_start(problem, ReducedSpace()) is None
-    assert plan_coarse_start(problem, replace(COARSE, coarse_start=False)) is None
+    assert CoarseStart.of(problem, ReducedSpace()) is None
+    assert CoarseStart.of(problem, replace(COARSE, coarse_start=False)) is None
 
 
 @pytest.mark.parametrize("value", [True, "on", 1])
@@ -239,7 +239,7 @@ def test_a_search_with_many_samples_starts_with_some_of_them(monkeypatch):
     assert simulated.trajectory.steps_per_sample == 4
     monkeypatch.setattr(coarse_start, "MANY_SAMPLES", 60)
     monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 12)
-    start = plan_coarse_start(problem, ReducedSpace())
+    start = CoarseStart.of(problem, ReducedSpace())
     assert start is not None
     (some,) = start.problem.experiments
     (given,) = problem.experiments
@@ -261,14 +261,14 @@ def test_all_samples_of_fast_motions_and_of_other_sensors_are_the_start(monkeypa
     (swing,) = finely_sampled().experiments
     ripple_m = 0.02 * np.sin(np.arange(len(swing.t_s)) * np.pi / 2)[:, None, None]
     tracks = with_markers(swing, swing.markers.positions_m + ripple_m)
-    assert plan_coarse_start(problem_of(tracks), ReducedSpace()) is None
-    assert plan_coarse_start(problem_of(swing), ReducedSpace()) is not None
+    assert CoarseStart.of(problem_of(tracks), ReducedSpace()) is None
+    assert CoarseStart.of(problem_of(swing), ReducedSpace()) is not None
 
 
 def test_frames_of_obstacles_are_copied():
     experiment = pressed_box()
     problem = Problem([experiment], TRUTH | {"mu_pa": Unknown(250.0)})
-    start = plan_coarse_start(problem, ReducedSpace(coarse_start_nodes=60))
+    start = CoarseStart.of(problem, ReducedSpace(coarse_start_nodes=60))
     assert start is not None
     (coarse,) = start.problem.experiments
     assert len(coarse.body.frames) == len(experiment.body.frames) == 2

@@ -121,7 +121,7 @@ def test_a_later_solve_starts_from_the_places_found(folder: Path, result: dict):
     assert transcription.marker_places_m(transcription.guess_phi) == pytest.approx(
         np.array(found), abs=1e-9
     )
-    z = earlier.simulated_variables(collocation)
+    z = earlier.start(collocation).variables
     assert z is not None
     again = cs.solve(problem, "reduced-space", start=folder / "run")
     assert again.status.converged

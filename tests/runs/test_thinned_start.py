@@ -16,7 +16,9 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
-from collocation_sysid.runs import several_starts, solving, thinned_start
+from collocation_sysid.runs import several_starts, thinned_start
+from collocation_sysid.runs.smaller_problem import NoStartError
+from collocation_sysid.runs.thinned_start import ThinnedStart
 
 # Finer than the pixels, so that no point is left out.
 SPACING_M = 2e-4
@@ -38,6 +40,12 @@ def depth() -> cs.Depth:
 
 def problem() -> cs.Problem:
     return cs.Problem([hanging((depth(),))], UNKNOWN)
+
+
+def thinned() -> ThinnedStart:
+    start = ThinnedStart.of(problem(), ReducedSpace())
+    assert start is not None
+    return start
 
 
 @pytest.fixture
@@ -65,18 +73,18 @@ def standard_error(solution: cs.Solution) -> float:
 
 
 def test_thinned_points_are_measured_ones_and_few(many):
-    thinned = depth().thinned(400)
-    (cloud,) = thinned.clouds
+    few = depth().thinned(400)
+    (cloud,) = few.clouds
     (given,) = depth().clouds
     assert len(given) > 1000
     assert 100 < len(cloud) <= 400
     rows = {row.tobytes() for row in given}
     assert all(row.tobytes() in rows for row in cloud)
-    assert thinned.sigma_m == depth().sigma_m
+    assert few.sigma_m == depth().sigma_m
 
 
 def test_few_points_are_not_thinned():
-    assert thinned_start.thinned_problem(problem()) is None
+    assert ThinnedStart.of(problem(), ReducedSpace()) is None
 
 
 def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
@@ -106,10 +114,10 @@ def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
 
 
 def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(many, monkeypatch):
-    def fail(_):
-        raise thinned_start.NoThinnedStartError("300 depth points fail")
+    def fail(*_):
+        raise NoStartError("300 depth points fail")
 
-    monkeypatch.setattr(solving, "require_determined", fail)
+    monkeypatch.setattr(ThinnedStart, "given_collocation", fail)
     solution = cs.solve(problem())
     assert "the search was not started with fewer points: 300 depth points fail" in (solution.notes)
     assert solution.status.converged
@@ -117,11 +125,12 @@ def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(many, mon
 
 
 def test_thinned_points_that_do_not_determine_a_parameter_are_no_start(many, monkeypatch):
-    rough = cs.solve(thinned_start.thinned_problem(problem()))
-    thinned_start.require_determined(rough)
+    smaller = thinned()
+    rough = cs.solve(smaller.problem)
+    smaller.given_collocation(problem(), rough)
     monkeypatch.setattr(thinned_start, "undetermined_names", lambda _: ("young_pa",))
-    with pytest.raises(thinned_start.NoThinnedStartError, match="determine E"):
-        thinned_start.require_determined(rough)
+    with pytest.raises(NoStartError, match="determine E"):
+        smaller.given_collocation(problem(), rough)
 
 
 def test_an_interrupt_keeps_the_point_and_compares_all_points(many):
@@ -197,18 +206,18 @@ def test_a_search_at_a_known_minimum_ends():
 
 
 def test_all_points_have_the_correspondences_of_the_thinned_solution(many):
-    thinned = cs.solve(thinned_start.thinned_problem(problem()))
-    collocation = thinned_start.collocation_with_all_points(problem(), thinned)
+    rough = cs.solve(thinned().problem)
+    collocation = thinned_start.collocation_with_all_points(problem(), rough)
     (transcription,) = collocation.transcriptions
     (found,) = transcription.association.correspondences
     assert isinstance(found, SurfaceCorrespondences)
     assert found.camera.depth is depth()
-    (before,) = thinned.collocation.transcriptions[0].association.correspondences
+    (before,) = rough.collocation.transcriptions[0].association.correspondences
     assert found.gate_m == before.gate_m
     assert found.is_compared.sum() > 2 * before.is_compared.sum()
-    assert len(thinned.z) == collocation.variable_count
+    assert len(rough.z) == collocation.variable_count
     # All points fit the shape of the thinned ones up to the noise.
-    p, positions = collocation.unpack(thinned.z)
+    p, positions = collocation.unpack(rough.z)
     distances_m = found.signed_distances_m(
         found.shapes_m, collocation.iterates_at(p, positions)[0].phi
     )

@@ -23,6 +23,7 @@ from ...program.collocation import Collocation
 from ...recording.experiment import Experiment
 from ...recording.specimen import RELAXED_STRAIN
 from ...recording.specimen_files import specimen_strains
+from .start import Start
 
 # Relaxation times of the grid for each decade, and how far it reaches beyond the measured times.
 PER_DECADE = 4
@@ -105,16 +106,10 @@ class _Table:
         return mu if specimen.test == "simple-shear" else mu * (3 * lam + 2 * mu) / (lam + mu)
 
 
-def memory_start(collocation: Collocation, parameters: Parameters) -> Parameters | None:
-    """Return the parameters with the start as guesses; None unless all recordings are harmonic tests
-    or tables of a relaxation modulus of specimens with the same branches, all of whose shares are
-    estimated; or if the guesses are as good.
-
-    Parameters
-    ----------
-    collocation : Collocation
-    parameters : Parameters
-        Those of the collocation, with guesses of all.
+def memory_start(collocation: Collocation, parameters: Parameters) -> Start | None:
+    """Return a start; None unless all recordings are harmonic tests or tables of a relaxation
+    modulus of specimens with the same branches, all of whose shares are estimated; or if the guesses
+    are as good. `parameters` are those of the collocation, with guesses of all.
     """
     tables = [_Table.of(each.experiment) for each in collocation.transcriptions]
     found = [each for each in tables if each is not None]
@@ -125,7 +120,8 @@ def memory_start(collocation: Collocation, parameters: Parameters) -> Parameters
     is_alike = all(_branch_names(each.part) == names for each in found)
     if not is_alike or not known.issuperset(name for pair in names for name in pair):
         return None
-    return _MemoryFit(parameters, found, names).start()
+    started = _MemoryFit(parameters, found, names).start()
+    return None if started is None else Start(collocation.with_parameters(started))
 
 
 def _branch_names(part: BodyPart) -> list[tuple[str, str]]:

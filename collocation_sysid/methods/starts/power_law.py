@@ -24,12 +24,13 @@ from scipy.optimize import OptimizeResult, least_squares
 from ...common.array_types import Array
 from ...fem.laws.constants import constant_named, symbol_of
 from ...fem.laws.ogden import is_power_law, term_numbers
-from ...model.parameters import Parameter, Parameters, Tied, with_widest_bounds
+from ...model.parameters import Parameter, Tied, with_widest_bounds
 from ...program.collocation import Collocation
 from ...recording.experiment import Experiment
 from ...recording.homogeneous_deformation import AXES
 from ...recording.specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
 from ...recording.specimen_files import deformed_gradients
+from .start import Start
 
 # Sizes of the exponents of the grid, each with both signs.
 GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0)
@@ -130,17 +131,15 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class PowerLawStart:
-    """Start of a law in powers of the stretches."""
+class PowerLawStart(Start):
+    """Start of a law in powers of the stretches: guesses of its factors, exponents and β; those that
+    the measurements do not determine are fixed or tied, and named in the note.
+    """
 
-    # With the start as guesses of the factors, exponents and β; those that are not determined are
-    # fixed or tied.
-    parameters: Parameters
     # Young's modulus of an incompressible body with these constants, for the other guesses.
-    young_pa: float
-    note: str  # what the measurements do not determine; empty if they determine all constants
-    loss: float  # χ² of the closed form at the start
-    is_at_bound: bool  # whether an exponent is at the largest one that is allowed
+    young_pa: float = 0.0
+    loss: float = np.inf  # χ² of the closed form at the start
+    is_at_bound: bool = False  # whether an exponent is at the largest one that is allowed
 
 
 def power_law_start(collocation: Collocation) -> PowerLawStart | None:
@@ -167,7 +166,7 @@ class _PowerLawFits:
 
     Parameters
     ----------
-    parameters : Parameters
+    collocation : Collocation
     tests : sequence of _Test
     is_foam : bool
         Whether the law is the compressible foam, else Ogden's with incompressible specimens.
@@ -177,12 +176,13 @@ class _PowerLawFits:
 
     def __init__(
         self,
-        parameters: Parameters,
+        collocation: Collocation,
         tests: Sequence[_Test],
         is_foam: bool,
         widened: Callable[[Parameter], Parameter],
     ) -> None:
-        self.parameters = parameters
+        self.collocation = collocation
+        self.parameters = parameters = collocation.parameters
         self.tests = tests
         self.is_foam = is_foam
         self.items = {item.name: widened(item) for item in parameters.components}
@@ -226,7 +226,7 @@ class _PowerLawFits:
             return None
         is_foam = law.startswith("hyperfoam-")
         tests = [test for each in experiments if (test := _test(each, is_foam))]
-        fits = cls(parameters, tests, is_foam, widened)
+        fits = cls(collocation, tests, is_foam, widened)
         return fits if own and fits.measurements > len(own) else None
 
     def _numbers(self) -> range:
@@ -479,7 +479,13 @@ class _PowerLawFits:
         is_at_bound = not (
             AT_BOUND * self.lowest < fit.alpha.min() and fit.alpha.max() < AT_BOUND * self.highest
         )
-        return PowerLawStart(parameters, young_pa, "; ".join(notes), fit.loss, is_at_bound)
+        return PowerLawStart(
+            self.collocation.with_parameters(parameters),
+            note="; ".join(notes),
+            young_pa=young_pa,
+            loss=fit.loss,
+            is_at_bound=is_at_bound,
+        )
 
     def _notes(
         self, terms: int, near: Sequence[int], tied: Mapping[str, Tied], fixed: Mapping[str, float]

@@ -15,11 +15,10 @@ The same scan is used if a guess cannot be simulated, or fits worse than a rigid
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import groupby
-from typing import ClassVar
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from ..options import SHARES, samples_in_share
 from .initial_trajectories import simulate_trajectories
 from .memory import memory_start
 from .power_law import power_law_start
+from .start import Scan, Start
 
 # Largest Young's modulus of the scan [Pa].
 STIFFEST_PA = 1e7
@@ -68,58 +68,8 @@ CLEARLY_BETTER = 1.2
 NO_GUESS = "no guess"
 
 
-@dataclass(frozen=True, eq=False)
-class ScanSummary:
-    """Stiffnesses of a scan and their misfits, as in ``result.json``."""
-
-    SERIALISED_PROPERTIES: ClassVar = ("sentence",)
-
-    reason: str  # reason for the scan, the beginning of `sentence`
-    # (k,): Young's moduli that were tried, ascending [Pa]. Moduli with a guess, and fixed ones,
-    # kept their values.
-    young_pa: Array
-    # (k,): root mean square of the residuals of all measurements, in standard deviations; NaN where
-    # the body could not be simulated.
-    misfit: Array
-    best: int  # index of the modulus that was chosen
-    samples: int  # number of first samples that were compared, over all experiments
-    time_s: float  # computing time [s]
-
-    @property
-    def sentence(self) -> str:
-        """Summary of the scan for the user: its reason, the best modulus, the number of moduli and
-        the time.
-        """
-        return (
-            f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
-            f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
-            + (
-                f", beyond the default bound of {YOUNG.bounds[1]:.3g} Pa of soft bodies"
-                if self.young_pa[self.best] > YOUNG.bounds[1]
-                else ""
-            )
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Scan(ScanSummary):
-    """Result of a scan of the stiffness, with parameters to start from."""
-
-    parameters: Parameters  # parameters with the guesses to start from
-    # mapping of int to Parameters: parameters with guesses by the index of a modulus, for `best`
-    # and `others`.
-    starts: Mapping[int, Parameters] = field(default_factory=dict)
-    # Indices of other moduli that may lead to a better solution where there are local minima: those
-    # next to the best, and other minima of the misfit, in ascending order of the misfit.
-    others: tuple[int, ...] = ()
-    share: float = SHARES[0]  # share of the samples that were compared
-
-
-def start_problem(
-    collocation: Collocation, is_complete: bool = False
-) -> tuple[Collocation, Scan | None, str]:
-    """Return the problem with a guess of every parameter, the scan, and a note for people; None and
-    "" if there was none.
+def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
+    """Return the problem with a guess of every parameter, and the scan if there was one.
 
     Specimens of laws in powers of the stretches without a guess start from `power_law_start`; the
     note states which constants their measurements do not determine, which are then fixed. Tables of
@@ -142,24 +92,24 @@ def start_problem(
     """
     usual = typical_parameters(collocation.parameters, SOFT_PA)
     if (of_memory := memory_start(collocation, usual)) is not None:
-        return collocation.with_parameters(of_memory), None, ""
+        return of_memory
     unguessed = collocation.parameters.names_without_guess
     start = power_law_start(collocation) if unguessed else None
     if start is not None:
-        usual = typical_parameters(start.parameters, start.young_pa)
-        return collocation.with_parameters(usual), None, start.note
+        usual = typical_parameters(start.collocation.parameters, start.young_pa)
+        return Start(collocation.with_parameters(usual), note=start.note)
     if any(is_modulus(name) for name in unguessed):
         result = scan_stiffness(collocation, is_complete=is_complete)
-        return collocation.with_parameters(result.parameters), result, ""
+        return Start(collocation.with_parameters(result.parameters), scan=result)
     if unguessed:
         usual = typical_parameters(collocation.parameters, STIFFEST_PA)
         collocation = collocation.with_parameters(usual)
     if not _has_free_modulus(collocation):
-        return collocation, None, ""
+        return Start(collocation)
     trial = TrialSimulation(collocation)
     misfit, failure = trial.evaluate_guess(is_complete)
     if failure is None and misfit <= trial.rigid_misfit:
-        return collocation, None, ""
+        return Start(collocation)
     reason = f"the body cannot be simulated at the guess ({failure})"
     if failure is None:
         reason = (
@@ -168,14 +118,14 @@ def start_problem(
         )
     result = rescue(collocation, reason, is_complete=is_complete)
     if result is None:
-        return collocation, None, ""  # the method reports what it needs
+        return Start(collocation)  # the method reports what it needs
     if result.share != trial.share and failure is None:
         misfit, failure = TrialSimulation(collocation, result.share).evaluate_guess(is_complete)
         if failure is not None:
             reason = f"the body cannot be simulated at the guess ({failure})"
     best = float(result.misfit[result.best])
     if failure is None and misfit <= CLEARLY_BETTER * best:
-        return collocation, None, ""
+        return Start(collocation)
     result = replace(result, reason=reason)
     if failure is None:
         result = replace(
@@ -183,7 +133,7 @@ def start_problem(
             reason=f"{reason} (misfit {misfit:.3g} standard deviations at the guess, {best:.3g} at "
             "the initial values of the scan, which replace all guesses)",
         )
-    return collocation.with_parameters(result.parameters), result, ""
+    return Start(collocation.with_parameters(result.parameters), scan=result)
 
 
 def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:

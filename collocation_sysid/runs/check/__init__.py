@@ -232,9 +232,10 @@ def check_problem(
     notes = []
     if problem.parameters.names_without_guess:
         report_progress("searching for initial values, because no guess is given")
-        collocation, scan, note = start_problem(collocation)
+        start = start_problem(collocation)
+        collocation, scan = start.collocation, start.scan
         problem = replace(problem, parameters=collocation.parameters)
-        notes = [each for each in (scan.sentence if scan else "", note) if each]
+        notes = [each for each in (scan.sentence if scan else "", start.note) if each]
     report_progress("simulating the first samples at the guess")
     started_s = time.perf_counter()
     first = shortened_problem(problem).collocation()
