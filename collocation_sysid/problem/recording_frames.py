@@ -18,8 +18,7 @@ from ..common.checked_arrays import point_text
 from ..errors import InputError, hint_at, located
 from ..recording.experiment import EARTH_M_S2
 from ..recording.poses import Frame
-from ..recording.sources.log_frames import LogFrames, TopicFrames, topic_frames
-from ..recording.sources.logs import TopicAddress
+from ..recording.sources.log_frames import LogFrames, TopicFrames
 from .recording_schema import ExperimentSection, ForceSensorSection
 
 # Names of frames that are level by convention, or their endings; the first are more reliable.
@@ -87,15 +86,13 @@ class RecordingFrames:
     section: ExperimentSection  # table of the experiment
     folder: Path  # folder that contains the files
 
+    def _frames_of(self, file: str | None) -> TopicFrames:
+        return TopicFrames.read(self.folder / file) if file else TopicFrames()
+
     @cached_property
-    def poses(self) -> list[TopicFrames | None]:
-        """Frames of the poses of each grasp, then of each obstacle; None where they are not a topic
-        of a log.
-        """
-        return [
-            topic_frames(self.folder / each.poses) if each.poses else None
-            for each in self.section.moved_sections
-        ]
+    def poses(self) -> list[TopicFrames]:
+        """Frames of the poses of each grasp, then of each obstacle."""
+        return [self._frames_of(each.poses) for each in self.section.moved_sections]
 
     @cached_property
     def markers(self) -> str:
@@ -103,18 +100,14 @@ class RecordingFrames:
         to another frame.
         """
         markers = self.section.markers
-        if not markers.file or markers.template_m is not None:
-            return ""
-        frames = topic_frames(self.folder / markers.file)
-        return frames.parent if frames is not None else ""
+        return "" if markers.template_m is not None else self._frames_of(markers.file).parent
 
     @cached_property
     def world(self) -> str:
         """Name of the frame of the first poses from a log, else of the markers; empty if no log
         states it.
         """
-        named = [each.parent for each in self.poses if each and each.parent]
-        return named[0] if named else self.markers
+        return next((each.parent for each in self.poses if each.parent), "") or self.markers
 
     @cached_property
     def transforms(self) -> LogFrames | None:
@@ -128,10 +121,9 @@ class RecordingFrames:
             *(section.file_of(each.sensor) for each in section.moved_sections),
         ]
         for name in filter(None, names):
-            if (address := TopicAddress.from_path(self.folder / name)) is None:
-                continue
             with located(name):
-                return LogFrames.read(address)
+                if (frames := LogFrames.read(self.folder / name)) is not None:
+                    return frames
         return None
 
     # Gravity --------------------------------------------------------------------------------------
@@ -218,7 +210,7 @@ class RecordingFrames:
         poses = [
             (moved.poses, frames)
             for moved, frames in zip(self.section.moved_sections, self.poses, strict=True)
-            if frames is not None and frames.parent
+            if frames.parent
         ]
         if not self.markers:
             return ""
@@ -275,7 +267,7 @@ class RecordingFrames:
                     self._require_static_transform(self.world, sensor)
             return None
         frames = self.poses[k]
-        if frames is not None and frames.child:
+        if frames.child:
             pose = self.transforms.static_transform(frames.child, sensor)
             if pose is not None:
                 transform = self.section.moved_sections[k].gripper_to_body
@@ -286,19 +278,15 @@ class RecordingFrames:
         if pose is not None:
             return SensorMounting(sensor, "world", pose)
         if section.sensor_frame is not None:
-            child = frames.child if frames is not None else ""
             with located(where=f"{key}.sensor_frame"):
-                self._require_static_transform(child or self.world, sensor)
+                self._require_static_transform(frames.child or self.world, sensor)
         return None
 
     def _sensor_frame(self, section: ForceSensorSection) -> str:
         """Return the name of the frame of a sensor, stated or of its messages; empty if unknown."""
         if section.sensor_frame is not None:
             return section.sensor_frame
-        if (file := self.section.file_of(section)) is None:
-            return ""
-        frames = topic_frames(self.folder / file)
-        return frames.parent if frames is not None else ""
+        return self._frames_of(self.section.file_of(section)).parent
 
     def sensor_note(self, section: ForceSensorSection, mounting: SensorMounting | None) -> str:
         """Return a note on the axes of a force sensor: those that the log gives, or that the stated

@@ -17,7 +17,8 @@ from ..errors import InputError, hint_at, listed
 from .sample_times import first_unordered_time
 from .sources import c3d, motive, plain_csv, qualisys, trc
 from .sources.raw_tracks import LabelChooser, RawTracks
-from .sources.text import decode, names_file_in_errors, read_bytes
+from .sources.source import as_table, open_source
+from .sources.text import decode, names_file_in_errors
 from .sources.units import METRES_PER_UNIT, require_length_unit
 
 # A frame rate and a column of times agree within this part.
@@ -125,13 +126,16 @@ def read_markers(
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     """Return the tracks that `choose` selects from a file of any known format."""
-    content = read_bytes(path)
-    if c3d.is_c3d(content):
-        return c3d.read(path, content, choose=choose)
-    text = decode(content)
-    start = text.lstrip().lstrip('"')
-    known = (read for beginning, read in _TEXT_FORMATS.items() if start.startswith(beginning))
-    return next(known, plain_csv.read)(text, choose)
+    source = open_source(path)
+    if isinstance(source, bytes):
+        if c3d.is_c3d(source):
+            return c3d.read(path, source, choose=choose)
+        text = decode(source)
+        start = text.lstrip().lstrip('"')
+        for beginning, read in _TEXT_FORMATS.items():
+            if start.startswith(beginning):
+                return read(text, choose)
+    return plain_csv.read(as_table(source), choose)
 
 
 def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:

@@ -14,18 +14,9 @@ from ..common.files import DAMAGE
 from ..errors import InputError
 from .poses import PoseSequence, first_matrix_fault, first_pose_fault
 from .sources.columns import find_time, name_and_unit
-from .sources.text import (
-    Row,
-    TextTable,
-    decode,
-    is_number,
-    names_file_in_errors,
-    numeric_cells,
-    read_bytes,
-    read_table,
-    times_in_column,
-)
-from .sources.topics import POSE
+from .sources.messages import POSE
+from .sources.source import as_table, open_source
+from .sources.text import Table, is_number, names_file_in_errors, numeric_cells, times_in_column
 from .sources.units import METRES_PER_UNIT, expected_units, require_length_unit, si_factor
 
 POSE_COLUMNS = ("t_s", *POSE)
@@ -65,13 +56,13 @@ def read_poses(
     require_length_unit(length_unit)
     if quaternion not in (None, *_ORDERS):
         raise InputError(f"quaternion is {quaternion!r}; expected one of {', '.join(_ORDERS)}")
-    content = read_bytes(path)
-    if content.startswith(_ZIP):
+    source = open_source(path)
+    if isinstance(source, bytes) and source.startswith(_ZIP):
         t_s, matrices = _read_archive(path)
         places = [f"index {k}" for k in range(len(t_s))]
         return _from_matrices(t_s, matrices, length_unit=length_unit, row_names=places)
-    grid = _with_column_names(read_table(decode(content)))
-    lines = [f"line {row.line}" for row in grid.rows]
+    grid = _with_column_names(as_table(source))
+    lines = [f"line {line}" for line in grid.lines]
     time = find_time(grid)
     if time is None:
         raise _column_error(grid)
@@ -102,12 +93,12 @@ def _checked_sequence(
 # Columns ------------------------------------------------------------------------------------------
 
 
-def _read_columns(grid: TextTable, places: Iterable[int]) -> Array:
+def _read_columns(grid: Table, places: Iterable[int]) -> Array:
     """Return the cells of columns (indices) as numbers; blank cells are refused."""
     return numeric_cells(grid, list(places), blank_allowed=False)
 
 
-def _with_column_names(table: TextTable) -> TextTable:
+def _with_column_names(table: Table) -> Table:
     """Return a table without a line of names with the names of poses.
 
     These are t_s, x, y, z and q0 to q3, whose order is stated elsewhere. A table has no names if it
@@ -117,10 +108,10 @@ def _with_column_names(table: TextTable) -> TextTable:
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
-    return TextTable(names, [Row(1, table.columns), *table.rows])
+    return Table(names, np.vstack([table.columns, table.cells]), [1, *table.lines])
 
 
-def _column_error(grid: TextTable) -> InputError:
+def _column_error(grid: Table) -> InputError:
     """Return the error for a table whose columns are not those of poses."""
     return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {', '.join(POSE_COLUMNS)}, each once "
@@ -128,7 +119,7 @@ def _column_error(grid: TextTable) -> InputError:
     )
 
 
-def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[int], float]:
+def _position_columns(grid: Table, length_unit: str | None) -> tuple[list[int], float]:
     """Return the indices of x, y, z (or capitals), and the factor to metres."""
     parts = [name_and_unit(column) for column in grid.columns]
     axes = [k for axis in "xyz" for k, (name, _) in enumerate(parts) if name.lower() == axis]
@@ -158,7 +149,7 @@ def _position_columns(grid: TextTable, length_unit: str | None) -> tuple[list[in
     return axes, float(metres[0] or 1.0)
 
 
-def _quaternion_columns(grid: TextTable, order: str | None, columns: list[int]) -> list[int]:
+def _quaternion_columns(grid: Table, order: str | None, columns: list[int]) -> list[int]:
     """Return the indices of the columns of the quaternion in the order x, y, z, w."""
     place = {grid.columns[k]: k for k in columns}
     if sorted(place) == ["qw", "qx", "qy", "qz"]:

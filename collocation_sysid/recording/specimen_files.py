@@ -54,7 +54,7 @@ from .sources.columns import (
     read_columns,
     similar_column_names,
 )
-from .sources.text import TextTable, names_file_in_errors
+from .sources.text import Table, names_file_in_errors
 from .sources.units import si_factor
 from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME, moduli_per_stress
 
@@ -309,7 +309,7 @@ def _modulus_table(
     )
 
 
-def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
+def column_advice(grid: Table, layout: SpecimenLayout) -> str:
     """Return the complete statements `columns = { … }` with which a table is unambiguous, joined by
     "or", at most `MOST_STATEMENTS`.
 
@@ -382,7 +382,7 @@ def column_advice(grid: TextTable, layout: SpecimenLayout) -> str:
 
 
 def _column_choices(
-    grid: TextTable,
+    grid: Table,
     quantities: tuple[Quantity, ...],
     stated: Mapping[str, str],
     taken: Collection[str] = (),

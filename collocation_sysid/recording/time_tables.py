@@ -25,14 +25,8 @@ from .sources.columns import (
     find_time,
     read_columns,
 )
-from .sources.text import (
-    decode,
-    names_file_in_errors,
-    numeric_cells,
-    read_bytes,
-    read_table,
-    times_in_column,
-)
+from .sources.source import read_table
+from .sources.text import names_file_in_errors, numeric_cells, times_in_column
 
 # Largest plausible pressure [Pa]: larger ones are likely in another unit.
 LARGEST_PA = 1e8
@@ -239,7 +233,7 @@ def read_custom_sensor(
         If a column is missing or repeated, a cell is not a number, or time does not increase; the
         line is named.
     """
-    grid = read_table(decode(read_bytes(path)))
+    grid = read_table(path)
     time = find_time(grid, [k for k, name in enumerate(grid.columns) if name in columns])
     time_name = TIME.column if time is None else grid.columns[time[0]]
     names = list(columns) or [name for name in grid.columns if name != time_name]

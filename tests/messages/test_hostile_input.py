@@ -37,7 +37,7 @@ from collocation_sysid.problem import Problem, loading
 from collocation_sysid.problem import size as problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
 from collocation_sysid.recording.sources.depth_files import read_depth
-from collocation_sysid.recording.sources.text import read_bytes
+from collocation_sysid.recording.sources.source import open_source
 from collocation_sysid.result import run_writers
 from collocation_sysid.runs.check import cost as memory
 
@@ -646,7 +646,7 @@ def test_text_that_no_memory_can_hold_is_refused_before_it_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(files, "machine_memory_mb", lambda: 6000.0)
-    for name, read in (("a.csv", read_bytes), ("result.json", lambda f: read_json(f, "a result"))):
+    for name, read in (("a.csv", open_source), ("result.json", lambda f: read_json(f, "a result"))):
         with (tmp_path / name).open("wb") as file:
             file.truncate(3_000_000_000)
         tracemalloc.start()

@@ -27,8 +27,8 @@ from ...program.streaming import StreamingModel
 from ...recording.custom_sensor import CustomSensor
 from ...recording.measured_wrench import WRENCH_COLUMNS, Wrench
 from ...recording.poses import first_matrix_fault, first_pose_fault
+from ...recording.sources.messages import POSE
 from ...recording.sources.text import number_from_text
-from ...recording.sources.topics import POSE
 
 Pose = Any
 

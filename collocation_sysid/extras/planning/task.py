@@ -31,7 +31,8 @@ from ...problem.reading import parse_toml, read_text
 from ...problem.schema import CodeSection
 from ...problem.validation_messages import explain_validation_error
 from ...recording.sources.columns import find_time
-from ...recording.sources.text import decode, numeric_cells, read_bytes, read_table, times_in_column
+from ...recording.sources.source import read_table
+from ...recording.sources.text import numeric_cells, times_in_column
 
 HandAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")
@@ -439,7 +440,7 @@ def _with_values_of_file(section: ReferenceSection, task: Path) -> ReferenceSect
     if section.file is None:
         return section
     with located(path := task.parent / section.file):
-        table = read_table(decode(read_bytes(path)))
+        table = read_table(path)
         time = find_time(table)
         names = [name for k, name in enumerate(table.columns) if time is None or k != time[0]]
         known = (*POSITION_COLUMNS, *VELOCITY_COLUMNS)

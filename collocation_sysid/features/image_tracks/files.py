@@ -36,14 +36,14 @@ from ...common.checked_arrays import float_array
 from ...common.files import DAMAGE
 from ...errors import InputError, listed
 from ...recording.sources.columns import find_time
+from ...recording.sources.source import open_source
 from ...recording.sources.text import (
     Row,
-    TextTable,
+    Table,
     decode,
     names_file_in_errors,
     numeric_cells,
-    read_bytes,
-    read_table,
+    parse_table,
     separated_rows,
     table_of_rows,
     times_in_column,
@@ -97,22 +97,23 @@ def read_tracks(path: str | Path) -> TrackFile:
         named.
     """
     file = Path(path)
-    content = read_bytes(file)
-    if content.startswith(HDF5_SIGNATURE):
+    source = open_source(file)
+    if isinstance(source, Table):
+        return _read_table(source)
+    if source.startswith(HDF5_SIGNATURE):
         return _read_hdf5(file)
-    if zipfile.is_zipfile(io.BytesIO(content)):
+    if zipfile.is_zipfile(io.BytesIO(source)):
         return _read_archive(file)
-    return _read_text(decode(content))
+    rows = separated_rows(text := decode(source))
+    if rows[0].cells[0].lower() == "scorer":
+        return _deeplabcut_table(rows)
+    return _read_table(parse_table(text))
 
 
 # Tables -------------------------------------------------------------------------------------------
 
 
-def _read_text(text: str) -> TrackFile:
-    rows = separated_rows(text)
-    if rows[0].cells[0].lower() == "scorer":
-        return _deeplabcut_table(rows)
-    grid = read_table(text)
+def _read_table(grid: Table) -> TrackFile:
     grid = replace(grid, columns=_usual_columns(grid.columns))
     t_s, frames = _times_of(grid)
     wide = [name[:-2] for name in grid.columns if name.endswith("_u")]
@@ -139,14 +140,14 @@ def _usual_columns(columns: Sequence[str]) -> list[str]:
     return [old if new in columns else new for old, new in zip(columns, names, strict=True)]
 
 
-def _times_of(grid: TextTable) -> tuple[Array | None, Array]:
+def _times_of(grid: Table) -> tuple[Array | None, Array]:
     """Return the times of the rows, None without, and the numbers of their images."""
     frame = next((name for name in FRAME_COLUMNS if name in grid.columns), None)
     if frame is not None:
         column = grid.columns.index(frame)
         frames = np.asarray(numeric_cells(grid, [column], blank_allowed=False))[:, 0]
     else:
-        frames = np.arange(float(len(grid.rows)))
+        frames = np.arange(float(len(grid.cells)))
     ends = ("_u", "_v", "_likelihood")
     time = find_time(grid, [k for k, name in enumerate(grid.columns) if name.endswith(ends)])
     if time is None:
@@ -157,7 +158,7 @@ def _times_of(grid: TextTable) -> tuple[Array | None, Array]:
     return times_in_column(grid, *time), frames
 
 
-def _numbers(grid: TextTable, names: Sequence[str]) -> Array:
+def _numbers(grid: Table, names: Sequence[str]) -> Array:
     for name in names:
         if grid.columns.count(name) != 1:
             count = grid.columns.count(name)
@@ -167,7 +168,7 @@ def _numbers(grid: TextTable, names: Sequence[str]) -> Array:
     return np.asarray(numeric_cells(grid, columns, blank_allowed=True))
 
 
-def _wide_table(grid: TextTable, names: list[str], t_s: Array | None, frames: Array) -> TrackFile:
+def _wide_table(grid: Table, names: list[str], t_s: Array | None, frames: Array) -> TrackFile:
     pixels = _numbers(grid, [f"{name}_{axis}" for name in names for axis in "uv"])
     scores = [f"{name}_likelihood" for name in names]
     likelihood = None
@@ -183,10 +184,10 @@ def _wide_table(grid: TextTable, names: list[str], t_s: Array | None, frames: Ar
 
 
 def _by_animal(
-    grid: TextTable, names: list[str], pixels: Array, likelihood: Array | None, frames: Array
+    grid: Table, names: list[str], pixels: Array, likelihood: Array | None, frames: Array
 ) -> TrackFile:
     """Return the tracks of a table of SLEAP, with one row for each animal in an image."""
-    labels = [row.cells[grid.columns.index("track")] for row in grid.rows]
+    labels = grid.cells[:, grid.columns.index("track")].tolist()
     animals = tuple(dict.fromkeys(labels))
     numbers, image = np.unique(frames, return_inverse=True)
     animal = np.array([animals.index(label) for label in labels])
@@ -206,8 +207,8 @@ def _by_animal(
     return TrackFile(tuple(names), placed.reshape(*flat, 2), score, None, numbers)
 
 
-def _long_table(grid: TextTable, point: int, t_s: Array | None, frames: Array) -> TrackFile:
-    labels = [row.cells[point] for row in grid.rows]
+def _long_table(grid: Table, point: int, t_s: Array | None, frames: Array) -> TrackFile:
+    labels = grid.cells[:, point].tolist()
     names = tuple(dict.fromkeys(labels))
     at = frames if t_s is None else t_s
     times, sample = np.unique(at, return_inverse=True)

@@ -33,10 +33,10 @@ from scipy.spatial.transform import Rotation
 from ...common.array_files import load_arrays
 from ...common.array_types import Array
 from ...common.files import DAMAGE, require_size
-from ...errors import InputError, listed, located
+from ...errors import InputError, listed
 from ..camera import Lens
 from .camera_messages import is_camera_model, message_field
-from .logs import TopicAddress, open_log, require_topic
+from .logs import TopicAddress, open_log
 
 # Largest size of a file [bytes]: far more than the cameras of a laboratory need.
 LARGEST_BYTES = 1_000_000
@@ -111,20 +111,43 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
         cameras and none is chosen. The message names file and key.
     """
     file = Path(path)
-    if (address := TopicAddress.from_path(path)) is not None:
-        return _camera_of_topic(address, file)
-    require_size(file, LARGEST_BYTES)
+    address = TopicAddress.from_path(path)
+    if address is None:
+        require_size(file, LARGEST_BYTES)
+    try:
+        return _camera_of_topic(address) if address else _camera_of_file(file, camera)
+    except InputError as error:
+        where = ": ".join(filter(None, (str(file), error.where)))
+        raise InputError(error.message, error.source, where) from error
+
+
+def _camera_of_topic(address: TopicAddress) -> Calibration:
+    """Return the camera of the first message of a topic."""
+    with open_log(address.log, address.episode) as log:
+        message = log.first(address.topic)
+    if not is_camera_model(message):
+        raise InputError(
+            f"the topic {address.topic} has no camera model; expected messages with k, d, width "
+            "and height, such as CameraInfo"
+        )
+    names = ("k", "d", "distortion_model", "width", "height")
+    content = {name: message_field(message, name) for name in names}
+    for name in ("k", "d"):
+        content[name] = np.asarray(content[name], dtype=float).tolist()
+    return _opencv_camera(content)
+
+
+def _camera_of_file(file: Path, camera: str | None) -> Calibration:
     if zipfile.is_zipfile(file):
-        return _opencv_camera(_archive(file), file)
+        return _opencv_camera(_archive(file))
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot be read as text ({error}); expected a calibration of OpenCV, ROS, Kalibr, "
-            "Anipose or COLMAP",
-            where=str(file),
+            "Anipose or COLMAP"
         ) from error
-    cameras = _cameras_of(text, file)
+    cameras = _colmap_cameras(text) if _is_colmap(text) else _cameras_of(_parsed(text))
     if camera is None and len(cameras) == 1:
         return cameras[0]
     chosen = [c for k, c in enumerate(cameras) if camera in (c.name, str(k))]
@@ -132,56 +155,35 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
         return chosen[0]
     names = listed([c.name or str(k) for k, c in enumerate(cameras)])
     found = "several cameras" if camera is None else f"no camera {camera!r}"
-    raise InputError(f"found {found}; expected the name of one of {names}", where=str(file))
+    raise InputError(f"found {found}; expected the name of one of {names}")
 
 
-def _camera_of_topic(address: TopicAddress, file: Path) -> Calibration:
-    """Return the camera of the first message of a topic."""
-    with located(where=str(file)), open_log(address.log, address.episode) as log:
-        require_topic(log, address.topic)
-        message = next((each for _, each in log.messages(address.topic)), None)
-        if not is_camera_model(message):
-            raise InputError(
-                f"the topic {address.topic} has no camera model; expected messages with k, d, width "
-                "and height, such as CameraInfo"
-            )
-        names = ("k", "d", "distortion_model", "width", "height")
-        content = {name: message_field(message, name) for name in names}
-    for name in ("k", "d"):
-        content[name] = np.asarray(content[name], dtype=float).tolist()
-    return _opencv_camera(content, file)
-
-
-def _archive(file: Path) -> Mapping[str, Any]:
-    """Return the arrays of an archive of NumPy as lists."""
-    try:
-        return {name: array.tolist() for name, array in load_arrays(file).items()}
-    except InputError as error:
-        raise error.located(where=str(file)) from error
-    except (*DAMAGE, OSError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"this archive cannot be read ({error}); expected arrays, such as mtx and dist",
-            where=str(file),
-        ) from error
-
-
-def _cameras_of(text: str, file: Path) -> list[Calibration]:
-    if _is_colmap(text):
-        return _colmap_cameras(text, file)
-    content = _parsed(text, file)
+def _cameras_of(content: Mapping[str, Any]) -> list[Calibration]:
     cameras = {
         key: each
         for key, each in content.items()
         if isinstance(each, Mapping) and {"intrinsics", "distortions"} & each.keys()
     }
     if any("intrinsics" in each for each in cameras.values()):
-        return [_kalibr_camera(key, each, file) for key, each in cameras.items()]
+        return [_kalibr_camera(key, each) for key, each in cameras.items()]
     if cameras:
-        return [_anipose_camera(key, each, file) for key, each in cameras.items()]
-    return [_opencv_camera(content, file)]
+        return [_anipose_camera(key, each) for key, each in cameras.items()]
+    return [_opencv_camera(content)]
 
 
-def _parsed(text: str, file: Path) -> Mapping[str, Any]:
+def _archive(file: Path) -> Mapping[str, Any]:
+    """Return the arrays of an archive of NumPy as lists."""
+    try:
+        return {name: array.tolist() for name, array in load_arrays(file).items()}
+    except InputError:
+        raise
+    except (*DAMAGE, OSError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"this archive cannot be read ({error}); expected arrays, such as mtx and dist"
+        ) from error
+
+
+def _parsed(text: str) -> Mapping[str, Any]:
     """Return the table of a TOML, JSON or YAML file."""
     # OpenCV writes a directive and tags that other readers of YAML refuse.
     plain = re.sub(r"^%YAML[: ][^\n]*\n", "", text.lstrip("\ufeff")).replace("!!opencv-matrix", "")
@@ -201,8 +203,7 @@ def _parsed(text: str, file: Path) -> Mapping[str, Any]:
             return content
     raise InputError(
         "found neither YAML, JSON, XML, TOML nor cameras.txt; expected a calibration of OpenCV, ROS, "
-        "Kalibr, Anipose or COLMAP",
-        where=str(file),
+        "Kalibr, Anipose or COLMAP"
     )
 
 
@@ -226,7 +227,7 @@ def _opencv_xml(text: str) -> Any:
     return content
 
 
-def _numbers(value: Any, file: Path, key: str) -> Array:
+def _numbers(value: Any, key: str) -> Array:
     """Return a list of numbers, or a matrix of OpenCV and ROS (a table with `data`), as an array."""
     data = value.get("data") if isinstance(value, Mapping) else value
     try:
@@ -234,21 +235,20 @@ def _numbers(value: Any, file: Path, key: str) -> Array:
     except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     if not np.isfinite(numbers).all():
-        raise InputError(f"found {value!r}; expected numbers", where=f"{file}: {key}")
+        raise InputError(f"found {value!r}; expected numbers", where=key)
     return numbers
 
 
-def _matrix(value: Any, file: Path, key: str) -> Array:
-    numbers = _numbers(value, file, key)
+def _matrix(value: Any, key: str) -> Array:
+    numbers = _numbers(value, key)
     if numbers.size != 9:
         raise InputError(
-            f"found {numbers.size} numbers; expected the nine of a camera matrix",
-            where=f"{file}: {key}",
+            f"found {numbers.size} numbers; expected the nine of a camera matrix", where=key
         )
     return numbers.reshape(3, 3)
 
 
-def _coefficients(numbers: Array, model: Lens, file: Path, key: str) -> Array:
+def _coefficients(numbers: Array, model: Lens, key: str) -> Array:
     """Return distortion coefficients (k,), without zeros beyond those that the model has."""
     flat = numbers.ravel()
     most = 4 if model == "fisheye" else 8
@@ -256,7 +256,7 @@ def _coefficients(numbers: Array, model: Lens, file: Path, key: str) -> Array:
         raise InputError(
             f"found {len(flat)} coefficients; expected at most {most} that are not zero: those of "
             "thin prisms and tilted sensors are not supported",
-            where=f"{file}: {key}",
+            where=key,
         )
     flat = flat[:most]
     if model == "pinhole" and len(flat) > 5:
@@ -264,11 +264,11 @@ def _coefficients(numbers: Array, model: Lens, file: Path, key: str) -> Array:
     return flat
 
 
-def _lens(name: Any, file: Path, key: str) -> Lens:
+def _lens(name: Any, key: str) -> Lens:
     lens = LENSES.get(str(name or "").lower())
     if lens is None:
         known = listed([repr(each) for each in LENSES if each])
-        raise InputError(f"found {name!r}; expected one of {known}", where=f"{file}: {key}")
+        raise InputError(f"found {name!r}; expected one of {known}", where=key)
     return lens
 
 
@@ -279,96 +279,91 @@ def _value(content: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, Any
     return ("", None) if found is None else (str(found), content[found])
 
 
-def _size(content: Mapping[str, Any], file: Path) -> tuple[int, int] | None:
+def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
     width_key, width = _value(content, WIDTH_KEYS)
     _, height = _value(content, HEIGHT_KEYS)
     size_key, size = _value(content, SIZE_KEYS)
     if width is None or height is None:
         if size is None:
             return None
-        numbers = _numbers(size, file, size_key)
+        numbers = _numbers(size, size_key)
     else:
-        numbers = _numbers([width, height], file, width_key)
+        numbers = _numbers([width, height], width_key)
     if numbers.shape != (2,) or (numbers < 1).any():
         raise InputError(
             f"found {numbers.tolist()}; expected columns and rows of the images",
-            where=f"{file}: {size_key or width_key}",
+            where=size_key or width_key,
         )
     return int(numbers[0]), int(numbers[1])
 
 
-def _opencv_camera(content: Mapping[str, Any], file: Path) -> Calibration:
+def _opencv_camera(content: Mapping[str, Any]) -> Calibration:
     """Return the camera of a file of OpenCV or ROS."""
     matrix_key, matrix = _value(content, MATRIX_KEYS)
     if matrix is None:
         raise InputError(
             f"found the keys {listed(list(map(str, content))) or 'none'}; expected the matrix of a "
-            "camera as camera_matrix or K, or the cameras of Kalibr or Anipose",
-            where=str(file),
+            "camera as camera_matrix or K, or the cameras of Kalibr or Anipose"
         )
     model_key, model = _value(content, ("distortionmodel", "cameramodel", "model"))
-    lens = _lens(model, file, model_key)
+    lens = _lens(model, model_key)
     if content.get("fisheye") is True:
         lens = "fisheye"
     key, distortion = _value(content, DISTORTION_KEYS)
-    numbers = np.zeros(0) if distortion is None else _numbers(distortion, file, key)
+    numbers = np.zeros(0) if distortion is None else _numbers(distortion, key)
     name = _value(content, ("cameraname", "name"))[1]
     return Calibration(
         str(name or ""),
-        _matrix(matrix, file, matrix_key),
-        _coefficients(numbers, lens, file, key),
+        _matrix(matrix, matrix_key),
+        _coefficients(numbers, lens, key),
         lens,
-        _size(content, file),
+        _size(content),
     )
 
 
-def _kalibr_camera(name: str, content: Mapping[str, Any], file: Path) -> Calibration:
+def _kalibr_camera(name: str, content: Mapping[str, Any]) -> Calibration:
     key = f"{name}.intrinsics"
     kind = content.get("camera_model", "pinhole")
     if kind != "pinhole":
-        raise InputError(
-            f'found {kind!r}; expected "pinhole"', where=f"{file}: {name}.camera_model"
-        )
-    intrinsics = _numbers(content.get("intrinsics"), file, key)
+        raise InputError(f'found {kind!r}; expected "pinhole"', where=f"{name}.camera_model")
+    intrinsics = _numbers(content.get("intrinsics"), key)
     if intrinsics.shape != (4,):
-        raise InputError(
-            f"found {intrinsics.size}; expected fu, fv, pu, pv", where=f"{file}: {key}"
-        )
+        raise InputError(f"found {intrinsics.size}; expected fu, fv, pu, pv", where=key)
     fu, fv, pu, pv = intrinsics.tolist()
-    lens = _lens(content.get("distortion_model"), file, f"{name}.distortion_model")
+    lens = _lens(content.get("distortion_model"), f"{name}.distortion_model")
     key = f"{name}.distortion_coeffs"
-    numbers = _numbers(content.get("distortion_coeffs", ()), file, key)
+    numbers = _numbers(content.get("distortion_coeffs", ()), key)
     return Calibration(
         name,
         np.array([[fu, 0, pu], [0, fv, pv], [0, 0, 1]]),
-        _coefficients(numbers, lens, file, key),
+        _coefficients(numbers, lens, key),
         lens,
-        _size(content, file),
+        _size(content),
     )
 
 
-def _anipose_camera(key: str, content: Mapping[str, Any], file: Path) -> Calibration:
+def _anipose_camera(key: str, content: Mapping[str, Any]) -> Calibration:
     """Return a camera of Anipose, whose rotation and translation are from world to camera."""
     lens: Lens = "fisheye" if content.get("fisheye") else "pinhole"
-    distortion = _numbers(content["distortions"], file, f"{key}.distortions")
+    distortion = _numbers(content["distortions"], f"{key}.distortions")
     pose = None
     if {"rotation", "translation"} <= content.keys():
-        turn = _numbers(content["rotation"], file, f"{key}.rotation")
-        shift = _numbers(content["translation"], file, f"{key}.translation")
+        turn = _numbers(content["rotation"], f"{key}.rotation")
+        shift = _numbers(content["translation"], f"{key}.translation")
         if turn.shape != (3,) or shift.shape != (3,):
             raise InputError(
                 "found other than three numbers; expected a rotation vector and a translation",
-                where=f"{file}: {key}.rotation",
+                where=f"{key}.rotation",
             )
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_rotvec(turn).as_matrix().T
         pose[:3, 3] = -pose[:3, :3] @ shift
     return Calibration(
         str(content.get("name", key)),
-        _matrix(content.get("matrix"), file, f"{key}.matrix"),
-        _coefficients(distortion, lens, file, f"{key}.distortions"),
+        _matrix(content.get("matrix"), f"{key}.matrix"),
+        _coefficients(distortion, lens, f"{key}.distortions"),
         lens,
-        _size(content, file),
+        _size(content),
         pose,
     )
 
@@ -381,18 +376,18 @@ def _is_colmap(text: str) -> bool:
     )
 
 
-def _colmap_cameras(text: str, file: Path) -> list[Calibration]:
+def _colmap_cameras(text: str) -> list[Calibration]:
     cameras = []
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
         name, kind, width, height, *rest = words
-        where = f"{file}: line {number}"
+        where = f"line {number}"
         if kind not in COLMAP_MODELS:
             raise InputError(f"found {kind}; expected one of {listed(COLMAP_MODELS)}", where=where)
         (fx, fy, cx, cy), places, lens = COLMAP_MODELS[kind]
-        parameters = _numbers(rest, file, f"line {number}")
+        parameters = _numbers(rest, f"line {number}")
         if len(parameters) != max(fx, fy, cx, cy, *places) + 1:
             raise InputError(
                 f"found {len(parameters)} parameters; expected those of {kind}", where=where

@@ -10,22 +10,15 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError, hint_at
-from .text import (
-    TextTable,
-    decode,
-    names_file_in_errors,
-    numeric_cells,
-    read_bytes,
-    read_table,
-    times_in_column,
-)
+from .source import read_table
+from .text import Table, names_file_in_errors, numeric_cells, times_in_column
 from .units import UNITS, expected_units, si_factor
 
 
@@ -191,7 +184,7 @@ _COMPRESSIVE = re.compile(r"stauch|druck(spann|kraft)|compress|compres[ií]", re
 class QuantityTable:
     """Quantities of a table in SI units."""
 
-    grid: TextTable  # cells of the table
+    grid: Table  # cells of the table
     t_s: Array  # (T,)
     # dict: (T,) array by the key of each quantity that the table has, NaN where missing.
     values: Mapping[str, Array]
@@ -209,7 +202,7 @@ def read_columns(
     blank_allowed: bool = False,
     requires_times: bool = True,
     requires_all: bool = False,
-    column_advice: Callable[[TextTable], str] | None = None,
+    column_advice: Callable[[Table], str] | None = None,
     noise_columns: Mapping[str, str] | None = None,
     other_columns: Collection[str] = (),
 ) -> QuantityTable:
@@ -241,7 +234,7 @@ def read_columns(
         If a column is missing, repeated, unknown, without unit or with a wrong one, a cell is not a
         number, or time does not increase; the line is named.
     """
-    grid = read_table(decode(read_bytes(path)))
+    grid = read_table(path)
     noises = {}
     for key, name in (noise_columns or {}).items():
         place, factor = _column_named_by_user(grid, NOISES[key], name=name, where=key)
@@ -262,7 +255,7 @@ def read_columns(
         values[key] = factor * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
             raise InputError(f"column {grid.columns[place]} has no values; remove it")
-    t_s = np.arange(float(len(grid.rows))) if t is None else times_in_column(grid, *t)
+    t_s = np.arange(float(len(grid.cells))) if t is None else times_in_column(grid, *t)
     used = [place for place, _ in (*places.values(), *([] if t is None else [t]))]
     unread = [
         column
@@ -277,10 +270,10 @@ def read_columns(
 
 
 def _find_columns(
-    grid: TextTable,
+    grid: Table,
     quantities: Sequence[Quantity],
     mapped: Mapping[str, str],
-    column_advice: Callable[[TextTable], str] | None = None,
+    column_advice: Callable[[Table], str] | None = None,
 ) -> dict[str, tuple[int, float]]:
     """Return index and factor to SI of each quantity that the table has, by key."""
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
@@ -302,7 +295,7 @@ def _find_columns(
 
 
 def _column_named_by_user(
-    grid: TextTable, quantity: Quantity, name: str, where: str = ""
+    grid: Table, quantity: Quantity, name: str, where: str = ""
 ) -> tuple[int, float]:
     """Return index and factor to SI of the column that the user names for a quantity.
 
@@ -334,10 +327,10 @@ def _column_named_by_user(
 
 
 def find_column(
-    grid: TextTable,
+    grid: Table,
     quantity: Quantity,
     others: Sequence[Quantity] = (),
-    advice: Callable[[TextTable], str] | None = None,
+    advice: Callable[[Table], str] | None = None,
 ) -> tuple[int, float] | None:
     """Return index and factor to SI of the column whose name and unit fit a quantity; None if no
     name fits. Of several columns with a fitting name, those with another unit are ignored.
@@ -377,7 +370,7 @@ def find_column(
     return None
 
 
-def find_time(grid: TextTable, measured: Collection[int] = ()) -> tuple[int, float] | None:
+def find_time(grid: Table, measured: Collection[int] = ()) -> tuple[int, float] | None:
     """Return index and factor to seconds of the column of times; None without one. A column t_s has
     precedence.
 
@@ -391,10 +384,10 @@ def find_time(grid: TextTable, measured: Collection[int] = ()) -> tuple[int, flo
     if grid.columns.count(TIME.column) == 1:
         return grid.columns.index(TIME.column), 1.0
     names = ["" if k in measured else name for k, name in enumerate(grid.columns)]
-    return find_column(TextTable(names, grid.rows, grid.names_line), TIME)
+    return find_column(replace(grid, columns=names), TIME)
 
 
-def _fitting_names(grid: TextTable, quantity: Quantity) -> Mapping[int, str | None]:
+def _fitting_names(grid: Table, quantity: Quantity) -> Mapping[int, str | None]:
     """Return the unit by index of each column whose name fits a quantity; None without."""
     units = {
         k: name_and_unit(column)[1]
@@ -406,7 +399,7 @@ def _fitting_names(grid: TextTable, quantity: Quantity) -> Mapping[int, str | No
     return units
 
 
-def _fitting_columns(grid: TextTable, quantity: Quantity) -> list[tuple[int, float]]:
+def _fitting_columns(grid: Table, quantity: Quantity) -> list[tuple[int, float]]:
     """Return index and factor to SI of each column whose name and unit fit a quantity."""
     factors = {
         k: si_factor(unit, quantity.dimension)
@@ -416,12 +409,12 @@ def _fitting_columns(grid: TextTable, quantity: Quantity) -> list[tuple[int, flo
     return [(k, factor) for k, factor in factors.items() if factor is not None]
 
 
-def fitting_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
+def fitting_column_names(grid: Table, quantity: Quantity) -> list[str]:
     """Return the names of all columns whose name and unit fit a quantity, in their order."""
     return [grid.columns[k] for k, _ in _fitting_columns(grid, quantity)]
 
 
-def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
+def similar_column_names(grid: Table, quantity: Quantity) -> list[str]:
     """Return the names of all columns that may hold a quantity although their names do not fit it,
     in their order.
 
@@ -454,7 +447,7 @@ def similar_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
     return names
 
 
-def deformed_column_names(grid: TextTable, quantity: Quantity) -> list[str]:
+def deformed_column_names(grid: Table, quantity: Quantity) -> list[str]:
     """Return the names of all columns that hold a quantity of the deformed specimen, such as a true
     stress or a logarithmic strain, in their order.
     """
@@ -488,7 +481,7 @@ def _name_fits(column: str, quantity: Quantity) -> bool:
     return _key_of(name) == quantity.key or bool(called and qualifiers == own)
 
 
-def other_columns_text(grid: TextTable, quantities: Sequence[Quantity] = ()) -> str:
+def other_columns_text(grid: Table, quantities: Sequence[Quantity] = ()) -> str:
     """Return the addition to a message on missing columns that names those of other quantities than
     `quantities`, such as a stress difference; "" without any.
     """
@@ -556,7 +549,7 @@ def _words(name: str) -> set[str]:
 # Errors -------------------------------------------------------------------------------------------
 
 
-def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_of: bool) -> None:
+def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: bool) -> None:
     """Check that every column holds a known quantity."""
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
@@ -568,7 +561,7 @@ def _require_known_columns(grid: TextTable, quantities: Sequence[Quantity], all_
 
 
 def _columns_error(
-    grid: TextTable, quantities: Sequence[Quantity], all_of: bool, why: str = "", advice: str = ""
+    grid: Table, quantities: Sequence[Quantity], all_of: bool, why: str = "", advice: str = ""
 ) -> InputError:
     """Return the error for a table without the wanted columns."""
     expected = ", ".join(quantity.column for quantity in quantities)
@@ -585,7 +578,7 @@ def _columns_error(
     )
 
 
-def _unit_error(grid: TextTable, column: str, unit: str | None, quantity: Quantity) -> InputError:
+def _unit_error(grid: Table, column: str, unit: str | None, quantity: Quantity) -> InputError:
     """Return the error for a column without unit, or with one of another dimension."""
     name = name_and_unit(column)[0] or column
     has = f"has the unit {unit}" if unit else "names no unit"

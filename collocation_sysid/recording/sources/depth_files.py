@@ -31,9 +31,9 @@ from .camera_messages import (
     is_camera_model,
     read_png,
 )
-from .logs import Log, TopicAddress, open_log, require_topic
-from .text import decode, read_bytes, read_table, times_in_column
-from .topics import sort_by_time
+from .logs import Log, TopicAddress, open_log
+from .source import read_table
+from .text import names_file_in_errors, times_in_column
 
 # Depth of one count of an integer image if none is stated [m], as is usual for depth cameras.
 USUAL_COUNT_M = 1e-3
@@ -84,6 +84,7 @@ class _LazyImages(Sequence[Array]):
             return _in_metres(decode_image(self.messages[place]), self.count_m)
 
 
+@names_file_in_errors
 def read_depth(
     path: Path, count_m: float | None, length_m: float, known_camera_fields: Container[str] = ()
 ) -> DepthFileContent:
@@ -108,10 +109,9 @@ def read_depth(
         that reads it is missing.
     """
     if (address := TopicAddress.from_path(path)) is not None:
-        with located(path):
-            return _read_topic(
-                path, address, count_m=count_m, length_m=length_m, known=known_camera_fields
-            )
+        return _read_topic(
+            path, address, count_m=count_m, length_m=length_m, known=known_camera_fields
+        )
     if path.is_dir():
         return _read_folder(path, count_m, length_m=length_m)
     require_regular(path)
@@ -122,23 +122,21 @@ def read_depth(
         expected = ", ".join(_READERS)
         raise InputError(
             f"the file has {'the ending ' + kind if kind else 'no ending'}; expected one of "
-            f"{expected}",
-            path,
+            f"{expected}"
         )
     try:
         content = _READERS[kind](path)
-    except InputError as error:
-        raise error.located(path) from error
+    except InputError:
+        raise
     except (Exception, SystemExit) as error:
         raise InputError(
-            f"the file cannot be read ({reason(error)}); expected a valid {kind} file", path
+            f"the file cannot be read ({reason(error)}); expected a valid {kind} file"
         ) from error
     if isinstance(content, DepthFileContent):
         return content
     if kind in CLOUDS:
-        return DepthFileContent([], [_scaled_cloud(content, path, length_m=length_m)])
-    with located(path):
-        return DepthFileContent([_in_metres(content, count_m)], [])
+        return DepthFileContent([], [_scaled_cloud(content, length_m)])
+    return DepthFileContent([_in_metres(content, count_m)], [])
 
 
 def _read_topic(
@@ -146,8 +144,7 @@ def _read_topic(
 ) -> DepthFileContent:
     """Read the messages of a topic in the order of their times, and the camera model beside them."""
     with open_log(address.log, address.episode) as log:
-        require_topic(log, address.topic)
-        t_s, messages = sort_by_time(list(log.messages(address.topic)), log.start_ns)
+        t_s, messages = log.read(address.topic)
         camera = _camera_of_topic(log, address.topic)
     kind = camera_data_kind(messages[0]) if messages else ""
     if not kind:
@@ -158,8 +155,7 @@ def _read_topic(
         )
     if "images" not in kind:
         clouds = [
-            _scaled_cloud(_points_from_columns(decode_cloud(each)), path, length_m=length_m)
-            for each in messages
+            _scaled_cloud(_points_from_columns(decode_cloud(each)), length_m) for each in messages
         ]
         return DepthFileContent([], clouds, t_s=t_s)
     images = _LazyImages(messages, count_m, path=path)
@@ -181,7 +177,7 @@ def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
     names = [f"{each.rstrip('/')}/{CAMERA}" for each in above]
     if (name := next((each for each in names if each in log.topics), None)) is None:
         return None
-    message = next((each for _, each in log.messages(name)), None)
+    message = log.first(name)
     return (name, message) if is_camera_model(message) else None
 
 
@@ -192,27 +188,23 @@ def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFil
     if not files:
         raise InputError(
             f"the folder contains no files {', '.join((*IMAGES, *CLOUDS))}; expected depth images "
-            "or point clouds of one of these types",
-            path,
+            "or point clouds of one of these types"
         )
     if len(kinds := {each.suffix.lower() for each in files}) > 1:
         raise InputError(
-            f"the folder contains {', '.join(sorted(kinds))} files; expected files of one type "
-            "only",
-            path,
+            f"the folder contains {', '.join(sorted(kinds))} files; expected files of one type only"
         )
     parts = [read_depth(each, count_m, length_m=length_m) for each in files]
     times = path / "times.csv"
     t_s = None
     if times.is_file():
         with located(times):
-            t_s = times_in_column(read_table(decode(read_bytes(times))), 0)
-        if len(t_s) != len(files):
-            raise InputError(
-                f"found {len(t_s)} times for the {len(files)} images or clouds of the folder; expected "
-                "one time for each file",
-                times,
-            )
+            t_s = times_in_column(read_table(times), 0)
+            if len(t_s) != len(files):
+                raise InputError(
+                    f"found {len(t_s)} times for the {len(files)} images or clouds of the folder; "
+                    "expected one time for each file"
+                )
     images = [image for part in parts for image in part.images_m]
     return DepthFileContent(images, [cloud for part in parts for cloud in part.clouds_m], t_s=t_s)
 
@@ -244,19 +236,17 @@ def _require_possible_lengths(values_m: Array) -> None:
         )
 
 
-def _scaled_cloud(points: Array, path: Path, length_m: float) -> Array:
+def _scaled_cloud(points: Array, length_m: float) -> Array:
     """Return points (P, 3) or (P, 6) in metres; normals in the last three columns are unchanged."""
     with np.errstate(invalid="ignore"):  # a damaged file may have signalling NaN
         points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] not in (3, 6):
         raise InputError(
             f"a cloud has the shape {points.shape}; expected 3 columns x, y, z, or 6 columns with "
-            "the normals nx, ny, nz",
-            path,
+            "the normals nx, ny, nz"
         )
     places_m = length_m * points[:, :3]
-    with located(path):
-        _require_possible_lengths(places_m)
+    _require_possible_lengths(places_m)
     return np.hstack([places_m, points[:, 3:]])
 
 

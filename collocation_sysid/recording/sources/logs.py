@@ -8,20 +8,21 @@ in ``run.mcap#/tf#base>tool``, a robot's description, and the episode of a datas
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from ...common.array_types import Array
 from ...common.files import reason, require_regular
 from ...errors import InputError, hint_at, listed
+from .messages import measurement_time_s
 
 TOPIC_SEPARATOR = "#"
 # Of the positions of joints.
@@ -89,28 +90,43 @@ def stored_files(path: str | Path) -> list[Path]:
     return [place] if place.is_file() else []
 
 
-class Log(Protocol):
-    """Messages by topic.
+@dataclass(frozen=True)
+class Log:
+    """Messages by topic."""
 
-    Attributes
-    ----------
-    topics : dict of name to (type, number of messages)
-    start_ns : int
-        When the first message was recorded; an integer, as floats lack the precision for present
-        dates.
-    unit : str or None
-        Unit of joint angles ("rad" or "deg") if the format prescribes one.
-    """
-
-    topics: dict[str, tuple[str, int]]
+    topics: dict[str, tuple[str, int]]  # type and number of messages by name
+    # When the first message was recorded; an integer, as floats lack the precision for present
+    # dates.
     start_ns: int
-    unit: str | None
+    # Yields the time of recording [ns] and the message, whose fields are attributes, of each message
+    # of a topic.
+    decoded: Callable[[str], Iterable[tuple[int, Any]]]
+    unit: str | None = "rad"  # unit of joint angles; None if the format prescribes none
 
-    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield the time of recording [ns] and the message, whose fields are attributes, of each
-        message of a topic.
+    def messages(self, topic: str) -> Iterable[tuple[int, Any]]:
+        """Return the times of recording [ns] and the messages of a topic; an `InputError` with the
+        most similar topic if the log does not have it.
         """
-        ...
+        if topic not in self.topics:
+            there = ", ".join(self.topics)
+            raise InputError(
+                f"there is no topic {topic!r}; expected one of the topics of the log: "
+                f"{there}{hint_at(topic, self.topics)}"
+            )
+        return self.decoded(topic)
+
+    def first(self, topic: str) -> Any:
+        """Return the first message of a topic; None if there is none."""
+        return next((message for _, message in self.messages(topic)), None)
+
+    def read(self, topic: str) -> tuple[Array, list[Any]]:
+        """Return the times (S,) [s] of the messages of a topic, ascending, see `measurement_time_s`,
+        and the messages in this order; of messages with the same time the first is kept.
+        """
+        messages = list(self.messages(topic))
+        t_s = [measurement_time_s(each, at_ns, self.start_ns) for at_ns, each in messages]
+        times, first = np.unique(t_s, return_index=True)
+        return times, [messages[k][1] for k in first]
 
 
 @contextmanager
@@ -133,19 +149,19 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
     for each in (path, *(path.iterdir() if path.is_dir() else ())):
         require_regular(each)
     if (path / "meta" / "info.json").is_file():
-        log: Any = partial(_Dataset, path, episode)
+        log = _dataset(path, episode)
     elif path.is_file() and path.suffix == ".mcap":
-        log = partial(_Mcap, path)
+        log = _mcap(path)
     elif path.suffix in (".bag", ".db3") or (path / "metadata.yaml").is_file():
-        log = partial(_Bag, path)
+        log = _bag(path)
     else:
         raise InputError(
             "this is not a log; expected a ROS bag (a folder with metadata.yaml, .db3 or .bag), "
             "an .mcap file, or a LeRobot dataset (a folder with meta/info.json)"
         )
     try:
-        with log() as each:
-            yield each
+        with log as opened:
+            yield opened
     except (InputError, ImportError):
         raise
     except Exception as error:  # the libraries have exceptions of their own
@@ -153,16 +169,6 @@ def open_log(path: Path, episode: int | None = None) -> Iterator[Log]:
             f"the log is damaged, or a file of another type ({reason(error)}); expected a log that "
             "its own tools can open"
         ) from error
-
-
-def require_topic(log: Log, topic: str) -> None:
-    """Raise an `InputError` with the most similar topic if a log does not have a topic."""
-    if topic not in log.topics:
-        there = ", ".join(log.topics)
-        raise InputError(
-            f"there is no topic {topic!r}; expected one of the topics of the log: "
-            f"{there}{hint_at(topic, log.topics)}"
-        )
 
 
 def require_packages(*modules: str) -> None:
@@ -173,79 +179,55 @@ def require_packages(*modules: str) -> None:
         raise InputError(_NEEDS.format(listed(missing)))
 
 
-class _Bag:
-    """A ROS bag, read through rosbags."""
+@contextmanager
+def _bag(path: Path) -> Iterator[Log]:
+    """Open a ROS bag through rosbags."""
+    require_packages("rosbags")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
-    unit: str | None = "rad"
+    # Older bags do not contain the definitions of their messages.
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([path], default_typestore=store) as reader:
 
-    def __init__(self, path: Path) -> None:
-        require_packages("rosbags")
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
+        def decoded(topic: str) -> Iterator[tuple[int, Any]]:
+            chosen = [each for each in reader.connections if each.topic == topic]
+            for connection, at_ns, content in reader.messages(chosen):
+                yield at_ns, reader.deserialize(content, connection.msgtype)
 
-        # Older bags do not contain the definitions of their messages.
-        store = get_typestore(Stores.ROS2_HUMBLE)
-        self._reader = AnyReader([path], default_typestore=store)
-
-    def __enter__(self) -> Log:
-        """Open the bag; return self, with topics and start."""
-        self._reader.open()
-        self.topics = {
-            name: (str(info.msgtype), info.msgcount) for name, info in self._reader.topics.items()
-        }
-        self.start_ns = self._reader.start_time
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the bag."""
-        self._reader.close()
-
-    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield time of recording [ns] and message, see `Log.messages`."""
-        chosen = [each for each in self._reader.connections if each.topic == topic]
-        for connection, at_ns, content in self._reader.messages(chosen):
-            yield at_ns, self._reader.deserialize(content, connection.msgtype)
+        topics = {name: (str(info.msgtype), info.msgcount) for name, info in reader.topics.items()}
+        yield Log(topics, reader.start_time, decoded)
 
 
-class _Mcap:
-    """An MCAP file with messages of ROS 2, protobuf or JSON."""
+@contextmanager
+def _mcap(path: Path) -> Iterator[Log]:
+    """Open an MCAP file with messages of ROS 2, protobuf or JSON; an `InputError` if it has no
+    summary.
+    """
+    require_packages("mcap", "mcap_ros2", "mcap_protobuf")
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory as Protobuf
+    from mcap_ros2.decoder import DecoderFactory as Ros2
 
-    unit: str | None = "rad"
-
-    def __init__(self, path: Path) -> None:
-        require_packages("mcap", "mcap_ros2", "mcap_protobuf")
-        self._path = path
-
-    def __enter__(self) -> Log:
-        """Open the file; an `InputError` if it has no summary."""
-        from mcap.reader import make_reader
-        from mcap_protobuf.decoder import DecoderFactory as Protobuf
-        from mcap_ros2.decoder import DecoderFactory as Ros2
-
-        self._file = self._path.open("rb")
+    with path.open("rb") as file:
         decoders: Any = [Ros2(), Protobuf(), _Json()]
-        self._reader = make_reader(self._file, decoder_factories=decoders)
-        summary = self._reader.get_summary()
+        reader = make_reader(file, decoder_factories=decoders)
+        summary = reader.get_summary()
         if summary is None or summary.statistics is None:
             raise InputError("the log is truncated: it has no summary; `mcap recover` creates one")
         counts = summary.statistics.channel_message_counts
-        self.topics = {}
+        topics: dict[str, tuple[str, int]] = {}
         for key, channel in summary.channels.items():
             schema = summary.schemas.get(channel.schema_id)
-            before = self.topics.get(channel.topic, ("", 0))[1]
+            before = topics.get(channel.topic, ("", 0))[1]
             kind = schema.name if schema else channel.message_encoding
-            self.topics[channel.topic] = kind, before + counts.get(key, 0)
-        self.start_ns = summary.statistics.message_start_time
-        return self
+            topics[channel.topic] = kind, before + counts.get(key, 0)
 
-    def __exit__(self, *_: object) -> None:
-        """Close the file."""
-        self._file.close()
+        def decoded(topic: str) -> Iterator[tuple[int, Any]]:
+            for _, _, message, content in reader.iter_decoded_messages(topics=[topic]):
+                yield message.log_time, content
 
-    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield time of recording [ns] and message, see `Log.messages`."""
-        for _, _, message, content in self._reader.iter_decoded_messages(topics=[topic]):
-            yield message.log_time, content
+        yield Log(topics, summary.statistics.message_start_time, decoded)
 
 
 class _Json:
@@ -258,64 +240,48 @@ class _Json:
         return partial(json.loads, object_hook=lambda each: SimpleNamespace(**each))
 
 
-@dataclass
-class _Dataset:
-    """A LeRobot dataset: its topics are the features, its messages the frames of an episode."""
+@contextmanager
+def _dataset(path: Path, episode: int | None) -> Iterator[Log]:
+    """Open a LeRobot dataset: its topics are the features, its messages the frames of an episode, as
+    objects with `name` and `position` like joint states.
 
-    path: Path
-    episode: int | None = None  # episode to read; None for the only one
-    # See `Log`.
-    topics: dict[str, tuple[str, int]] = field(default_factory=dict)
-    start_ns: int = 0
-    unit: str | None = None  # not prescribed by the format
-    # mapping of topic to list of str: names of the numbers of each feature.
-    names: dict[str, list[str]] = field(default_factory=dict)
+    Indices, timestamps and features without numbers are no topics. The messages of a topic are
+    refused if no episode is stated and there are several, or the episode does not exist.
+    """
+    require_packages("pyarrow")
+    info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+    features = {
+        name: feature
+        for name, feature in info["features"].items()
+        if feature["dtype"].startswith(("float", "int"))
+        and "index" not in name
+        and name != "timestamp"
+    }
+    episodes = int(info["total_episodes"])
 
-    def __enter__(self) -> Log:
-        """Read the features; indices, timestamps and those without numbers are no topics."""
-        require_packages("pyarrow")
-        info = json.loads((self.path / "meta" / "info.json").read_text(encoding="utf-8"))
-        self._episodes = int(info["total_episodes"])
-        for name, feature in info["features"].items():
-            if feature["dtype"].startswith(("float", "int")) and "index" not in name:
-                self.topics[name] = feature["dtype"], int(info["total_frames"])
-                self.names[name] = _component_names(feature, name)
-        self.topics.pop("timestamp", None)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing: no file is open."""
-
-    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yield time [ns] and values of each frame of the episode, as objects with `name` and
-        `position` like joint states.
-
-        Raises
-        ------
-        InputError
-            If no episode is stated and there are several, or the episode does not exist.
-        """
+    def decoded(topic: str) -> Iterator[tuple[int, Any]]:
         from pyarrow import dataset
 
-        if self.episode is None and self._episodes > 1:
+        if episode is None and episodes > 1:
             raise InputError(
-                f"the dataset has {self._episodes} episodes; expected the index of one of them after "
-                f"the topic, as in {self.path.name}#{topic}#0"
+                f"the dataset has {episodes} episodes; expected the index of one of them after "
+                f"the topic, as in {path.name}#{topic}#0"
             )
-        episode = self.episode or 0
-        if episode >= self._episodes:
+        if (index := episode or 0) >= episodes:
             raise InputError(
-                f"found the episode {episode}; expected an index from 0 to {self._episodes - 1}"
+                f"found the episode {index}; expected an index from 0 to {episodes - 1}"
             )
-        frames = dataset.dataset(self.path / "data", format="parquet").to_table(
-            columns=["timestamp", topic], filter=dataset.field("episode_index") == episode
+        frames = dataset.dataset(path / "data", format="parquet").to_table(
+            columns=["timestamp", topic], filter=dataset.field("episode_index") == index
         )
+        names = _component_names(features[topic], topic)
         values: Array = np.asarray(frames[topic].to_pylist(), dtype=float)
         for t_s, each in zip(frames["timestamp"].to_pylist(), values, strict=True):
-            yield (
-                round(t_s * 1e9),
-                SimpleNamespace(name=self.names[topic], position=np.atleast_1d(each)),
-            )
+            yield round(t_s * 1e9), SimpleNamespace(name=names, position=np.atleast_1d(each))
+
+    count = int(info["total_frames"])
+    topics = {name: (feature["dtype"], count) for name, feature in features.items()}
+    yield Log(topics, 0, decoded, unit=None)
 
 
 def _component_names(feature: Any, name: str) -> list[str]:

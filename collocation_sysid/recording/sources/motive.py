@@ -49,7 +49,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     chosen = choose(labels, [name for name in labels if name.startswith("Unlabeled")])
     titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
     table = table_of_rows(titles, rows[top + 1 :])
-    header.require_count("Total Exported Frames", len(table.rows), what="frames")
+    header.require_count("Total Exported Frames", len(table.cells), what="frames")
     rate_key = next((key for key in _RATES if header.number(key)), _RATES[0])
     (unit, _) = header.entries.get("Length Units", ("", 0))
     raw = tracks_of_table(

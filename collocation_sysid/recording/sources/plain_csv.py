@@ -21,7 +21,7 @@ from ...errors import InputError, listed
 from ..sample_times import first_unordered_time
 from .columns import find_time
 from .raw_tracks import LabelChooser, RawTracks, tracks_of_table
-from .text import TextTable, numeric_cells, read_table
+from .text import Table, numeric_cells
 from .units import METRES_PER_UNIT, length_unit_of_spelling
 
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
@@ -35,9 +35,9 @@ _IGNORED = ("Frame", "frame")
 _LISTED = 8
 
 
-def read(text: str, choose: LabelChooser) -> RawTracks:
-    """Read a plain CSV file, wide or long (with a column "marker"); `choose` returns the indices of
-    the markers to read from their labels.
+def read(given: Table, choose: LabelChooser) -> RawTracks:
+    """Read the table of a plain CSV file, wide or long (with a column "marker"); `choose` returns
+    the indices of the markers to read from their labels.
 
     Raises
     ------
@@ -45,13 +45,13 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         If columns are missing or unknown, a cell is neither blank nor a number, or time does not
         increase.
     """
-    table, unit, to_seconds = _without_units(read_table(text))
+    table, unit, to_seconds = _without_units(given)
     read = _read_long if "marker" in table.columns else _read_wide
     tracks = read(table, choose, to_seconds)
     return tracks if unit is None else replace(tracks, unit=unit, unit_key="the columns' names")
 
 
-def _without_units(table: TextTable) -> tuple[TextTable, str | None, float]:
+def _without_units(table: Table) -> tuple[Table, str | None, float]:
     """Return the table with times called t_s and coordinates without units in brackets, the unit of
     the coordinates, None if there is none, and the factor from the times to seconds.
     """
@@ -81,10 +81,10 @@ def _without_units(table: TextTable) -> tuple[TextTable, str | None, float]:
     to_seconds = 1.0
     if "t_s" not in columns and (time := find_time(table, measured=places)) is not None:
         columns[time[0]], to_seconds = "t_s", time[1]
-    return TextTable(columns, table.rows), next(iter(units), None), to_seconds
+    return replace(table, columns=columns), next(iter(units), None), to_seconds
 
 
-def _read_wide(table: TextTable, choose: LabelChooser, to_seconds: float) -> RawTracks:
+def _read_wide(table: Table, choose: LabelChooser, to_seconds: float) -> RawTracks:
     """Read a table with three columns for each marker, in metres unless the user states another
     unit; `choose` returns the indices of the markers to read from their labels. Errors as of
     `_wide_labels` and `tracks_of_table`.
@@ -105,14 +105,14 @@ def _read_wide(table: TextTable, choose: LabelChooser, to_seconds: float) -> Raw
     noises = [place.get(f"{labels[k]}{SIGMA}") for k in chosen]
     if noises == [None] * len(noises):
         return tracks
-    sigmas = np.full((len(table.rows), len(chosen)), np.nan)
+    sigmas = np.full((len(table.cells), len(chosen)), np.nan)
     for k, column in enumerate(noises):
         if column is not None:
             sigmas[:, k] = numeric_cells(table, [column], blank_allowed=True)[:, 0]
     return replace(tracks, sigmas=sigmas)
 
 
-def _wide_labels(table: TextTable) -> list[str]:
+def _wide_labels(table: Table) -> list[str]:
     """Return the names of the markers in the file, in the order of their first columns.
 
     The columns are t_s and, for each marker, <name>_x, <name>_y and <name>_z, in any order and
@@ -146,14 +146,14 @@ def _first_columns(columns: Sequence[str]) -> str:
     return ", ".join(columns[:_LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _read_long(table: TextTable, choose: LabelChooser, to_seconds: float) -> RawTracks:
+def _read_long(table: Table, choose: LabelChooser, to_seconds: float) -> RawTracks:
     """Read a table with one row for each marker and time; `choose` returns the indices of the
     markers to read from their labels.
 
     The times of the result are those of all rows, sorted. Only rows of chosen markers are checked.
     """
     axes, unit = _long_columns(table)
-    of_row = [row.cells[table.columns.index("marker")] for row in table.rows]
+    of_row = table.cells[:, table.columns.index("marker")].tolist()
     if "" in of_row:
         raise table.error_at("column marker is blank; expected a name", of_row.index(""))
     labels = list(dict.fromkeys(of_row))
@@ -164,7 +164,7 @@ def _read_long(table: TextTable, choose: LabelChooser, to_seconds: float) -> Raw
     coordinates = np.full((len(t_s), len(chosen), 3), np.nan)
     for k, label in enumerate(chosen):
         own = [i for i, other in enumerate(of_row) if other == label]
-        rows = TextTable(table.columns, [table.rows[i] for i in own])
+        rows = replace(table, cells=table.cells[own], lines=[table.lines[i] for i in own])
         if fault := first_unordered_time(row_t_s[own]):
             raise rows.error_at(f"marker '{label}': {fault[1]}", fault[0])
         columns = [table.columns.index(axis) for axis in axes]
@@ -179,7 +179,7 @@ def _read_long(table: TextTable, choose: LabelChooser, to_seconds: float) -> Raw
     )
 
 
-def _long_columns(table: TextTable) -> tuple[list[str], str | None]:
+def _long_columns(table: Table) -> tuple[list[str], str | None]:
     """Return the names of the columns of x, y and z, and the unit in these names, such as "mm" of
     x_mm; None if they name none.
     """

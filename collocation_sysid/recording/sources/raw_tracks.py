@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from ...common.array_types import Array
 from ...errors import InputError
-from .text import Row, TextTable, number_from_text, numeric_cells, table_of_rows, times_in_column
+from .text import Row, Table, number_from_text, numeric_cells, table_of_rows, times_in_column
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class LabelChooser(Protocol):
 
 
 def tracks_of_table(
-    table: TextTable,
+    table: Table,
     labels: Sequence[str],
     coordinate_columns: Sequence[Sequence[int]],
     chosen: Sequence[int],

@@ -1,4 +1,4 @@
-"""Text files as tables: rows of cells below column names, and numbers from cells.
+"""Tables: rows of cells below column names, from text files, and numbers from cells.
 
 Messages name lines; readers of files add the path, see `names_file_in_errors`.
 """
@@ -10,20 +10,17 @@ import io
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from itertools import zip_longest
-from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.array_types import Array
-from ...common.files import require_regular, require_size
 from ...errors import InputError, excerpt, located
 from ..sample_times import first_unordered_time
-from .logs import TopicAddress
-from .point_topics import address_as_csv
 from .units import UNITS, si_factor
 
 P = ParamSpec("P")
@@ -57,29 +54,24 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class TextTable:
-    """Rows of equal length below column names; `names_line` is the line of the names, counted from
-    1.
-    """
+class Table:
+    """Rows of equal length below column names."""
 
     columns: list[str]
-    rows: list[Row]
-    names_line: int = 1
+    cells: NDArray  # (rows, columns): texts of a file, or numbers of a log
+    lines: Sequence[int]  # line of each row, counted from 1
+    names_line: int = 1  # line of the names
 
-    def without_column(self, place: int) -> TextTable:
+    def without_column(self, place: int) -> Table:
         """Return the table without the column of an index."""
-        names, *rows = (
-            [cell for k, cell in enumerate(cells) if k != place]
-            for cells in (self.columns, *(row.cells for row in self.rows))
-        )
-        kept = [Row(row.line, cells) for row, cells in zip(self.rows, rows, strict=True)]
-        return TextTable(names, kept, self.names_line)
+        names = [name for k, name in enumerate(self.columns) if k != place]
+        return replace(self, columns=names, cells=np.delete(self.cells, place, axis=1))
 
     def error_at(self, message: str, row: int | None = None) -> InputError:
         """Return an `InputError` about a row, by its index from 0, or about the column names if
         `row` is None; the error names the line.
         """
-        line = self.names_line if row is None else self.rows[row].line
+        line = self.names_line if row is None else self.lines[row]
         return InputError(message, where=f"line {line}")
 
 
@@ -97,24 +89,6 @@ def names_file_in_errors(
             return read(path, *args, **kwargs)
 
     return reader
-
-
-def read_bytes(path: str | Path) -> bytes:
-    """Return the content of a file; for a topic of a log, the content of an equivalent CSV file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read; see `address_as_csv` for topics. The path is not named.
-    """
-    if (address := TopicAddress.from_path(path)) is not None:
-        return address_as_csv(address)
-    require_regular(path)
-    require_size(path)
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"the file cannot be read: {error.strerror}") from error
 
 
 def decode(content: bytes) -> str:
@@ -210,7 +184,7 @@ def tab_rows(text: str) -> list[Row]:
     return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> TextTable:
+def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> Table:
     """Return a table of rows that are as wide as their column names.
 
     Blank columns at the end of all rows are cut.
@@ -233,18 +207,18 @@ def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> T
     common = len(rows[0].cells)
     if common > width and all(len(r.cells) == common and not any(r.cells[width:]) for r in rows):
         rows = [Row(row.line, row.cells[:width]) for row in rows]
-    table = TextTable(columns, rows, names_line=names_line)
-    for k, row in enumerate(rows):
+    for row in rows:
         if len(row.cells) != width:
-            raise table.error_at(
+            raise InputError(
                 f"the row has {len(row.cells)} cells; expected {width}, as many as the header has "
                 "columns",
-                k,
+                where=f"line {row.line}",
             )
-    return table
+    cells = np.array([row.cells for row in rows], dtype=object)
+    return Table(columns, cells, [row.line for row in rows], names_line)
 
 
-def read_table(text: str) -> TextTable:
+def parse_table(text: str) -> Table:
     """Return a table from text of separated cells with a row of column names.
 
     Lines above the names are skipped; units in a row of their own are joined to the names, as in
@@ -280,7 +254,7 @@ def _is_unit(cell: str) -> bool:
 # Cells --------------------------------------------------------------------------------------------
 
 
-def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) -> Array:
+def numeric_cells(grid: Table, columns: Sequence[int], blank_allowed: bool) -> Array:
     """Return the cells of some columns as numbers (rows, columns); NaN where blank.
 
     Parameters
@@ -296,27 +270,32 @@ def numeric_cells(grid: TextTable, columns: Sequence[int], blank_allowed: bool) 
         If a cell is not a number up to `LARGEST_NUMBER` in magnitude; its line and column are
         named.
     """
-    values = np.empty((len(grid.rows), len(columns)))
-    for i, row in enumerate(grid.rows):
-        for j, column in enumerate(columns):
-            cell = row.cells[column]
-            try:
-                value = number_from_text(cell) if cell else math.nan
-            except ValueError:
-                value = math.inf
-            if abs(value) > LARGEST_NUMBER or (math.isnan(value) and not blank_allowed):
-                expected = "a number or a blank cell" if blank_allowed else "a number"
-                name = grid.columns[column]
-                raise grid.error_at(
-                    f"column {name} holds '{excerpt(cell)}'; expected {expected}", i
-                )
-            values[i, j] = value
+    cells = grid.cells[:, list(columns)]
+    values = cells
+    if cells.dtype == object:
+        values = np.vectorize(_number_of_cell, otypes=[float])(cells)
+    is_allowed = (abs(values) <= LARGEST_NUMBER) | (blank_allowed & np.isnan(values))
+    if not is_allowed.all():
+        i, j = np.argwhere(~is_allowed)[0].tolist()
+        expected = "a number or a blank cell" if blank_allowed else "a number"
+        name = grid.columns[columns[j]]
+        raise grid.error_at(
+            f"column {name} holds '{excerpt(str(cells[i, j]))}'; expected {expected}", i
+        )
     for j, column in enumerate(columns):
         _require_no_codes(grid, column, values[:, j], blank_allowed)
     return values
 
 
-def _require_no_codes(grid: TextTable, column: int, values: Array, blank_allowed: bool) -> None:
+def _number_of_cell(cell: str) -> float:
+    """Return the number in a cell: NaN if the cell is blank, infinity if it is no number."""
+    try:
+        return number_from_text(cell) if cell else math.nan
+    except ValueError:
+        return math.inf
+
+
+def _require_no_codes(grid: Table, column: int, values: Array, blank_allowed: bool) -> None:
     """Raise an `InputError` if values (rows,) of a column are codes of missing ones."""
     is_code = np.isin(values, MISSING_CODES)
     largest = float(np.nanmax(np.abs(values[~is_code]), initial=0.0))
@@ -332,7 +311,7 @@ def _require_no_codes(grid: TextTable, column: int, values: Array, blank_allowed
         )
 
 
-def times_in_column(grid: TextTable, column: int, factor: float = 1.0) -> Array:
+def times_in_column(grid: Table, column: int, factor: float = 1.0) -> Array:
     """Return the times (rows,) [s] in a column.
 
     Parameters
