@@ -50,7 +50,6 @@ VARIANTS = (
     ),
     Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian", share=0.5),
     Variant("interior-point", "interior-point", FROM_SIMULATION, share=0.25),
-    Variant("penalty, CG", "penalty", {"max_time_s": 15}, share=0.25),
 )
 
 PROBLEM = """\

@@ -6,11 +6,11 @@ markers. Six motions are planned and executed in MuJoCo: the tip moves along a c
 200 mm from rest to rest along a path of least jerk, by a hand that moves during the same time, that
 may begin 0.1 s earlier and end 0.1 s later, or that may turn, or on any path, and stays where it is
 while the hand moves by 50 mm. The tip is compared with its
-reference for the plan, for a plan with the estimates of the penalty method, and for hands that move
-as if the body were rigid, with and without a zero-vibration shaper.
+reference for the plan, and for hands that move as if the body were rigid, with and without a
+zero-vibration shaper.
 
     python scripts study_planning
-    python scripts study_planning --tasks circle --no-penalty
+    python scripts study_planning --tasks circle
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ from studies import markdown, number, save
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
-from collocation_sysid.errors import SimulationError
 from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import MotionPlan, Task, plan_motion
-from collocation_sysid.methods.comparison.penalty import Penalty
 
 mujoco: Any = import_module("mujoco")
 
@@ -67,7 +65,6 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
-    parser.add_argument("--no-penalty", action="store_true", help="without the penalty method")
     parser.add_argument("--out", type=Path, default=Path("results/study_planning"))
     arguments = parser.parse_args()
     plant = Plant()
@@ -75,9 +72,6 @@ def main() -> None:
     exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
     run = cs.run(cs.Problem([recorded], unknown(), uncertainty=exact))
     print(run.table(), run.trust.verdict, *run.trust.reasons, sep="\n    ", flush=True)
-    problems = {} if arguments.no_penalty else {
-        f"plan, penalty, ρ = {rho:.0e}": penalty_problem(recorded, rho) for rho in (1e2, 1e6)
-    }  # fmt: skip
     rows = []
     rigid = np.nan, np.nan, np.nan
     for name in arguments.tasks:
@@ -86,11 +80,6 @@ def main() -> None:
         motions: dict[str, Motion] = {"rigid": wanted.rigid_hand}
         motions["plan"] = plan_coordinates(plan)
         motions["rigid, shaped"] = Shaper.at(plan, run).shaped(wanted)
-        for title, problem in problems.items():
-            try:
-                motions[title] = plan_coordinates(plan_motion(problem, wanted.task, LIMITS))
-            except SimulationError as error:
-                print(f"{name}, {title}: {error}")
         for title, motion in motions.items():
             t_s, tip = executed(plant, motion, wanted.task.duration_s + AFTER_S)
             values = errors_of(t_s, tip, wanted)
@@ -233,21 +222,6 @@ def unknown() -> dict[str, Any]:
     """Return the parameters that are estimated."""
     free = {name: cs.Unknown() for name in ("young_pa", "gamma_r_s", "gamma_m_1_s")}
     return {**free, "poisson": PLANT["poisson"]}
-
-
-def penalty_problem(recorded: cs.Experiment, rho: float) -> cs.Problem:
-    """Return the problem with the estimates of the penalty method of the paper as guesses."""
-    guess = {"young_pa": 30e3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
-    start = {name: cs.Unknown(value) for name, value in guess.items()}
-    problem = cs.Problem([recorded], {**start, "poisson": PLANT["poisson"]}, substeps=1)
-    method = Penalty(
-        schedule="constant", rho=rho, inner="cg-descent", inner_iterations=10000, max_time_s=120.0
-    )
-    found = cs.solve(replace(problem, method=method)).parameters
-    values = ", ".join(f"{name} {value:.4g}" for name, value in found.items())
-    print(f"penalty, ρ = {rho:.0e}: {values}", flush=True)
-    known = {name: cs.Unknown(found[name]) for name in guess}
-    return cs.Problem([recorded], {**known, "poisson": PLANT["poisson"]})
 
 
 # Tasks --------------------------------------------------------------------------------------------

@@ -26,7 +26,6 @@ VARIANTS = (
     Variant("shooting", "shooting"),
     Variant("augmented-lagrangian, LM, first ρ = 1e5", "augmented-lagrangian"),
     Variant("augmented-lagrangian, LM, first ρ = 1e2", "augmented-lagrangian", {"rho": 1e2}),
-    Variant("penalty, CG", "penalty"),
     # Constant weights: that of the first stage of the schedule, and a large one.
     Variant("penalty, CG, ρ = 1e2", "penalty", {"schedule": "constant", "inner_iterations": 10000}),
     Variant(

@@ -60,7 +60,7 @@ def test_the_augmented_lagrangian_leaves_less_slack_than_a_penalty_of_the_same_w
 @pytest.mark.long
 def test_gradients_alone_get_near_with_multipliers():
     collocation = collocation_of("released-cube", 0.0, 5)
-    options = AugmentedLagrangian("cg-descent", rho=1e2, max_iterations=400)
+    options = AugmentedLagrangian("scipy-cg", rho=1e2, max_iterations=400)
     solution = options(collocation)
     assert solution.rms_m < 0.05 * solution.history[0].rms_m
 
@@ -88,7 +88,7 @@ def test_an_interruption_keeps_the_last_iterate():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"inner": "simplex"}, "inner: found 'simplex'; expected 'cg-descent'"),
+        ({"inner": "simplex"}, "inner: found 'simplex'; expected 'scipy-cg'"),
         ({"rho": -1.0}, "rho: found -1.0; expected a number above 0"),
         ({"rho_factor": 0.5}, "rho_factor: found 0.5; expected a number above 1"),
         (

@@ -16,23 +16,22 @@ from kit.problems import (
     measured,
     noisy,
     relative_errors,
-    released_cube,
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.methods.comparison.inner import FIRST_ORDER, minimise_merit
-from collocation_sysid.methods.comparison.merit import MeritFunction, PenaltyProblem
+from collocation_sysid.methods.comparison.conjugate_gradients import minimise_conjugate_gradients
+from collocation_sysid.methods.comparison.merit import MeritFunction, MeritPoint, PenaltyProblem
 from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
-from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.collocation import Collocation, convert_variables
 
 NEWTON = Penalty(inner="levenberg-marquardt")
 
 
-def disturbed(problem: PenaltyProblem, rng: np.random.Generator) -> np.ndarray:
-    z, _ = initial_variables(problem.original)
-    return z + np.where(problem.is_free, 0.01 * rng.standard_normal(len(z)), 0.0)
+def starting(problem: PenaltyProblem, collocation: Collocation) -> np.ndarray:
+    z, _ = initial_variables(collocation)
+    return convert_variables(z, collocation, target=problem.nlp)
 
 
 # The merit function
@@ -40,49 +39,26 @@ def disturbed(problem: PenaltyProblem, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SMALL_EXPERIMENTS)
 def test_the_gradient_of_the_merit_is_that_of_differences(name: str, rng):
-    problem = PenaltyProblem(collocation_of(name))
+    collocation = collocation_of(name)
+    problem = PenaltyProblem(collocation)
     merit = MeritFunction(problem, 30.0, rng.standard_normal(problem.nlp.constraint_count))
-    z = disturbed(problem, rng)
-    _, gradient = merit.value_and_gradient(z)
+    z = starting(problem, collocation)
+    z = z + np.where(problem.is_free, 0.01 * rng.standard_normal(len(z)), 0.0)
+    gradient = MeritPoint.evaluate(merit, z).gradient
     assert not gradient[~problem.is_free].any()
     scale = 0.1 * problem.is_free
     assert_derivative(merit.value, lambda d: gradient @ d, z, rng, tolerance=1e-6, scale=scale)
 
 
-def test_grasps_are_paid_for_and_given_starts_are_not():
-    hung, released = (
-        PenaltyProblem(Collocation([measured(make())], GUESS))
-        for make in (hung_cube, released_cube)
-    )
-    assert hung.is_free.all()
-    (start,) = released.nlp.transcriptions
-    assert np.count_nonzero(~released.is_free) == start.dof_count
-    assert hung.nlp.constraint_count > hung.original.constraint_count
-
-
 def test_an_inverted_element_costs_infinitely_much():
-    problem = PenaltyProblem(collocation_of("hung-cube"))
+    collocation = collocation_of("hung-cube")
+    problem = PenaltyProblem(collocation)
     merit = MeritFunction(problem, 1.0, np.zeros(problem.nlp.constraint_count))
-    z, _ = initial_variables(problem.original)
+    z = starting(problem, collocation)
     q, (x,) = problem.nlp.unpack(z)
     inverted = problem.nlp.pack(q, [-x])
     assert np.isfinite(merit.value(z))
     assert merit.value(inverted) == np.inf
-    assert merit.value_and_gradient(inverted)[0] == np.inf
-
-
-def test_held_nodes_of_the_answer_are_where_their_grasps_are(rng):
-    problem = PenaltyProblem(collocation_of("bar-let-go"))
-    answer = problem.to_original(disturbed(problem, rng))
-    rows = problem.nlp.constraint_values(answer).reshape(
-        -1, problem.nlp.transcriptions[0].dof_count
-    )
-    (transcription,) = problem.nlp.transcriptions
-    assert transcription.dynamics.is_temporarily_prescribed.any()
-    np.testing.assert_allclose(rows[:, transcription.prescribed_dofs], 0, atol=1e-12)
-    np.testing.assert_allclose(
-        rows[transcription.dynamics.is_temporarily_prescribed], 0, atol=1e-12
-    )
 
 
 # The answer
@@ -116,11 +92,10 @@ def test_the_slack_falls_as_one_over_rho_and_the_bias_with_it():
     assert (np.diff(moves) < 0).all()
 
 
-@pytest.mark.parametrize("inner", FIRST_ORDER)
-def test_methods_of_first_order_lower_the_merit_and_stay_upright(inner):
+def test_conjugate_gradients_lower_the_merit_and_stay_upright():
     collocation = collocation_of("hung-cube", 0.0, 5)
     problem = PenaltyProblem(collocation)
-    options = Penalty(inner, schedule="constant", rho=1e3, max_iterations=120)
+    options = Penalty(schedule="constant", rho=1e3, max_iterations=120)
     lines: list[Iteration] = []
     solution = options(collocation, lines.append)
     merit = MeritFunction(problem, 1e3, np.zeros(problem.nlp.constraint_count))
@@ -138,12 +113,11 @@ def test_conjugate_gradients_lower_the_merit_in_every_step():
     merit = MeritFunction(problem, 1e3, np.zeros(problem.nlp.constraint_count))
     start, _ = initial_variables(collocation)
     values = []
-    minimise_merit(
-        "cg-descent", merit, start, 1e-12, 150, lambda z, value, slope: values.append(value)
+    minimise_conjugate_gradients(
+        merit, start, 1e-12, 150, lambda z, gradient: values.append(merit.value(z))
     )
-    changes = np.diff(values)
-    assert len(changes) > 50
-    assert (changes <= 1e-6 * np.abs(values[:-1])).all()  # what the approximate conditions allow
+    assert len(values) > 50
+    assert (np.diff(values) < 0).all()
 
 
 @pytest.mark.slow
@@ -188,25 +162,26 @@ def test_budgets_end_it():
     assert "Raise inner_iterations" in stage.message
 
 
-def test_an_interruption_keeps_the_last_and_best_iterate():
+@pytest.mark.parametrize(("method", "last"), [(NEWTON, 3), (Penalty(), 60)])
+def test_an_interruption_keeps_the_last_and_best_iterate(method: Penalty, last: int):
     collocation = collocation_of("hung-cube")
 
     def interrupt(line: Iteration) -> None:
-        if line.number >= 3:
+        if line.number >= last:
             raise KeyboardInterrupt
 
-    solution = NEWTON(collocation, interrupt)
+    solution = method(collocation, interrupt)
     assert solution.status is Status.INTERRUPTED
-    assert solution.history[-1].number == 3
+    assert solution.history[-1].number == last
     assert solution.rms_m == pytest.approx(solution.history[-1].rms_m)
-    assert solution.rms_m < 0.01 * solution.history[0].rms_m
+    assert solution.rms_m < 0.1 * solution.history[0].rms_m
 
 
 @pytest.mark.long
-def test_both_layouts_of_grasps_give_the_same_answer():
+def test_both_layouts_of_grasps_give_the_same_answer_at_large_rho():
     made = noisy(hung_cube(), 1e-4)
     bounds, rows = (Collocation([made], GUESS, has_grasp_constraints=e) for e in (False, True))
-    options = replace(NEWTON, rho=1e6)
+    options = replace(NEWTON, rho=1e8)
     solution, explicit = options(bounds), options(rows)
     np.testing.assert_allclose(solution.z, explicit.z, atol=1e-6)
     assert len(solution.multipliers) == bounds.constraint_count
@@ -217,7 +192,7 @@ def test_both_layouts_of_grasps_give_the_same_answer():
 
 def test_nuisance_parameters_may_be_estimated_by_gradients_alone():
     collocation = Collocation([measured(cube_with_nuisance(5))], GUESS)
-    options = Penalty("l-bfgs-b", schedule="constant", rho=1e3, max_iterations=60)
+    options = Penalty(schedule="constant", rho=1e3, max_iterations=60)
     solution = options(collocation)
     assert solution.rms_m < 0.1 * solution.history[0].rms_m
 
@@ -225,7 +200,10 @@ def test_nuisance_parameters_may_be_estimated_by_gradients_alone():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"inner": "simplex"}, "inner: found 'simplex'; expected 'cg-descent', 'scipy-cg', "),
+        (
+            {"inner": "simplex"},
+            "inner: found 'simplex'; expected 'scipy-cg' or 'levenberg-marquardt'",
+        ),
         ({"schedule": "slow"}, "schedule: found 'slow'; expected 'geometric', 'progress' or"),
         ({"rho": 0.0}, "rho: found 0.0; expected a number above 0"),
         ({"rho_factor": 1.0}, "rho_factor: found 1.0; expected a number above 1"),

@@ -24,7 +24,7 @@ from ...common.array_types import Array, Index
 from ...errors import InputError
 from ...program.least_squares import SquareRootInformation
 from ...program.linear_algebra.lapack import cholesky_in_place, one_blas_thread
-from .merit import MeritFunction, PenaltyProblem
+from .merit import MeritFunction, MeritPoint, PenaltyProblem
 
 (_pbtrs,) = get_lapack_funcs(("pbtrs",), dtype=np.float64)
 
@@ -51,7 +51,7 @@ def minimise_levenberg_marquardt(
     z: Array,
     tolerance: float,
     max_iterations: int,
-    report: Callable[[Array, float, Array], None],
+    report: Callable[[Array, float], None],
 ) -> bool:
     """Minimise a merit function within its bounds.
 
@@ -64,8 +64,8 @@ def minimise_levenberg_marquardt(
     max_iterations : int
         Largest number of accepted steps.
     report : callable
-        Function that is called with every iterate, its value and its projected gradient; an
-        exception ends the minimisation. The last iterate is the result.
+        Function that is called with every iterate and the largest entry of its projected gradient;
+        an exception ends the minimisation and is not caught. The last iterate is the result.
 
     Returns
     -------
@@ -84,9 +84,9 @@ def minimise_levenberg_marquardt(
     growth = 2.0
     is_local = False
     order = []
-    point = _MeritPoint.evaluate(merit, z)
+    point = MeritPoint.evaluate(merit, z)
     for count in range(max_iterations + 1):
-        report(point.z, point.value, point.projected)
+        report(point.z, point.gradient_norm)
         if point.gradient_norm <= tolerance:
             return True
         if count == max_iterations:
@@ -102,14 +102,14 @@ def minimise_levenberg_marquardt(
                 trial = np.clip(point.z + step, merit.problem.lower, merit.problem.upper)
                 if predicted <= ROUNDING * abs(point.value):
                     # Values cannot judge this step any more; gradients can.
-                    after = _MeritPoint.evaluate(merit, trial)
+                    after = MeritPoint.evaluate(merit, trial)
                     if not after.gradient_norm <= point.gradient_norm / 2:
                         return False
                     ratio = 1.0
                     break
                 decrease = point.value - merit.value(trial)
                 if decrease >= ACCEPTED * predicted:
-                    after = _MeritPoint.evaluate(merit, trial)
+                    after = MeritPoint.evaluate(merit, trial)
                     ratio = decrease / predicted
                     break
             damping = damping * growth
@@ -123,52 +123,8 @@ def minimise_levenberg_marquardt(
     return False
 
 
-@dataclass(frozen=True, eq=False)
-class _MeritPoint:
-    """Merit function with its derivatives at z; the Jacobian is overwritten by the next point's."""
-
-    z: Array  # (variables,): variables
-    value: float  # merit m
-    rows: Array  # (constraints,): constraints g
-    # sparse (constraints, variables): ∂g/∂z, in memory that all points share.
-    jacobian: sp.csc_array
-    gradient: Array  # (variables,): ∂m/∂z
-    # (variables,): the same with zeros for constant variables and at active bounds.
-    projected: Array
-
-    @classmethod
-    def evaluate(cls, merit: MeritFunction, z: Array) -> _MeritPoint:
-        """Return the merit function, the constraints and their Jacobian, and ∂m/∂z at z
-        (variables,).
-
-        Elements are not checked: if one is inverted, the value may be infinite and derivatives NaN.
-        The Jacobian of the point that was evaluated before is overwritten.
-
-        Raises
-        ------
-        SimulationError
-            If the body has no stress-free shape at these parameters.
-        """
-        rows, jacobian = merit.problem.constraints_and_jacobian(z)
-        gradient = merit.gradient(z, rows, jacobian=jacobian)
-        projected = merit.problem.project_gradient(z, gradient)
-        return cls(
-            z,
-            merit.value_from_constraints(z, rows),
-            rows=rows,
-            jacobian=jacobian,
-            gradient=gradient,
-            projected=projected,
-        )
-
-    @property
-    def gradient_norm(self) -> float:
-        """Largest entry of the projected gradient."""
-        return float(np.abs(self.projected).max(initial=0.0))
-
-
 def _quadratic_model(
-    merit: MeritFunction, point: _MeritPoint, exact: bool, order: list[Index]
+    merit: MeritFunction, point: MeritPoint, exact: bool, order: list[Index]
 ) -> _QuadraticModel:
     """Return the quadratic model at a point."""
     weights = merit.multiplier_estimate(point.rows) if exact else np.zeros_like(point.rows)
@@ -197,8 +153,7 @@ class _QuadraticModel:
     problem: PenaltyProblem
     z: Array  # (variables,)
     rho: float  # penalty parameter ρ
-    # sparse (constraints, variables): ∂g/∂z; it must not be overwritten while the model is used.
-    jacobian: sp.csc_array
+    jacobian: sp.csc_array  # sparse (constraints, variables): ∂g/∂z
     # sparse (variables, variables): Hessian H of the loss or of the Lagrangian.
     hessian: sp.csc_array
     gradient: Array  # (variables,): ∂m/∂z
@@ -269,9 +224,7 @@ class _QuadraticModel:
             return None
         border = self.problem.parameter_indices
         problem = self.problem
-        reach = problem.nlp.reach_p
-        places = np.where(border < problem.nlp.nq, border, border - len(self.z) + len(reach))
-        reach = REACH * reach[places]
+        reach = REACH * problem.reach_p
         # Rounding may leave a parameter on its bound by a hair.
         low = np.minimum(np.maximum(problem.lower[border] - self.z[border], -reach), 0) - 1e-15
         high = np.maximum(np.minimum(problem.upper[border] - self.z[border], reach), 0) + 1e-15
@@ -338,7 +291,7 @@ class _QuadraticModel:
                 raise InputError(
                     f"inner = 'levenberg-marquardt' would take {needed / 1e9:.0f} GB for "
                     f"{len(place)} variables; expected at most {MOST_MEMORY / 1e9:.0f} GB. "
-                    "Choose inner = 'l-bfgs-b', or the method 'reduced-space'",
+                    "Choose inner = 'scipy-cg', or the method 'reduced-space'",
                     None,
                     where="solver",
                 )

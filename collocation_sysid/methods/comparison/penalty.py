@@ -25,14 +25,16 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ...common.array_types import Array
+from ...common.time_limit import time_limit
 from ...common.validated_classes import validated
 from ...common.validated_types import AboveOne, AtLeastOne, Count, Positive
 from ...errors import InputError
-from ...program.collocation import Collocation
+from ...program.collocation import Collocation, convert_variables
 from ..options import MethodOptions
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
-from .inner import FIRST_ORDER, Inner, minimise_merit
+from .conjugate_gradients import minimise_conjugate_gradients
+from .levenberg_marquardt import minimise_levenberg_marquardt
 from .merit import MeritFunction, PenaltyProblem
 
 # ρ increases if a stage leaves more than this share of the violation.
@@ -43,10 +45,8 @@ STUCK = 0.9
 FIRST_GRADIENT = 1e-3
 # Tolerance of a later stage over that of the previous one.
 TIGHTER = 0.1
-# Iterations between entries of the history.
-EVERY = 1
-# The same for first-order methods, whose iterations are many and cheap.
-EVERY_OF_FIRST_ORDER = 20
+# Iterations between entries of the history; those of conjugate gradients are many and cheap.
+EVERY = {"levenberg-marquardt": 1, "scipy-cg": 20}
 # Rounding leaves about this much of the gradient for every unit of curvature, of the loss or ρ.
 ROUNDING = 1e-14
 
@@ -57,7 +57,7 @@ class ConstraintViolation:
 
     newtons: float = np.inf  # largest residual [N]
     relative: float = np.inf  # largest residual over the largest force in the equations
-    scaled: float = np.inf  # largest entry of g, prescribed displacements included
+    scaled: float = np.inf  # largest entry of g
 
     def __str__(self) -> str:
         """Return the violation in words, for messages."""
@@ -82,11 +82,10 @@ class PenaltyOptions(MethodOptions):
 
     Attributes
     ----------
-    inner : {"cg-descent", "scipy-cg", "l-bfgs-b", "levenberg-marquardt"}
-        Solver that minimises the merit function: the conjugate gradients of Hager and Zhang as in
-        the paper ("cg-descent"), the conjugate gradients of SciPy ("scipy-cg"), a quasi-Newton
-        method ("l-bfgs-b"), or damped Newton steps with a sparse factorisation
-        ("levenberg-marquardt"), which alone come near a minimum at large ρ.
+    inner : {"scipy-cg", "levenberg-marquardt"}
+        Solver that minimises the merit function: the conjugate gradients of SciPy ("scipy-cg"), or
+        damped Newton steps with a sparse factorisation ("levenberg-marquardt"), which alone come
+        near a minimum at large ρ.
     rho : float
         First ρ; loss and constraints are in the scaling of the NLP, where both are of order one.
     rho_max : float
@@ -107,7 +106,7 @@ class PenaltyOptions(MethodOptions):
         Largest computing time in seconds.
     """
 
-    inner: Inner = "levenberg-marquardt"
+    inner: Literal["scipy-cg", "levenberg-marquardt"] = "levenberg-marquardt"
     rho: Positive = 1e5
     rho_max: Positive = 1e9
     rho_factor: AboveOne = 10.0
@@ -132,9 +131,6 @@ class PenaltyOptions(MethodOptions):
     ) -> Solution:
         """Solve the NLP from `start`, by default from a simulation at the guess; see `Method`.
         Entries of the history, with which `watch` is called, count inner iterations.
-
-        Grasped nodes of the solution have their prescribed positions, where its violation is
-        evaluated.
         """
         climb = _PenaltySolve(
             self,
@@ -142,7 +138,8 @@ class PenaltyOptions(MethodOptions):
             start=start,
         )
         try:
-            status, message = climb.run()
+            with time_limit(self.max_time_s):
+                status, message = climb.run()
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)
         return climb.solution(status, message)
@@ -190,7 +187,7 @@ class Penalty(PenaltyOptions):
 
     name: ClassVar[str] = "penalty"
 
-    inner: Inner = "cg-descent"
+    inner: Literal["scipy-cg", "levenberg-marquardt"] = "scipy-cg"
     rho: Positive = 1e2
     rho_max: Positive = 1e8
     violation: Positive = 1e-3
@@ -319,7 +316,9 @@ class _PenaltySolve:
         self.recorder = recorder
         self.problem = PenaltyProblem(recorder.collocation, recorder.stopwatch)
         nlp = self.problem.nlp
-        began = self.problem.from_original(recorder.initial_variables(start))
+        began = convert_variables(
+            recorder.initial_variables(start), recorder.collocation, target=nlp
+        )
         self.variables = np.clip(began, self.problem.lower, self.problem.upper)
         if not self.problem.has_valid_elements(self.variables):
             raise InputError("elements are inverted at the initial point; give another guess")
@@ -330,7 +329,6 @@ class _PenaltySolve:
         self.gradient = np.inf
         curvature = nlp.hessian(self.variables, 1.0, multipliers=no_weights).diagonal()
         self._curvature = float(curvature.max(initial=0.0))
-        self._every = EVERY_OF_FIRST_ORDER if options.inner in FIRST_ORDER else EVERY
 
     def run(self) -> tuple[Status, str]:
         """Solve one stage after the other; return status and message.
@@ -374,8 +372,8 @@ class _PenaltySolve:
             status,
             f"{reason} Remaining violation of the equations of motion at ρ = {merit.rho:.3g}: "
             f"{self._violation()}.",
-            z=self.problem.to_original(self.variables),
-            multipliers=self.problem.to_original_multipliers(estimate),
+            z=self._original_variables(),
+            multipliers=estimate[: self.recorder.collocation.constraint_count],
             iterations=self.iterations,
             evaluations=self.problem.evaluations,
         )
@@ -396,15 +394,15 @@ class _PenaltySolve:
         before = self.iterations
         done = 0
 
-        def report(z: Array, value: float, projected: Array) -> None:
-            """Store an iterate z with its projected gradient, add it to the history now and then,
-            and raise `SearchEnded` if a limit is reached; its merit `value` is not used.
+        def report(z: Array, gradient: float) -> None:
+            """Store an iterate z with its largest projected gradient, add it to the history now and
+            then, and raise `SearchEnded` if a limit is reached.
             """
             nonlocal done
             self.variables = z
-            self.gradient = float(np.abs(projected).max(initial=0.0))
+            self.gradient = gradient
             self.iterations = before + done
-            if (done % self._every == 0 and done > 0) or not recorder.history:
+            if (done % EVERY[options.inner] == 0 and done > 0) or not recorder.history:
                 self._record()
             if recorder.is_late():
                 raise SearchEnded(Status.TIME_LIMIT)
@@ -412,13 +410,16 @@ class _PenaltySolve:
                 raise SearchEnded(Status.ITERATION_LIMIT)
             done += 1
 
-        limit = options.inner_iterations
-        reached = minimise_merit(
-            options.inner,
+        minimise = (
+            minimise_conjugate_gradients
+            if options.inner == "scipy-cg"
+            else minimise_levenberg_marquardt
+        )
+        reached = minimise(
             stage.merit,
-            z=self.variables,
+            self.variables,
             tolerance=tolerance,
-            max_iterations=limit,
+            max_iterations=options.inner_iterations,
             report=report,
         )
         if recorder.history[-1].number < self.iterations:
@@ -427,16 +428,20 @@ class _PenaltySolve:
             stage, gradient=self.gradient, is_minimum=reached, violation=self._violation()
         )
 
+    def _original_variables(self) -> Array:
+        """Return the variables of the given problem at the last iterate."""
+        return convert_variables(self.variables, self.problem.nlp, target=self.recorder.collocation)
+
     def _record(self) -> None:
         """Add the last iterate to the history, with the loss of the given problem."""
-        nlp = self.problem.original
-        z = self.problem.to_original(self.variables)
+        nlp = self.recorder.collocation
+        z = self._original_variables()
         self.recorder.add_variables(self.iterations, z, loss=nlp.objective(z) / nlp.loss_scale)
 
     def _violation(self) -> ConstraintViolation:
-        """Violation with grasped nodes at their goals, and without this change."""
-        nlp = self.problem.original
-        z = self.problem.to_original(self.variables)
+        """Return the violation at the last iterate."""
+        nlp = self.recorder.collocation
+        z = self._original_variables()
         newtons = max(float(np.abs(r).max(initial=0.0)) for r in nlp.residuals_n(z))
         rows = self.problem.constraint_values(self.variables)
         scaled = float(np.abs(rows).max(initial=0.0))
