@@ -119,10 +119,6 @@ class InteriorPoint(MethodOptions):
         every parameter and decreases as steps become shorter. Far from the solution the residuals
         are large, so that the full Hessian is indefinite and its steps are too long. 0 uses the
         exact Hessian from the start.
-    proximal : float
-        Number that is added to the diagonal entries of the Hessian that belong to positions, most
-        of which would otherwise be zero. It changes the steps slightly, but not the solution, and
-        avoids factorisations that fail because of rounding (wrong inertia).
     contact : {"energy", "complementarity"}
         Model of contact with obstacles. "energy": an energy that increases as the body approaches
         an obstacle. "complementarity": pressures are additional variables with 0 ≤ pressure ⟂ gap ≥
@@ -146,7 +142,6 @@ class InteriorPoint(MethodOptions):
     hessian: Literal["exact", "gauss-newton", "limited-memory"] = "exact"
     initial: Literal["reduced-space", "simulation"] = "reduced-space"
     warm_up: NotNegative = 0.1
-    proximal: NotNegative = 1e-5
     contact: Literal["energy", "complementarity"] = "energy"
     linear_solver: Text = "mumps"
     tolerance: Positive = 1e-8
@@ -310,8 +305,14 @@ def _largest_curvature(collocation: Collocation) -> float:
     return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
 
 
+# Number that is added to the diagonal entries of the Hessian that belong to positions, most of which
+# would otherwise be zero. It changes the steps slightly, but not the solution, and avoids
+# factorisations that fail because of rounding (wrong inertia).
+PROXIMAL = 1e-5
+
+
 class _DampedHessian:
-    """Hessian of the Lagrangian with the warm-up and proximal terms of the options.
+    """Hessian of the Lagrangian with the warm-up and proximal terms.
 
     It depends on the sequence of calls: each call compares the parameters with those of the
     previous call, and adapts the damping.
@@ -331,7 +332,7 @@ class _DampedHessian:
 
     def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
         """Write the upper triangle of the Hessian at z to `values`: the exact one, or that of
-        Gauss–Newton during the warm-up or by the options, with `proximal` on the diagonal of the
+        Gauss–Newton during the warm-up or by the options, with `PROXIMAL` on the diagonal of the
         positions and, during the warm-up, the damping on that of q.
 
         The parameters are stored, and the damping is adapted, see `_ends_warm_up`.
@@ -342,7 +343,7 @@ class _DampedHessian:
             z, weight, multipliers=multipliers if is_exact else None, out=values
         )
         of_q, of_x = self.collocation.hessian_diagonals
-        values[of_x] += self.options.proximal
+        values[of_x] += PROXIMAL
         if not is_settled:
             # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
             largest = self.collocation.objective(z) / (2 * STEP_LIMIT**2)

@@ -97,6 +97,14 @@ REREADINGS = 40
 UNLIMITED = 1e100
 
 
+# The search on each share of a recording but the last ends when the next step is predicted to decrease
+# the loss by less than this fraction.
+RUNG_DECREASE = 0.05
+# Standard deviation of a prior of the logarithm of each parameter about its guess on these shares: a
+# short part of a recording does not determine all parameters, and those would move to their bounds.
+RUNG_PRIOR = 2.3
+
+
 @validated
 class SearchOptions(MethodOptions):
     """Options of the search for parameters.
@@ -117,16 +125,9 @@ class SearchOptions(MethodOptions):
     ladder : tuple of float
         Shares of the recording solved one after another, ending with 1. Not used if the solve
         starts from another run.
-    rung_decrease : float
-        The search on each share of the recording except the last ends when the next step is
-        predicted to decrease the loss by less than this fraction.
     largest_loss : float
         The search stalls when the solve of a share of the recording except the last leaves a larger
         loss than this; unlimited by default.
-    rung_prior : float
-        Standard deviation of a prior of the logarithm of each parameter about its guess, for all
-        shares of the recording except the last. A short part of a recording does not determine all
-        parameters; without this prior, undetermined parameters would move to their bounds.
     hessian : {"gauss-newton", "exact"}
         Second derivatives that Gauss–Newton neglects: "gauss-newton" approximates them from the
         previous steps, and "exact" computes them from the Lagrangian, which takes a second sweep
@@ -143,9 +144,7 @@ class SearchOptions(MethodOptions):
     max_iterations: Count = 200
     trust: Positive = 1.0
     ladder: Shares = SHARES
-    rung_decrease: Positive = 0.05
     largest_loss: Positive = UNLIMITED
-    rung_prior: Positive = 2.3
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     factorisation: Choice = "auto"
 
@@ -320,7 +319,7 @@ class ReducedSearch:
         """Return the problem on the given numbers of first rows of each experiment; unless it is
         the last horizon, with the prior of the options.
         """
-        prior = None if last else self.options.rung_prior
+        prior = None if last else RUNG_PRIOR
         watch = self.recorder.stopwatch
         choice = self.options.factorisation
         return Horizon(
@@ -388,7 +387,7 @@ class ReducedSearch:
             Problem on the first rows.
         is_last : bool
             Whether it is the complete problem. Otherwise the status is also that of convergence if
-            the predicted relative decrease of the loss is less than `rung_decrease`.
+            the predicted relative decrease of the loss is less than `RUNG_DECREASE`.
         accuracy : float
             Relative accuracy of the time steps' solutions in the first sweep.
 
@@ -437,7 +436,7 @@ class ReducedSearch:
                     )
                     return Status.CONVERGED
             predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
-            if not is_last and predicted_share < self.options.rung_decrease:
+            if not is_last and predicted_share < RUNG_DECREASE:
                 return Status.CONVERGED
             # With curvature that Gauss–Newton neglects its own loss may be predicted to grow.
             if 0.0 <= predicted_share < self.options.least_decrease * min(1.0, length):

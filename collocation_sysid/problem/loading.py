@@ -384,7 +384,6 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         made=section.made,
         mesh_from=section.mesh_from,
         material_density_kg_m3=section.material_density_kg_m3,
-        evaluator=section.evaluator,
     )
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from ..common.array_types import Array
-from ..errors import InputError
 from ..recording import MarkerTable, PoseSequence, align_to_template, fit_poses, read_markers
 from ..recording.rigid_fit import least_rigid_marker
 from .recording_schema import ExperimentSection, MarkersSection, MovedSection
@@ -68,21 +67,13 @@ def transform_to_body_frame(
     Raises
     ------
     InputError
-        If the fit fails, or a marker's residual exceeds `max_template_residual_m`.
+        If the fit fails.
     """
     if markers.template_m is None or markers.template_window_s is None:
         return table, []
     fit = align_to_template(table, markers.template_m, window_s=markers.template_window_s)
     names = list(markers.template_m)
     residuals_m = fit.residual_m
-    worst = int(np.nanargmax(residuals_m))
-    limit_m = markers.max_template_residual_m
-    if limit_m is not None and residuals_m[worst] > limit_m:
-        raise InputError(
-            f"marker {names[worst]!r} is {residuals_m[worst]:.3g} m away from its template "
-            f"position after the rigid fit; max_template_residual_m is {limit_m:g}. Check "
-            "template_m, labels and length_unit, and that the body rests in template_window_s"
-        )
     residual_list = ", ".join(
         f"{name} {_mm(off)}"
         for name, off in zip(names, residuals_m, strict=True)
@@ -134,32 +125,18 @@ def poses_from_markers(
         )
     residual_m = np.where(is_in_window, fit.residual_m, np.nan)
     if np.isfinite(residual_m).any():
-        notes.append(
-            _rigidity_note(
-                names,
-                reference_m,
-                tracks=tracks,
-                t_s=table.t_s,
-                residual_m=residual_m,
-                max_residual_m=grasp.max_residual_m,
-            )
-        )
+        notes.append(_rigidity_note(names, reference_m, tracks, table.t_s, residual_m))
     return poses, notes
 
 
 def _rigidity_note(
-    names: list[str],
-    reference_m: Array,
-    tracks: Array,
-    t_s: Array,
-    residual_m: Array,
-    max_residual_m: float | None,
+    names: list[str], reference_m: Array, tracks: Array, t_s: Array, residual_m: Array
 ) -> str:
     """Return a note on the residuals of the rigid fit, with the worst marker if a frame is unusual."""
     median_m = float(np.nanmedian(residual_m))
     worst = int(np.nanargmax(residual_m))
     size_m = float(np.linalg.norm(np.ptp(reference_m, axis=0)))
-    limit_m = max_residual_m or max(UNUSUAL * median_m, ROUNDING * size_m)
+    limit_m = max(UNUSUAL * median_m, ROUNDING * size_m)
     fit_sentence = (
         f"the markers {', '.join(names)} fit a rigid motion to {_mm(median_m)} (median over "
         "the frames)"

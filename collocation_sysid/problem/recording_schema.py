@@ -220,8 +220,6 @@ class MovedSection(Section):
         obstacle, by name; the poses are fitted to the tracks of these markers.
     weights : mapping of name to float
         Weight of each marker in `markers` in the fit of the poses, by name; 1 by default.
-    max_residual_m : float, optional
-        Residual of the fit of the poses above which a frame is reported [m].
     gripper_to_body : TransformSection, optional
         Pose G of the undeformed body in the frame whose poses U(t) were measured, x = U(t) G X:
         position_m, quaternion_xyzw.
@@ -236,7 +234,6 @@ class MovedSection(Section):
     length_unit: Unit | None = None
     markers: dict[str, Vector] | None = None
     weights: dict[str, NotNegative] = Field(default_factory=dict)
-    max_residual_m: Positive | None = None
     gripper_to_body: TransformSection | None = None
     interpolation: Literal["smooth", "linear", "hold"] = "smooth"
 
@@ -258,7 +255,7 @@ class MovedSection(Section):
             )
         for section, keys in (
             ("poses", ("quaternion", "length_unit", "gripper_to_body")),
-            ("markers", ("max_residual_m", "weights")),
+            ("markers", ("weights",)),
         ):
             present = [key for key in keys if getattr(self, key)]
             if present and getattr(self, section) is None:
@@ -346,8 +343,6 @@ class MarkersSection(Section, of=Markers):
     template_window_s : list, optional
         First and last time [start, end] of the window in which the markers are at the positions in
         template_m; their tracks are averaged over it.
-    max_template_residual_m : float, optional
-        Largest allowed distance of a marker from its position in template_m after this motion [m].
     reference_m : mapping of name to (3,) array
         Position [x, y, z] of each marker on the undeformed body, by name; the positions of other
         markers are estimated.
@@ -368,7 +363,6 @@ class MarkersSection(Section, of=Markers):
     rate_hz: Positive | None = None
     template_m: dict[str, Vector] | None = None
     template_window_s: tuple[Finite, Finite] | None = None
-    max_template_residual_m: Positive | None = None
     reference_m: dict[str, Vector] = Field(default_factory=dict)
     reference_sigma_m: ReferenceSigma | None = None
 
@@ -378,8 +372,8 @@ class MarkersSection(Section, of=Markers):
         are given together or not at all, with at least three positions and a window that does
         not end before it starts.
         """
-        present = used_keys(self, "template_m", "template_window_s", "max_template_residual_m")
-        if present and not {"template_m", "template_window_s"} <= set(present):
+        present = used_keys(self, "template_m", "template_window_s")
+        if len(present) == 1:
             raise ValueError(
                 f"found {', '.join(present)}; expected template_m and template_window_s, both "
                 "or neither"

@@ -227,9 +227,6 @@ class ObjectSection(Section):
         object. A scan without rest_shape counts as made in an unknown orientation to gravity.
     scan : ScanSection, optional
         Gravity and held nodes during the scan: gravity_m_s2, nodes.
-    evaluator : {"auto", "simd", "casadi"}
-        How the expressions of the elements are evaluated: by compiled vector code ("simd"), by
-        CasADi ("casadi"), or by CasADi only if vector code cannot evaluate the material ("auto").
     """
 
     mesh: Text | None = None
@@ -253,7 +250,6 @@ class ObjectSection(Section):
     made: Made | None = None
     mesh_from: MeshOrigin | None = None
     scan: ScanSection | None = None
-    evaluator: Literal["auto", "simd", "casadi"] = "auto"
 
     @property
     def has_shape(self) -> bool:

@@ -98,9 +98,9 @@ def test_a_marker_that_moves_on_the_gripper_is_reported_with_its_frame(tracked):
         return tracks
 
     change_tracks(tracked, loosen)
-    driven_by_markers(tracked, ", max_residual_m = 0.001")
+    driven_by_markers(tracked)
     (note,) = load(tracked).notes
-    assert "1 frame is above 1 mm" in note
+    assert "1 frame is above" in note
     assert (
         f"at t = {expected[5]:.6g} s (frame 6), where 'base2' moves relative to the others" in note
     )
@@ -221,14 +221,6 @@ def test_a_template_brings_the_cameras_frame_to_the_bodys(filmed):
     problem = load(folder, *settings(markers))
     assert_same_motion(problem.experiments[0], expected)
     assert "moved rigidly to the template; remaining distances: base1 " in problem.notes[0]
-
-
-def test_a_template_that_does_not_fit_is_refused(filmed):
-    folder, markers, _ = filmed
-    markers["template_m"]["base2"][0] += 0.01
-    assert "base2 " in load(folder, *settings(markers)).notes[0]
-    with pytest.raises(InputError, match=r"markers\.template_m: marker 'base2' is 0\.00\d+ m"):
-        load(folder, *settings({**markers, "max_template_residual_m": 0.002}))
 
 
 @pytest.mark.parametrize(

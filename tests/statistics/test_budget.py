@@ -31,7 +31,6 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.combined_intervals import combine
@@ -40,7 +39,11 @@ from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_nuisances,
 )
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
-from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
+from collocation_sysid.statistics.budget.systematic_effects import (
+    ASSUMPTIONS,
+    CONSIDERED,
+    Assumptions,
+)
 from collocation_sysid.statistics.budget.variance_sources import (
     VarianceSources,
     rescaled,
@@ -170,17 +173,8 @@ def test_estimated_nuisance_parameters_are_not_considered():
     assert "clock_rate" in names
 
 
-def test_a_nuisance_that_moves_the_body_may_be_considered():
-    solution = solve(Problem([measured(hung_cube(12))], GUESS))
-    stated = Assumptions(gravity_rad=0.02).collect_deviations()
-    changes = changes_of_assumptions(solution.collocation, solution.z, stated)
-    here = [k for k, name in enumerate(changes.names) if name == "gravity_rad"]
-    assert len(here) == 2
-    assert all(np.abs(changes.blocks[0][..., k]).max() > 0.1 for k in here)
-
-
 def test_every_assumption_has_a_key_a_default_and_words():
-    assert set(Assumptions().collect_deviations()) == {row.name for row in (*ASSUMPTIONS, *KINDS)}
+    assert set(Assumptions().collect_deviations()) == {row.name for row in CONSIDERED}
     assert all(row.description and source_label(row.name) for row in ASSUMPTIONS)
     assert source_label("grip_layer_m") == "grip layer"
 

@@ -1194,6 +1194,8 @@ ASSUMPTIONS = (
 
 # Every deviation, by its name.
 DEVIATIONS = {row.name: row for row in (*ASSUMPTIONS, *KINDS)}
+# Those of the budget; other nuisance parameters are estimated or exact.
+CONSIDERED = (*ASSUMPTIONS, *(row for row in KINDS if row.considered is not None))
 
 
 def usual_deviations(bodies: Iterable[Body]) -> dict[str, float | None]:
@@ -1244,13 +1246,13 @@ def _field_of(row: Deviation) -> FieldOfRow:
 
 
 @validated(kw_only=True)
-@with_fields({name: _field_of(row) for name, row in DEVIATIONS.items()})
+@with_fields({row.name: _field_of(row) for row in CONSIDERED})
 class Assumptions:
     """Standard deviations of systematic effects; "none" for an effect that is exactly zero.
 
     An effect that is known to exist, such as the compliance of a machine, has a table of mean and
     deviation. Nuisance parameters of recordings, by their names, count if they are not estimated.
-    There is a field for each of `DEVIATIONS`. Fields that are None have the default of bodies that
+    There is a field for each of `CONSIDERED`. Fields that are None have the default of bodies that
     were made like those of the problem, see `usual_deviations`.
     """
 
