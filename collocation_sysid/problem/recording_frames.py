@@ -110,8 +110,8 @@ class RecordingFrames:
         return next((each.parent for each in self.poses if each.parent), "") or self.markers
 
     @cached_property
-    def transforms(self) -> LogFrames | None:
-        """Transforms of the log of the first poses, else of the markers or of a force sensor; None
+    def transforms(self) -> LogFrames:
+        """Transforms of the log of the first poses, else of the markers or of a force sensor; none
         if all are files.
         """
         section = self.section
@@ -122,9 +122,9 @@ class RecordingFrames:
         ]
         for name in filter(None, names):
             with located(name):
-                if (frames := LogFrames.read(self.folder / name)) is not None:
+                if (frames := LogFrames.read(self.folder / name)).name:
                     return frames
-        return None
+        return LogFrames()
 
     # Gravity --------------------------------------------------------------------------------------
 
@@ -147,7 +147,7 @@ class RecordingFrames:
 
     def _require_static_transform(self, parent: str, child: str) -> Array:
         """Return the pose (4, 4) of a frame in another one from the log's static transforms."""
-        if self.transforms is None:
+        if not self.transforms.name:
             raise InputError(
                 f"found {child!r}, but poses and markers are not topics of a log, from which the "
                 "frames would be known; expected no such key: omit it, and state the values in the "
@@ -178,26 +178,23 @@ class RecordingFrames:
         frame against one that is level by its name (`LEVEL_FRAMES`); else an empty list.
         """
         states_gravity = {"gravity_m_s2", "gravity_frame"} & (self.section.model_fields_set)
-        if states_gravity or not self.world or self.transforms is None:
+        if states_gravity or not self.world:
             return []
-        names = self.transforms.static_neighbours(self.world)
-        for name in sorted(names, key=_level_rank):
-            if _level_rank(name) >= _level_rank(self.world):
-                return []
-            matrix = self.transforms.static_transform(self.world, name)
-            assert matrix is not None
-            tilt_deg = float(np.degrees(np.arccos(np.clip(matrix[2, 2], -1, 1))))
-            if tilt_deg > SMALLEST_TILT_DEG:
-                gravity = matrix[:3, :3] @ np.array(EARTH_M_S2)
-                vector = ", ".join(f"{value:.4g}" for value in gravity)
-                return [
-                    f"gravity is along −z of {self.world!r}, the frame of the recording, but the "
-                    f"log tilts this frame by {tilt_deg:.2g}° against {name!r}: if {name!r} is "
-                    f'level, state gravity_frame = "{name}", or gravity_m_s2 = [{vector}]; '
-                    f'if {self.world!r} is level, state gravity_frame = "{self.world}"'
-                ]
+        names = [self.world, *self.transforms.static_neighbours(self.world)]
+        name = min(names, key=_level_rank)
+        matrix = self.transforms.static_transform(self.world, name)
+        assert matrix is not None
+        tilt_deg = float(np.degrees(np.arccos(np.clip(matrix[2, 2], -1, 1))))
+        if tilt_deg <= SMALLEST_TILT_DEG:
             return []
-        return []
+        gravity = matrix[:3, :3] @ np.array(EARTH_M_S2)
+        vector = ", ".join(f"{value:.4g}" for value in gravity)
+        return [
+            f"gravity is along −z of {self.world!r}, the frame of the recording, but the log tilts "
+            f"this frame by {tilt_deg:.2g}° against {name!r}: if {name!r} is level, state "
+            f'gravity_frame = "{name}", or gravity_m_s2 = [{vector}]; if {self.world!r} is level, '
+            f'state gravity_frame = "{self.world}"'
+        ]
 
     # Markers --------------------------------------------------------------------------------------
 
@@ -207,23 +204,15 @@ class RecordingFrames:
 
         Frames that coincide by the log's static transforms are the same.
         """
-        poses = [
-            (moved.poses, frames)
-            for moved, frames in zip(self.section.moved_sections, self.poses, strict=True)
-            if frames.parent
-        ]
-        if not self.markers:
-            return ""
-        for name, frames in poses:
-            if frames.parent == self.markers:
+        for moved, frames in zip(self.section.moved_sections, self.poses, strict=True):
+            if not self.markers or frames.parent in ("", self.markers):
                 continue
+            name = moved.poses
             file = self.section.markers.file
             fault = (
                 f"the poses {name} are in the frame {frames.parent!r}, the markers {file} in "
                 f"{self.markers!r}; expected one frame"
             )
-            if self.transforms is None:
-                return fault
             pose = self.transforms.static_transform(frames.parent, self.markers)
             if pose is not None and np.allclose(pose, np.eye(4)):
                 continue
@@ -260,11 +249,7 @@ class RecordingFrames:
         InputError
             If `sensor_frame` is stated, and is not connected with either.
         """
-        sensor = self._sensor_frame(section)
-        if not sensor or self.transforms is None:
-            if section.sensor_frame is not None:
-                with located(where=f"{key}.sensor_frame"):
-                    self._require_static_transform(self.world, sensor)
+        if not (sensor := self._sensor_frame(section)):
             return None
         frames = self.poses[k]
         if frames.child:

@@ -178,62 +178,53 @@ def _wide_table(grid: Table, names: list[str], t_s: Array | None, frames: Array)
             if name in grid.columns:
                 likelihood[:, k] = _numbers(grid, [name])[:, 0]
     pixels = pixels.reshape(len(pixels), -1, 2)
-    if "track" in grid.columns:
-        return _by_animal(grid, names, pixels, likelihood, frames)
-    return TrackFile(tuple(names), pixels, likelihood, t_s, frames)
-
-
-def _by_animal(
-    grid: Table, names: list[str], pixels: Array, likelihood: Array | None, frames: Array
-) -> TrackFile:
-    """Return the tracks of a table of SLEAP, with one row for each animal in an image."""
-    labels = grid.cells[:, grid.columns.index("track")].tolist()
-    animals = tuple(dict.fromkeys(labels))
-    numbers, image = np.unique(frames, return_inverse=True)
-    animal = np.array([animals.index(label) for label in labels])
-    pairs = image * len(animals) + animal
-    twice = np.flatnonzero(~np.isin(np.arange(len(pairs)), np.unique(pairs, return_index=True)[1]))
-    if len(twice):
-        k = int(twice[0])
-        raise grid.error_at(f"track {labels[k]!r} appears twice in this image; expected once", k)
-    shape = len(numbers), len(animals), len(names)
-    placed, scores = np.full((*shape, 2), np.nan), np.zeros(shape)
-    placed[image, animal] = pixels
-    scores[image, animal] = 1.0 if likelihood is None else likelihood
+    if "track" not in grid.columns:
+        return TrackFile(tuple(names), pixels, likelihood, t_s, frames)
+    # A table of SLEAP has one row for each animal in an image.
+    animals, numbers, pixels, likelihood = _by_label(
+        grid, grid.columns.index("track"), "track {!r}", frames, pixels, likelihood
+    )
     if len(animals) > 1:
         names = [f"{label or k + 1}_{name}" for k, label in enumerate(animals) for name in names]
-    flat = len(numbers), -1
-    score = None if likelihood is None else scores.reshape(flat)
-    return TrackFile(tuple(names), placed.reshape(*flat, 2), score, None, numbers)
+    return TrackFile(tuple(names), pixels, likelihood, None, numbers)
 
 
 def _long_table(grid: Table, point: int, t_s: Array | None, frames: Array) -> TrackFile:
-    labels = grid.cells[:, point].tolist()
-    names = tuple(dict.fromkeys(labels))
+    pixels = _numbers(grid, ["u", "v"])[:, None]
+    likelihood = _numbers(grid, ["likelihood"]) if "likelihood" in grid.columns else None
     at = frames if t_s is None else t_s
+    names, times, pixels, likelihood = _by_label(grid, point, "{}", at, pixels, likelihood)
+    if t_s is None:
+        return TrackFile(tuple(names), pixels, likelihood, None, times)
+    return TrackFile(tuple(names), pixels, likelihood, times, np.arange(float(len(times))))
+
+
+def _by_label(
+    grid: Table, column: int, called: str, at: Array, pixels: Array, likelihood: Array | None
+) -> tuple[list[str], Array, Array, Array | None]:
+    """Return the labels in a column, the S times or images `at` of the rows, each once, and pixels
+    (S, N, 2) and likelihoods (S, N) of the N points of all labels, from those of the rows.
+
+    A label that is repeated at one time is refused, `called` as its format says.
+    """
+    of_row = [str(label) for label in grid.cells[:, column]]
+    number = {label: k for k, label in enumerate(dict.fromkeys(of_row))}
+    label = np.array([number[each] for each in of_row])
     times, sample = np.unique(at, return_inverse=True)
-    number = {name: k for k, name in enumerate(names)}
-    column = np.array([number[label] for label in labels])
-    pairs = sample * len(names) + column
-    if len(np.unique(pairs)) < len(pairs):
-        seen: set[int] = set()
-        for k, pair in enumerate(pairs.tolist()):
-            if pair in seen:
-                raise grid.error_at(f"{labels[k]} appears twice in this image; expected once", k)
-            seen.add(pair)
-    pixels = np.full((len(times), len(names), 2), np.nan)
-    pixels[sample, column] = _numbers(grid, ["u", "v"])
-    likelihood = None
-    if "likelihood" in grid.columns:
-        likelihood = np.zeros(pixels.shape[:2])
-        likelihood[sample, column] = _numbers(grid, ["likelihood"])[:, 0]
-    return TrackFile(
-        names,
-        pixels,
-        likelihood,
-        None if t_s is None else times,
-        times if t_s is None else np.arange(float(len(times))),
-    )
+    _, first = np.unique(sample * len(number) + label, return_index=True)
+    if len(first) < len(label):
+        k = int(np.setdiff1d(np.arange(len(label)), first)[0])
+        raise grid.error_at(
+            f"{called.format(of_row[k])} appears twice in this image; expected once", k
+        )
+    placed = np.full((len(times), len(number), *pixels.shape[1:]), np.nan)
+    placed[sample, label] = pixels
+    flat = len(times), -1
+    if likelihood is not None:
+        scores = np.zeros(placed.shape[:-1])
+        scores[sample, label] = likelihood
+        likelihood = scores.reshape(flat)
+    return list(number), times, placed.reshape(*flat, 2), likelihood
 
 
 def _deeplabcut_table(rows: list[Row]) -> TrackFile:

@@ -320,15 +320,8 @@ def _points_from_columns(columns: Mapping[str, Array]) -> Array:
         raise InputError(
             f"the point cloud has the columns {', '.join(columns)}; expected x, y and z among them"
         )
-    return _with_normals(np.column_stack([columns[axis] for axis in "xyz"]), columns)
-
-
-def _with_normals(points: Array, columns: Mapping[str, Array]) -> Array:
-    """Append the columns of normals, if there are any."""
-    for names in NORMALS:
-        if set(names) <= set(columns):
-            return np.column_stack([points, *(columns[name] for name in names)])
-    return points
+    normals: Sequence[str] = next((names for names in NORMALS if {*names} <= {*columns}), ())
+    return np.column_stack([columns[name] for name in (*"xyz", *normals)])
 
 
 def _read_pcd(path: Path) -> Array:

@@ -7,7 +7,7 @@ in the frame of cameras and gravity in that of a robot's base.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +75,12 @@ class TopicFrames:
 class LogFrames:
     """Transforms between the frames of a log."""
 
-    name: str  # name of the log, for messages
-    edges: Edges
+    name: str = ""  # name of the log, for messages; "" without a log
+    edges: Edges = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: str | Path) -> LogFrames | None:
-        """Read the transforms of all topics of the log of a path; None if that names no topic.
+    def read(cls, path: str | Path) -> LogFrames:
+        """Read the transforms of all topics of the log of a path; none if that names no topic.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class LogFrames:
             If the log cannot be read.
         """
         if (address := TopicAddress.from_path(path)) is None:
-            return None
+            return cls()
         with open_log(address.log, address.episode) as log:
             topics = [
                 name

@@ -297,23 +297,17 @@ def _poses_from_joints(
         for name, value in zip(columns, position, strict=True):
             if name in limits:
                 angle = np.radians(value) if unit == "deg" else value
-                _require_joint_limits(name, angle, limits=limits[name], address=address)
+                low, high = limits[name]
+                # The library would silently clip it.
+                if not low - JOINT_LIMIT_SLACK <= angle <= high + JOINT_LIMIT_SLACK:
+                    hint = (
+                        "" if address.unit else "; if these are degrees, append #deg to the topic"
+                    )
+                    raise InputError(
+                        f"the joint {name} is at {angle:.4g}, outside its limits {low:.4g} to "
+                        f"{high:.4g} in {address.robot.name}; expected positions within the limits "
+                        f"of the recorded robot{hint}"
+                    )
                 robot.set_joint(name, angle)
         poses[row] = pq_from_transform(robot.get_transform(child, parent))[[0, 1, 2, 4, 5, 6, 3]]
     return poses
-
-
-def _require_joint_limits(
-    name: str, angle: float, limits: tuple[float, float], address: TopicAddress
-) -> None:
-    """Raise an `InputError` if a joint is at an angle or displacement beyond its limits [rad or m]
-    by more than `JOINT_LIMIT_SLACK`: the library would silently clip it. The message names the
-    robot of `address`.
-    """
-    if not limits[0] - JOINT_LIMIT_SLACK <= angle <= limits[1] + JOINT_LIMIT_SLACK:
-        hint = "" if address.unit else "; if these are degrees, append #deg to the topic"
-        raise InputError(
-            f"the joint {name} is at {angle:.4g}, outside its limits {limits[0]:.4g} to "
-            f"{limits[1]:.4g} in {address.robot and address.robot.name}; expected positions within "
-            f"the limits of the recorded robot{hint}"
-        )
