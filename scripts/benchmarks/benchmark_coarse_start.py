@@ -1,6 +1,6 @@
 """Start on a coarser mesh, compared with the direct start: time, sweeps and difference of results.
 
-The recording is the swung cylinder of `benchmark_methods.py` with noise; four parameters have no
+The recording is the swung cylinder of `benchmark_sizes.py` with noise; four parameters have no
 guess. Both solves run one after the other in one process on one thread. Other work on the machine
 changes the processor time little, but it increases the wall time.
 
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from benchmark_methods import TRUTH, cylinder, swung_cylinder
+from benchmark_sizes import TRUTH, cylinder, swung_cylinder
 
 from collocation_sysid import Body, Problem, Unknown, simulate
 from collocation_sysid.methods.reduced_space import ReducedSpace

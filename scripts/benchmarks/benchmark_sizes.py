@@ -1,10 +1,10 @@
 """Time and memory of a simulation and a sweep of bodies with 500 to 20,000 nodes.
 
-The body is the swung cylinder of `benchmark_methods.py`, with the default damping law or with
-Rayleigh's. Each line is measured in a separate process, so that the peak memory is that of the
-line. On one thread, times are processor times, which other work on the machine changes little; on
-more threads they are wall times. A sweep consists of a feasibility step and the sensitivities to
-four parameters; a few time steps are enough to measure the cost of one.
+The body is a swung cylinder, with the default damping law or with Rayleigh's. Each line is measured
+in a separate process, so that the peak memory is that of the line. On one thread, times are
+processor times, which other work on the machine changes little; on more threads they are wall
+times. A sweep consists of a feasibility step and the sensitivities to four parameters; a few time
+steps are enough to measure the cost of one.
 
     python scripts benchmark_sizes                              # all sizes, one and two threads
     python scripts benchmark_sizes --size 5000 --steps 200      # peak memory of 200 steps
@@ -21,15 +21,30 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from benchmark_methods import PARAMETERS, TRUTH, cylinder, swung_cylinder
+from scipy.spatial.transform import Rotation
+from synthetic import swing
 
-from collocation_sysid import Body, Collocation
+from collocation_sysid import Body, Collocation, Experiment, Grasp, Markers, Parameter, Parameters
+from collocation_sysid.fem.meshes.mesh import TetMesh
+from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.program.forward.newton_solver import NewtonOptions
 from collocation_sysid.program.forward.scheme_simulation import continue_simulation
 from collocation_sysid.program.linear_algebra.factorisation import Choice
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
+from collocation_sysid.recording import Nuisance, place_markers
 
+TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+PARAMETERS = Parameters(
+    (
+        Parameter("lambda_pa", 400.0, 10.0, 1e5),
+        Parameter("mu_pa", 150.0, 10.0, 1e5),
+        Parameter("gamma_r_s", 0.02, 1e-5, 1.0),
+        Parameter("gamma_m_1_s", 0.5, 1e-3, 100.0),
+    )
+)
+# Sampling interval [s].
+STEP_S = 0.01
 # Rings x layers of the cylinder, element, and a sufficient number of time steps, by number of
 # nodes.
 SIZES = {
@@ -73,6 +88,34 @@ def main() -> None:
                 case = size, arguments.steps, threads, choice, arguments.damping
                 with multiprocessing.get_context("spawn").Pool(1) as pool:
                     print(pool.apply(measure_size, case), flush=True)
+
+
+def cylinder(mesh: str) -> TetMesh:
+    """Return the mesh of a cylinder with numbers of rings and layers, such as 2x8."""
+    rings, layers = map(int, mesh.split("x"))
+    return cylinder_mesh(0.04, 0.16, rings, layers)
+
+
+def swung_cylinder(body: Body, steps: int) -> Experiment:
+    """Return the recording of a hanging, swung cylinder without tracks, with `steps` samples."""
+    t_s = np.arange(steps, dtype=np.float64) * STEP_S
+    poses = swing(
+        t_s,
+        amplitude_m=(0.05, 0.04, 0.03),
+        amplitude_rad=(0.1, 0.1, 0.6),
+        frequency_hz=(0.9, 1.1, 1.3),
+        rise_s=0.3,
+        start=Rotation.from_rotvec([np.pi, 0, 0]),
+    )
+    angle = np.arange(8) * 2.4
+    height = np.linspace(0.04, 0.16, 8)
+    places_m = np.column_stack([0.035 * np.cos(angle), 0.035 * np.sin(angle), height])
+    placement = place_markers(places_m, body.nodes_m, body, "vertex")
+    markers = Markers(t_s, np.zeros((steps, 8, 3)), 0.001, placement=placement)
+    clamped_nodes = np.flatnonzero(body.nodes_m[:, 2] < 1e-9)
+    grasp = Grasp(clamped_nodes, poses)
+    no_nuisance = Nuisance.none()
+    return Experiment(body, t_s, [grasp], markers, name="swing", nuisance=no_nuisance)
 
 
 def measure_size(size: str, steps: int | None, threads: int, choice: Choice, damping: str) -> str:

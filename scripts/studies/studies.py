@@ -1,12 +1,18 @@
-"""Runs of methods with options in separate processes, and Markdown tables; shared by the studies."""
+"""Runner of the studies: cases in processes, coverage of intervals, and Markdown tables."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.stats import binom
 
 from collocation_sysid.extras.studies import (
     PlannedRun,
@@ -17,7 +23,14 @@ from collocation_sysid.extras.studies import (
     run_all,
 )
 from collocation_sysid.extras.studies.rows import Row, SuccessCriterion, run_row
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
+from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
+
+T = TypeVar("T")
+# Intervals by the name of what they contain; None where a solve gives none.
+Intervals = Mapping[str, tuple[float, float] | None]
 
 # True parameters of the cylinder of the studies.
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -142,3 +155,94 @@ def save(folder: Path, name: str, text: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.md").write_text(text + "\n", encoding="utf-8")
     print(text)
+
+
+def run_in_processes(run: Callable[..., T], jobs: Sequence[tuple], workers: int = 1) -> list[T]:
+    """Return the results of a function for all tuples of arguments, computed in so many processes."""
+    # Worker processes read these variables when they start: one thread each.
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
+    start = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=start) as pool:
+        return list(pool.map(run, *zip(*jobs, strict=True), chunksize=5))
+
+
+# Coverage -----------------------------------------------------------------------------------------
+
+
+@dataclass
+class Coverage:
+    """Counted intervals, by name.
+
+    Attributes
+    ----------
+    twins : int
+        Number of twins.
+    contained : mapping of str to list of bool
+        Whether each interval contains the truth.
+    half_widths : mapping of str to list of float
+        Half width of each interval over the true value.
+    """
+
+    twins: int = 0
+    contained: dict[str, list[bool]] = field(default_factory=dict)
+    half_widths: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, intervals: Intervals, truth: Mapping[str, float]) -> None:
+        """Count the intervals of one twin; the name may be followed by the kind of the interval
+        after a comma.
+        """
+        self.twins += 1
+        for name, interval in intervals.items():
+            contained = self.contained.setdefault(name, [])
+            half_widths = self.half_widths.setdefault(name, [])
+            if interval is not None:
+                value = truth[name.partition(",")[0]]
+                contained.append(interval[0] <= value <= interval[1])
+                half_widths.append((interval[1] - interval[0]) / 2 / abs(value))
+
+    def table(self) -> str:
+        """Return the expected range and the counts as Markdown."""
+        low, high = binom.interval(0.95, self.twins, 0.95)
+        rows = [
+            (
+                name,
+                f"{sum(each)} of {len(each)}",
+                f"{100 * np.mean(each):.1f}" if each else "–",
+                f"{100 * np.median(self.half_widths[name]):.3g}" if each else "–",
+            )
+            for name, each in self.contained.items()
+        ]
+        heads = ("interval", "contain the truth", "coverage %", "median half width %")
+        return (
+            f"{self.twins} twins; the coverage of exact intervals is {100 * low / self.twins:.1f} "
+            f"to {100 * high / self.twins:.1f} % with a probability of 95 %\n\n"
+            + markdown(heads, rows)
+        )
+
+
+def count_coverage(
+    twins: Iterable[tuple[T, Mapping[str, float]]], solve: Callable[[T], Intervals | None]
+) -> Coverage:
+    """Return the coverage of the intervals that `solve` returns for each twin, given with its true
+    values; a twin without an answer (None) is reported and left out.
+    """
+    coverage = Coverage()
+    for number, (twin, truth) in enumerate(twins, start=1):
+        intervals = solve(twin)
+        if intervals is None:
+            print(f"twin {number} has no answer", file=sys.stderr, flush=True)
+            continue
+        coverage.add(intervals, truth)
+        if number % 20 == 0:
+            print(f"{number} twins", file=sys.stderr, flush=True)
+    return coverage
+
+
+def statistical_intervals(problem: Problem) -> Intervals:
+    """Return the intervals for noise of all parameters and derived moduli, by reduced space."""
+    solution = ReducedSpace()(problem.collocation())
+    fit = linearise_fit(solution.collocation, solution.z)
+    parameters = solution.collocation.parameters
+    uncertainty = uncertainty_from_fit(fit, parameters, solution.q, problem.uncertainty)
+    estimates = {**uncertainty.estimates, **uncertainty.derived}
+    return {name: estimate.statistical95 for name, estimate in estimates.items()}

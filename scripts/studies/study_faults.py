@@ -1,38 +1,34 @@
 """Coverage of the 95 % intervals with the errors of a real laboratory, for twins with one error
 each.
 
-A cylinder hangs from a swung hand, as in study_coverage.py. The tracks are simulated with the
-scheme of the fit and have white noise. Each twin has one error of the recording, a random number of
-the stated size, and is identified with every option at its default: nuisance parameters, noise and
-covariance. The solve starts from the true values. The table has the coverage of the intervals and
-the median standard errors; for twins without errors also the ratio of standard errors with and
-without nuisance parameters. In the rows "assumed", the body deviates from an assumption of the
-budget by a random number with the standard deviation of this assumption; these rows have the
-coverage of the combined interval too, of a budget with this assumption or with all of them. In the
-rows "every effect" all default assumptions and nuisance parameters are wrong at once. If the damping
-law is wrong too, the intervals of γ_r and γ_m need not contain the true values, because both are
-constants of the stated law.
+A cylinder hangs from a swung hand, as in `coverage_twins`. The tracks are simulated with the scheme
+of the fit and have white noise. Each twin has one error of the recording, a random number of the
+stated size, and is identified with every option at its default: nuisance parameters, noise and
+covariance. The solve starts from the true values. In the rows "every effect" all default assumptions
+of the budget and all nuisance parameters are wrong at once, by random numbers with their standard
+deviations, and the table has the combined interval too. If the damping law is wrong too, the
+intervals of γ_r and γ_m need not contain the true values, because both are constants of the stated
+law.
+
+    python scripts study_faults [--twins 200] [--only "gravity 1°"] [--seed 0] [--workers 2]
 """
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
-import os
-import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 from assumed_twins import with_wrong_assumptions
+from coverage_twins import QUANTITIES, SCHEME, intervals_with_truth, reference, truth
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
-from study_coverage import QUANTITIES, SCHEME, intervals_with_truth, reference, truth
+from script_arguments import make_parser
+from studies import markdown, run_in_processes
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
@@ -42,14 +38,13 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
-from collocation_sysid.recording.deviation import Deviation
 from collocation_sysid.recording.nuisance import CALIBRATION_SCALE
 from collocation_sysid.statistics.budget.consider_analysis import (
     changed_residuals,
     changes_of_assumptions,
 )
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.budget.variance_sources import BudgetLine, VarianceSources, budget
+from collocation_sysid.statistics.budget.variance_sources import VarianceSources, budget
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import Uncertainty
@@ -80,12 +75,6 @@ class FaultOutcome:
         Half widths of the combined intervals over the true values; NaN without interval.
     relative : (6,)
         Standard errors over the true values; NaN without standard error.
-    without : (6,)
-        As `relative`, of a fit without nuisance parameters; NaN in twins with an error.
-    correlated : bool
-        Whether the standard errors are those of correlated errors.
-    redrawn : int
-        Number of bodies that were drawn before and could not be simulated.
     """
 
     converged: bool
@@ -93,41 +82,28 @@ class FaultOutcome:
     combined_contains_truth: Array
     half_widths: Array
     relative: Array
-    without: Array
-    correlated: bool
-    redrawn: int
-
-
-@dataclass(frozen=True, eq=False)
-class BudgetedFit:
-    """Error bars and budget of one twin's fit, and whether the fit converged."""
-
-    uncertainty: Uncertainty
-    lines: Mapping[str, BudgetLine]
-    converged: bool
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=200, help="of each fault")
     parser.add_argument("--only", nargs="*", choices=list(FAULTS), default=list(FAULTS))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1, help="processes")
     arguments = parser.parse_args()
-    # Worker processes read these variables when they start: one thread each.
-    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "COLLOCATION_SYSID_THREADS": "1"}
-    start = multiprocessing.get_context("spawn")
-    notes = []
-    began = time.perf_counter()
-    print(header(arguments.twins), table_head(), sep="\n\n", flush=True)
-    with ProcessPoolExecutor(arguments.workers, mp_context=start) as pool:
-        for fault in arguments.only:
-            seeds = [(arguments.seed, *fault.encode(), twin) for twin in range(arguments.twins)]
-            outcomes = list(pool.map(run, [fault] * len(seeds), seeds, chunksize=5))
-            print(table_row(fault, outcomes), flush=True)
-            if fault == "none":
-                notes.append(loss_of_precision(outcomes))
-    print("", *notes, f"{time.perf_counter() - began:.0f} s", sep="\n")
+    low, high = binom.interval(0.95, arguments.twins, 0.95)
+    print(
+        f"{arguments.twins} twins of each fault; the coverage of exact intervals is "
+        f"{100 * low / arguments.twins:.1f} to {100 * high / arguments.twins:.1f} % with a "
+        "probability of 95 % (* is outside)\n"
+    )
+    rows = []
+    for fault in arguments.only:
+        seeds = [(arguments.seed, *fault.encode(), twin) for twin in range(arguments.twins)]
+        jobs = [(fault, seed) for seed in seeds]
+        rows.append(table_row(fault, run_in_processes(run, jobs, arguments.workers)))
+        print(*rows[-1], sep=" | ", flush=True)
+    print("\n" + markdown(HEADS, rows))
 
 
 # One twin -----------------------------------------------------------------------------------------
@@ -139,32 +115,14 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
     """
     rng = np.random.default_rng(seed)
     recordings: TrueAndStated | None = None
-    redrawn = -1
     while recordings is None:
-        redrawn += 1
         # Some soft bodies with many errors collapse, and nobody would record them.
         with suppress(SimulationError):
             recordings = FAULTS[fault](exact_recording(), rng)
     true_recording, described = recordings
     tracks = true_recording.markers.positions_m
     tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
-    uncertainty, combined_contains_truth, half_widths, converged = identified(
-        with_markers(described, tracks), BUDGETS.get(fault, ROWS.get(fault, ()))
-    )
-    errors_without_nuisance = np.full(len(QUANTITIES), np.nan)
-    if true_recording is described:
-        ideal = replace(with_markers(described, tracks), nuisance=Nuisance.none())
-        errors_without_nuisance = relative_errors(identified(ideal)[0])
-    return FaultOutcome(
-        converged,
-        np.array(intervals_with_truth(uncertainty)),
-        combined_contains_truth,
-        half_widths,
-        relative_errors(uncertainty),
-        errors_without_nuisance,
-        uncertainty.errors == "autocorrelated",
-        redrawn,
-    )
+    return identified(with_markers(described, tracks), BUDGETS.get(fault))
 
 
 @cache
@@ -180,60 +138,42 @@ def positions_m() -> Array:
     return x.reshape(len(x), -1, 3)
 
 
-def identified(
-    experiment: Experiment, assumed: Sequence[Deviation] | Mapping[str, None] = ()
-) -> tuple[Uncertainty, Array, Array, bool]:
+def identified(experiment: Experiment, left_out: Mapping[str, None] | None = None) -> FaultOutcome:
     """Identify an experiment with default options, starting from the truth.
 
     Parameters
     ----------
     experiment : Experiment
-    assumed : sequence of Deviation, or mapping of str to None
-        Rows of the uncertainty budget, or the names of rows that the default budget lacks.
-
-    Returns
-    -------
-    uncertainty : Uncertainty
-    combined_contains_truth : (6,) array
-        1 if the combined interval contains the truth, 0 if not, NaN without interval.
-    half_widths : (6,) array
-        Half widths of the combined intervals over the true values.
-    converged : bool
+    left_out : mapping of str to None, optional
+        Names of the rows that the default budget lacks; without it there is no budget.
     """
-    fit = fit_from_truth(experiment, assumed)
-    true = truth()
-    lines = fit.lines
-    combined_contains_truth = [
-        float(lines[n].combined95[0] <= true[n] <= lines[n].combined95[1]) if n in lines else np.nan
-        for n in QUANTITIES
-    ]
-    half_widths = [
-        np.ptp(lines[n].combined95) / 2 / true[n] if n in lines else np.nan for n in QUANTITIES
-    ]
-    contained = np.array(combined_contains_truth)
-    return fit.uncertainty, contained, np.array(half_widths), fit.converged
-
-
-def fit_from_truth(
-    experiment: Experiment, assumed: Sequence[Deviation] | Mapping[str, None]
-) -> BudgetedFit:
-    """Return the fit of an experiment from the truth, with a budget as in `identified`."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
-    collocation = solution.collocation
-    z = solution.z
+    collocation, z = solution.collocation, solution.z
     uncertainty = uncertainty_at(collocation, z)
-    if isinstance(assumed, Mapping):
-        changes = changes_of_assumptions(collocation, z, assumed)
-    else:
-        deviations = [(row, row.considered) for row in assumed if row.considered is not None]
-        changes = changed_residuals(collocation, z, deviations)
+    changes = (
+        changed_residuals(collocation, z, [])
+        if left_out is None
+        else changes_of_assumptions(collocation, z, left_out)
+    )
     fit = linearise_fit(collocation, z)
     sources = VarianceSources.from_fit(
         fit, changes, collocation.parameters, solution.q, uncertainty
     )
     lines = budget(sources, uncertainty, {}, problem.parameters)
-    return BudgetedFit(uncertainty, lines, solution.status.converged)
+    true = truth()
+    combined = np.array(
+        [lines[name].combined95 if name in lines else (np.nan, np.nan) for name in QUANTITIES]
+    )
+    values = np.array([true[name] for name in QUANTITIES])
+    contained = (combined[:, 0] <= values) & (values <= combined[:, 1])
+    return FaultOutcome(
+        solution.status.converged,
+        np.array(intervals_with_truth(uncertainty)),
+        np.where(np.isnan(combined[:, 0]), np.nan, contained),
+        np.ptp(combined, axis=1) / 2 / values,
+        relative_errors(uncertainty),
+    )
 
 
 def relative_errors(uncertainty: Uncertainty) -> Array:
@@ -353,17 +293,6 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
     return replace(experiment, markers=markers)
 
 
-def draw_assumption_errors(names: Sequence[str]) -> Callable[..., TrueAndStated]:
-    """Return a fault that draws deviations from the named assumptions, each at its standard
-    deviation.
-    """
-
-    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
-        return with_wrong_assumptions(experiment, true_values(), _errors(names, rng)), experiment
-
-    return fault
-
-
 def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
     errors = {}
     for row in (row for row in ASSUMPTIONS if row.name in names):
@@ -432,10 +361,6 @@ SINGLE = (
     ),
     *AIR,
 )
-# Names of the assumptions that are wrong in each fault, and the rows of the budget for them.
-ASSUMED = {f"assumed: {name}": (name,) for name in SINGLE}
-ASSUMED |= {"assumed: air": AIR, "assumed: all of these": SINGLE}
-ROWS = {f: tuple(r for r in ASSUMPTIONS if r.name in names) for f, names in ASSUMED.items()}
 # All effects of the default budget, and the nuisance parameters; the budget has what is drawn.
 WITHOUT_LAW = (*SINGLE, "surface", "grip_layer_m", "grasp_edge_m")
 EVERY = {
@@ -460,59 +385,37 @@ FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "marker positions 1 mm": misplaced,
     "marker positions unknown": unplaced,
 }
-FAULTS |= {fault: draw_assumption_errors(names) for fault, names in ASSUMED.items()}
 FAULTS |= {fault: draw_every_error(names) for fault, names in EVERY.items()}
 
 
 # Table --------------------------------------------------------------------------------------------
 
 
-def header(twins: int) -> str:
-    """Return the size of the problem, and the range of coverages of exact intervals, as text."""
-    experiment = exact_recording()
-    low, high = binom.interval(0.95, twins, 0.95)
-    return (
-        f"{len(experiment.body.nodes_m)} nodes x {len(experiment.t_s)} steps, "
-        f"{len(experiment.markers.names)} markers, sigma {1e3 * SIGMA_M:g} mm; {twins} twins of "
-        f"each fault; the coverage of exact intervals is {100 * low / twins:.1f}-"
-        f"{100 * high / twins:.1f} % with a probability of 95 % (* is outside)"
-    )
-
-
-def table_head() -> str:
-    """Return the two lines of the head of the table."""
-    columns = [
-        f"{c} {kind}, %"
+HEADS = (
+    "fault",
+    *(
+        f"{column} {kind}, %"
         for kind in ("coverage", "combined coverage", "combined half width", "standard error")
-        for c in COLUMNS
-    ]
-    cells = ["fault", *columns, "correlated errors, %", "not converged", "not simulated"]
-    return _line(cells) + "\n" + _line(["---"] * len(cells))
+        for column in COLUMNS
+    ),
+    "not converged",
+)
 
 
-def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> str:
-    """Return a row of the table: coverages, and median standard errors over the true values."""
-    converged_outcomes = [outcome for outcome in outcomes if outcome.converged]
-    columns = np.array(
-        [
-            [*outcome.contains_truth, *outcome.combined_contains_truth]
-            for outcome in converged_outcomes
-        ]
-    ).T
-    half_widths = [outcome.half_widths for outcome in converged_outcomes]
-    errors = 100 * np.nanmedian([outcome.relative for outcome in converged_outcomes], axis=0)
-    correlated = 100 * np.mean([outcome.correlated for outcome in converged_outcomes])
-    failures = len(outcomes) - len(converged_outcomes)
-    return _line(
-        [
-            fault,
-            *map(_coverage_cell, columns),
-            *map(_median_cell, np.array(half_widths).T),
-            *map("{:.2g}".format, errors),
-            f"{correlated:.0f}",
-            f"{failures}",
-            f"{sum(outcome.redrawn for outcome in outcomes)}",
-        ]
+def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> tuple[str, ...]:
+    """Return a row of the table: coverages, and median half widths and standard errors over the true
+    values.
+    """
+    converged = [outcome for outcome in outcomes if outcome.converged]
+    contained = np.array([[*o.contains_truth, *o.combined_contains_truth] for o in converged])
+    half_widths = np.array([outcome.half_widths for outcome in converged])
+    errors = 100 * np.nanmedian([outcome.relative for outcome in converged], axis=0)
+    return (
+        fault,
+        *map(_coverage_cell, contained.T),
+        *map(_median_cell, half_widths.T),
+        *map("{:.2g}".format, errors),
+        str(len(outcomes) - len(converged)),
     )
 
 
@@ -533,17 +436,6 @@ def _median_cell(shares: Array) -> str:
     """Return the median in percent of those that are not NaN."""
     known = shares[np.isfinite(shares)]
     return f"{100 * np.median(known):.2g}" if len(known) else "-"
-
-
-def loss_of_precision(outcomes: Sequence[FaultOutcome]) -> str:
-    """Return the ratios of standard errors with and without nuisance parameters, without errors."""
-    ratios = np.nanmedian([outcome.relative / outcome.without for outcome in outcomes], axis=0)
-    shown_ratios = ", ".join(f"{c} {ratio:.2f}" for c, ratio in zip(COLUMNS, ratios, strict=True))
-    return f"Without faults: standard errors with nuisance parameters over those without: {shown_ratios}"
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

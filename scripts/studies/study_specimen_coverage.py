@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from coverage_runner import Intervals, count_coverage, statistical_intervals
+from studies import Intervals, count_coverage, statistical_intervals
 
 import collocation_sysid as cs
 from collocation_sysid.program.simulation import with_readings

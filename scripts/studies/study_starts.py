@@ -9,22 +9,22 @@ both answers is within three standard deviations; the number of these successes 
 a guess every run has its own noise, and an answer succeeds if its misfit is not larger than that of
 the true values. The cost is counted in sweeps, that is in factorisations of the blocks of all time
 steps, including those of simulations and of the initial equilibrium.
+
+    python scripts study_starts [--bodies cylinder] [--starts 20] [--factor 30] [--unplaced]
+    python scripts study_starts --unguessed
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 from synthetic import HANGING, Swing, swing
 
 from collocation_sysid.errors import InputError
@@ -90,84 +90,43 @@ class StartOutcome:
         Number of the start, from 0 on; without a guess the seed of the noise.
     status : str
         Status of the solve; "refused" if the problem was rejected.
-    success : bool
-    same_fit : bool
-        Whether the start succeeds only because its fit is equally good.
     sweeps : float
         Factorisations divided by the number of time steps.
-    time_s : float
-        Time of the solve and of the scan [s].
-    loss, excess : float
-        Loss, and by how much it exceeds the smallest one.
-    rms_m : float
-        Root mean square of the marker residuals [m].
-    worst_ratio, worst_errors : float
-        Largest difference of a parameter from the best answer: as a factor, in standard errors.
-    guess, estimates : tuple of float
-        Initial guesses and estimates; NaN without one.
-    notes : tuple of str
+    loss : float
+    estimates : tuple of float
+        NaN without one.
     message : str
+    success, same_fit : bool
+        Whether the start succeeds, and only because its fit is equally good.
     """
 
     number: int
     status: str
-    success: bool
-    same_fit: bool
     sweeps: float
-    time_s: float
     loss: float
-    excess: float
-    rms_m: float
-    worst_ratio: float
-    worst_errors: float
-    guess: tuple[float, ...]
     estimates: tuple[float, ...]
-    notes: tuple[str, ...]
     message: str
+    success: bool = False
+    same_fit: bool = False
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--bodies", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--factor", type=float, default=30.0)
-    parser.add_argument(
-        "--unguessed",
-        action="store_true",
-        help="start without a guess, each start with other noise",
-    )
-    parser.add_argument(
-        "--unplaced", action="store_true", help="the places of the markers are unknown"
-    )
-    parser.add_argument("--ideal", action="store_true", help="no nuisance parameters")
-    parser.add_argument("--method", default="reduced-space")
-    parser.add_argument(
-        "--noise-m", type=float, help="standard deviation of the noise, if not that of the body"
-    )
+    parser.add_argument("--unguessed", action="store_true", help="no guess, and other noise each")
+    parser.add_argument("--unplaced", action="store_true", help="unknown places of the markers")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", type=int, nargs="*", help="numbers of the starts to run")
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    outcomes_by_body = {}
     for body in arguments.bodies:
-        case = with_description(CASES[body](), arguments.unplaced, arguments.ideal)
-        noise_m = case.noise_m if arguments.noise_m is None else arguments.noise_m
-        starts = guesses(arguments.starts, arguments.factor, arguments.seed, case.truth)
+        case = described(CASES[body](), arguments.unplaced)
         if arguments.unguessed:
-            seeds = arguments.only or range(arguments.starts)
-            outcomes_by_body[body] = [
-                solve_without_guess(case, noise_m, seed, arguments.method) for seed in seeds
-            ]
+            outcomes = [solve_without_guess(case, seed) for seed in range(arguments.starts)]
         else:
-            noisy_body = with_noise(case, noise_m, arguments.seed)
-            outcomes_by_body[body] = study(noisy_body, starts, arguments.method, arguments.only)
-        if not arguments.json:
-            print(f"{body}: {summary(outcomes_by_body[body])}", flush=True)
-    if arguments.json:
-        records = {
-            body: [asdict(each) for each in outcomes] for body, outcomes in outcomes_by_body.items()
-        }
-        print(json.dumps(records, indent=1))
+            starts = guesses(arguments.starts, arguments.factor, arguments.seed, case.truth)
+            outcomes = study(with_noise(case, arguments.seed), starts)
+        print(f"{body}: {summary(outcomes)}", flush=True)
 
 
 # Bodies -------------------------------------------------------------------------------------------
@@ -245,25 +204,22 @@ def swung_body(
     return SwungBody(with_markers(experiment, tracks), truth, noise_m=noise_m)
 
 
-def with_description(case: SwungBody, unplaced: bool, ideal: bool) -> SwungBody:
-    """Return the body as a problem describes it.
-
-    If `ideal`, no nuisance parameters are estimated, else the default ones; if `unplaced`, the
-    places of the markers are unknown.
+def described(case: SwungBody, unplaced: bool) -> SwungBody:
+    """Return the body with the default nuisance parameters, and with markers at unknown places if
+    `unplaced`.
     """
-    experiment = case.experiment
+    experiment = replace(case.experiment, nuisance=Nuisance())
     if unplaced:
         markers = experiment.markers
         unknown = Markers(markers.t_s, markers.positions_m, markers.sigma_m, markers.names)
         experiment = replace(experiment, markers=unknown)
-    nuisance = Nuisance.none() if ideal else Nuisance()
-    return replace(case, experiment=replace(experiment, nuisance=nuisance))
+    return replace(case, experiment=experiment)
 
 
-def with_noise(case: SwungBody, noise_m: float, seed: int) -> SwungBody:
-    """Return the recording with noise of a standard deviation [m] on its tracks."""
+def with_noise(case: SwungBody, seed: int) -> SwungBody:
+    """Return the recording with its noise on the tracks."""
     tracks = case.experiment.markers.positions_m
-    noise = np.random.default_rng(seed).normal(size=tracks.shape) * noise_m
+    noise = np.random.default_rng(seed).normal(size=tracks.shape) * case.noise_m
     return replace(case, experiment=with_markers(case.experiment, tracks + noise))
 
 
@@ -312,125 +268,56 @@ def guesses(
     return np.array(list(truth.values())) * factor**spread
 
 
-def study(
-    case: SwungBody,
-    starts: NDArray[np.float64],
-    method: str = "reduced-space",
-    only: list[int] | None = None,
-) -> list[StartOutcome]:
-    """Solve from the truth and from every start, and compare with the best answer.
-
-    Parameters
-    ----------
-    case : SwungBody
-    starts : (S, p) array
-        Initial guesses; NaN for no guess.
-    method : str
-    only : list of int or None
-        Numbers of the starts that are solved; None for all.
+def study(case: SwungBody, starts: NDArray[np.float64]) -> list[StartOutcome]:
+    """Solve from the truth and from every start (S, p), and compare with the best answer.
 
     Raises
     ------
     SystemExit
         If the solve from the truth does not converge.
     """
-    truth = np.array(list(case.truth.values()))
-    best = solve(problem_of(case, truth), method)
+    best = solve(problem_of(case, np.array(list(case.truth.values()))))
     if not best.status.converged:
         raise SystemExit(f"from the truth: {best.message}")
     fit = linearise_fit(best.collocation, best.z)
     uncertainty = uncertainty_from_fit(
         fit, best.collocation.parameters, best.q, ErrorModel("given", "independent")
     )
-    std_errors = [
-        uncertainty.estimates[name].statistical_std_error or np.nan for name in case.truth
-    ]
-    outcomes = []
-    for number, guess in enumerate(starts):
-        if not only or number in only:
-            outcomes.append(attempt(case, number, guess, method))
-            print(end=".", file=sys.stderr, flush=True)
-    losses = [best.history[-1].loss, *(each.loss for each in outcomes)]
-    answers = [
-        tuple(best.parameters[name] for name in case.truth),
-        *(e.estimates for e in outcomes),
-    ]
-    has_ended = [True, *(each.status in SOLVED_STATUSES for each in outcomes)]
-    best_index = min(np.flatnonzero(has_ended), key=lambda k: losses[k])
-    smallest_loss = losses[best_index]
-    reference = np.array(answers[best_index])
-    return [with_success(each, reference, smallest_loss, np.array(std_errors)) for each in outcomes]
+    std_errors = np.array(
+        [uncertainty.estimates[name].statistical_std_error or np.nan for name in case.truth]
+    )
+    outcomes = [attempt(case, number, guess) for number, guess in enumerate(starts)]
+    answers = [(best.history[-1].loss, tuple(best.parameters[name] for name in case.truth))]
+    answers += [(each.loss, each.estimates) for each in outcomes if each.status in SOLVED_STATUSES]
+    loss, estimates = min(answers)
+    return [with_success(each, np.array(estimates), loss, std_errors) for each in outcomes]
 
 
-def solve_without_guess(case: SwungBody, noise_m: float, seed: int, method: str) -> StartOutcome:
+def solve_without_guess(case: SwungBody, seed: int) -> StartOutcome:
     """Solve a recording with the noise of a seed without a guess, and compare with the loss of the
     truth.
     """
-    noisy = with_noise(case, noise_m, seed)
-    outcome = attempt(noisy, seed, np.full(len(case.truth), np.nan), method)
-    print(end=".", file=sys.stderr, flush=True)
-    excess = outcome.loss - loss_of_truth(noisy, case)
-    ratios = np.abs(np.log(np.array(outcome.estimates) / list(case.truth.values())))
-    return replace(
-        outcome,
-        success=excess < 0 and outcome.status in SOLVED_STATUSES,
-        excess=excess,
-        worst_ratio=float(np.exp(ratios.max())),
-        worst_errors=np.nan,
-    )
+    noisy = with_noise(case, seed)
+    outcome = attempt(noisy, seed, np.full(len(case.truth), np.nan))
+    noise_m = noisy.experiment.markers.positions_m - case.experiment.markers.positions_m
+    loss_of_truth = float(((noise_m / noisy.experiment.markers.sigma_m[:, None]) ** 2).sum())
+    is_solved = outcome.status in SOLVED_STATUSES
+    return replace(outcome, success=is_solved and outcome.loss < loss_of_truth)
 
 
-def loss_of_truth(noisy: SwungBody, clean: SwungBody) -> float:
-    """Return the sum of squares of the noise, in standard deviations."""
-    noisy_markers = noisy.experiment.markers
-    true_positions_m = clean.experiment.markers.positions_m
-    return float(
-        (
-            ((noisy_markers.positions_m - true_positions_m) / noisy_markers.sigma_m[:, None]) ** 2
-        ).sum()
-    )
-
-
-def attempt(case: SwungBody, number: int, guess: NDArray[np.float64], method: str) -> StartOutcome:
-    """Solve from one initial guess (p,); success and errors are set later, by `with_success`."""
-    guess_values = tuple(guess.tolist())
-    no_estimates = (np.nan,) * len(guess)
+def attempt(case: SwungBody, number: int, guess: NDArray[np.float64]) -> StartOutcome:
+    """Solve from one initial guess (p,); success is set later, by `with_success`."""
     with counted_factorisations() as count:
         try:
-            solution = solve(problem_of(case, guess), method)
+            solution = solve(problem_of(case, guess))
         except InputError as error:
-            return StartOutcome(
-                number,
-                status="refused",
-                success=False,
-                same_fit=False,
-                sweeps=0.0,
-                time_s=0.0,
-                loss=np.inf,
-                excess=np.inf,
-                rms_m=np.nan,
-                worst_ratio=np.inf,
-                worst_errors=np.inf,
-                guess=guess_values,
-                estimates=no_estimates,
-                notes=(),
-                message=str(error),
-            )
+            return StartOutcome(number, "refused", 0.0, np.inf, (np.nan,) * len(guess), str(error))
     return StartOutcome(
         number,
         solution.status.value,
-        False,
-        False,
         count[0] / len(case.experiment.t_s),
-        solution.timing.total + (solution.scan.time_s if solution.scan else 0.0),
         solution.history[-1].loss if solution.history else np.inf,
-        np.inf,
-        solution.rms_m,
-        np.inf,
-        np.inf,
-        guess_values,
         tuple(solution.parameters[name] for name in case.truth),
-        tuple(solution.notes),
         solution.message,
     )
 
@@ -447,20 +334,16 @@ def with_success(
     (p,) are their standard errors.
     """
     estimates = np.array(outcome.estimates)
-    excess = outcome.loss - smallest_loss
     ratios = np.abs(np.log(estimates / best))
     errors = np.abs(estimates - best) / std_errors
     is_close = bool(((ratios < SUCCESS_SHARE) | (errors < STANDARD_ERRORS)).all())
     # The loss follows a χ² distribution, so that this difference is that of as many standard
     # deviations.
-    fits_equally = excess < STANDARD_ERRORS**2
+    fits_equally = outcome.loss - smallest_loss < STANDARD_ERRORS**2
     return replace(
         outcome,
         success=(is_close or fits_equally) and outcome.status in SOLVED_STATUSES,
         same_fit=fits_equally and not is_close,
-        excess=excess,
-        worst_ratio=float(np.exp(ratios.max())),
-        worst_errors=float(np.nanmax(errors, initial=0.0)),
     )
 
 
@@ -503,27 +386,19 @@ def counted_factorisations() -> Iterator[list[int]]:
 
 
 def summary(outcomes: list[StartOutcome]) -> str:
-    """Return numbers of successes, sweeps and time, and one line for each failure."""
+    """Return numbers of successes and sweeps, and one line for each failure."""
     sweeps = [outcome.sweeps for outcome in outcomes if outcome.success]
-    failures = [outcome for outcome in outcomes if not outcome.success]
-    lines = [
-        f"success: {len(sweeps)} of {len(outcomes)}, of which by an equal fit only: "
-        f"{sum(outcome.success and outcome.same_fit for outcome in outcomes)}",
-        f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}" if sweeps else "",
-        f"time: {sum(outcome.time_s for outcome in outcomes):.1f} s",
-        f"failures: {dict(Counter(outcome.status for outcome in failures)) or 'none'}",
+    equal = sum(outcome.success and outcome.same_fit for outcome in outcomes)
+    lines = [f"success: {len(sweeps)} of {len(outcomes)}, of which by an equal fit only: {equal}"]
+    if sweeps:
+        lines.append(f"sweeps: median {np.median(sweeps):.1f}, max {np.max(sweeps):.1f}")
+    lines += [
+        f"  {each.number}: {each.status}, "
+        + " ".join(f"{value:.4g}" for value in each.estimates)
+        + f", {each.message}"
+        for each in outcomes
+        if not each.success
     ]
-    for outcome in failures:
-        guess, estimates = (
-            " ".join(f"{value:.4g}" for value in values)
-            for values in (outcome.guess, outcome.estimates)
-        )
-        lines.append(
-            f"  {outcome.number}: {guess} -> {estimates}, {outcome.sweeps:.1f} sweeps, "
-            f"RMS {1e3 * outcome.rms_m:.3g} mm, largest error a factor of {outcome.worst_ratio:.3g} or "
-            f"{outcome.worst_errors:.2g} standard errors, loss {outcome.excess:.3g} higher: "
-            f"{outcome.message}"
-        )
     return "\n".join(lines)
 
 

@@ -101,17 +101,11 @@ def test_a_twin_with_noisy_poses_is_identified_and_listed():
     found = study_faults.run("poses 0.1 mm, 0.06°, estimated", (0, 1))
     assert found.converged
     assert found.contains_truth.sum() >= 3
-    (line,) = cells(f"{study_faults.table_head()}\n{study_faults.table_row('poses', [found])}")
+    line = study_faults.table_row("poses", [found])
+    assert len(line) == len(study_faults.HEADS)
     assert line[0] == "poses"
     assert float(line[19]) == pytest.approx(100 * found.relative[0], rel=0.05)
     assert line[-1] == "0"
-
-
-def test_a_twin_of_which_all_that_is_assumed_is_wrong_is_in_the_whole_intervals():
-    found = study_faults.run("assumed: all of these", (0, 1))
-    assert found.converged
-    assert found.contains_truth.sum() < found.combined_contains_truth.sum()
-    assert found.combined_contains_truth.sum() >= 5
 
 
 def test_a_twin_with_every_effect_has_the_default_budget():
@@ -152,9 +146,7 @@ def test_faults_are_as_large_as_they_are_called():
 
 @pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
 def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.FaultOutcome(
-        True, *(np.ones(6) for _ in range(5)), correlated=False, redrawn=0
-    )
+    outcome = study_faults.FaultOutcome(True, *(np.ones(6) for _ in range(4)))
     missed = replace(outcome, contains_truth=np.zeros(6))
     row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
-    assert cells(f"a\nb\n{row}")[0][1] == shown
+    assert row[1] == shown

@@ -11,8 +11,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from benchmark_distant_guesses import TRUTH as SOFT
-from benchmark_distant_guesses import bar
 from kit.lifted import of_branches, swung
 from kit.memories import ONE
 from kit.problems import (
@@ -29,9 +27,13 @@ from kit.problems import (
     released_cube,
 )
 from kit.wrenches import sensed, wristed_cube
+from scipy.spatial.transform import Rotation
+from synthetic import Swing
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.moduli import engineering_constants
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -48,8 +50,8 @@ from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.lifted.collocation import with_lifted_variables
-from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.recording import Experiment, Markers, Nuisance
+from collocation_sysid.program.simulation import simulate, with_markers
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
 from collocation_sysid.runs.warm_start import WarmStart
 
 PRECISE = InteriorPoint(tolerance=1e-11)
@@ -318,10 +320,46 @@ def test_a_refinement_that_fails_keeps_the_coarse_point(monkeypatch: pytest.Monk
     np.testing.assert_allclose(solution.theta, as_theta(TRUTH), rtol=1e-5)
 
 
+SOFT = {"lambda_pa": 1300.0, "mu_pa": 870.0, "gamma_r_s": 0.01, "gamma_m_1_s": 0.5}
+# Guesses over true values, and bounds.
+SOFT_GUESSES = {
+    "lambda_pa": (1 / 3, 1.0, 1e6),
+    "mu_pa": (1 / 3, 1.0, 1e6),
+    "gamma_r_s": (3.6, 1e-5, 1.0),
+    "gamma_m_1_s": (3.0, 1e-3, 100.0),
+}
+SOFT_STEP_S, SOFT_NOISE_M, SOFT_MARKERS = 0.01, 5e-4, 9
+
+
 @cache
 def soft_bar(divisions: tuple[int, int, int] = (4, 1, 1), samples: int = 31) -> Problem:
     """A soft bar whose markers have unknown places; its guesses are wrong by factors of three."""
-    return bar(divisions, samples, ideal=False)
+    body = Body(box_mesh((0.22, 0.035, 0.05), divisions), density_kg_m3=95.0)
+    motion = Swing(
+        duration_s=(samples - 1) * SOFT_STEP_S,
+        amplitude_m=(0.03, 0.04, 0.03),
+        amplitude_rad=(0.2, 0.3, 0.3),
+        frequency_hz=(1.1, 1.4, 1.7),
+        rise_s=0.3,
+        start=Rotation.identity(),
+    )
+    poses = motion.poses(SOFT_STEP_S)
+    is_clamped = body.nodes_m[:, 0] < 1e-9
+    rng = np.random.default_rng(1)
+    marked = np.sort(rng.choice(np.flatnonzero(~is_clamped), SOFT_MARKERS, replace=False))
+    no_tracks_m = np.zeros((samples, SOFT_MARKERS, 3))
+    markers = Markers(poses.t_s, no_tracks_m, SOFT_NOISE_M, places_m=body.nodes_m[marked])
+    grasp = Grasp(np.flatnonzero(is_clamped), poses)
+    experiment = Experiment(body, poses.t_s, [grasp], markers, name="soft bar")
+    tracks_m = simulate(experiment, SOFT, timestep_s=SOFT_STEP_S / 8).markers_m
+    tracks_m = tracks_m + SOFT_NOISE_M * rng.normal(size=tracks_m.shape)
+    unplaced_markers = Markers(poses.t_s, tracks_m, SOFT_NOISE_M, markers.names)
+    described = replace(experiment, markers=unplaced_markers, nuisance=Nuisance())
+    guesses = {
+        name: Unknown(SOFT[name] * factor, *bounds)
+        for name, (factor, *bounds) in SOFT_GUESSES.items()
+    }
+    return Problem([described], guesses, scheme="midpoint")
 
 
 def alone_from_the_guess(problem: Problem) -> Solution:

@@ -17,7 +17,6 @@ FILES = [file for file in sorted(SCRIPTS.glob("*/*.py")) if file.parent.name != 
 # Command lines without the ending of the script's name.
 COMMANDS = (
     "study_contact --parts poked --twins 2",
-    "study_coverage --twins 2 --workers 1",
     "study_design --twins 2 --evaluations 5",
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
@@ -31,7 +30,6 @@ COMMANDS = (
     "study_table1 --methods reduced-space",
     "study_trust --twins 1 --faulty 1 --only none",
     "benchmark_contact",
-    "benchmark_distant_guesses --cases none --samples 10",
     "benchmark_jacobian --repeats 1",
     "benchmark_shipped foam_cylinder --max-time-s 20",
 )

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from coverage_twins import CASES, reference, truth, twin
 from kit.fits import PARAMETERS, Problem, problem
 from scipy.stats import binom, kstest
-from study_coverage import CASES, reference, truth, twin
 
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.statistics.linearised import factorise_information, linearise_fit
@@ -211,7 +211,7 @@ def test_intervals_of_a_whole_identification_follow_the_residuals(claimed):
         deviations[:] = 1 / claimed
     stated = replace(experiment, markers=replace(experiment.markers, sigma_m=sigma_m / deviations))
     for seed in range(2):
-        collocation, _ = twin(stated, x, CASES[0], sigma_m, np.random.default_rng(seed))
+        collocation = twin(stated, x, CASES[0], sigma_m, np.random.default_rng(seed))
         solution = ReducedSpace(tolerance=1e-6, ladder=(1.0,))(collocation)
         fit = linearise_fit(collocation, solution.z)
         each = uncertainty_from_fit(fit, collocation.parameters, solution.q)

@@ -1,4 +1,4 @@
-"""Coverage of intervals in complete identifications, a short version of scripts/studies/study_coverage.py."""
+"""Coverage of intervals in complete identifications."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from coverage_twins import CASES, ERROR_MODELS, CoverageOutcome, run
 from scipy.stats import binom, chi2, norm
-from study_coverage import CASES, ERROR_MODELS, CoverageOutcome, run
 
 from collocation_sysid.statistics.uncertainty import ErrorModel
 
