@@ -11,7 +11,6 @@ changes the processor time little, but it increases the wall time.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import time
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Literal
 
 import numpy as np
 from benchmark_sizes import TRUTH, cylinder, swung_cylinder
+from script_arguments import make_parser
 
 from collocation_sysid import Body, Problem, Unknown, simulate
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -52,7 +52,7 @@ class Measurement:
 
 def main() -> None:
     """Run the benchmark with the options of the command line, and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--size", choices=[*SIZES], default="2000")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--only", choices=[*STARTS])

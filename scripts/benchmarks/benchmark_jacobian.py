@@ -8,7 +8,6 @@ and 82 ms (median) for its Jacobian on its own machine.
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import time
@@ -18,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from script_arguments import make_parser
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.kernels import available_threads
@@ -30,7 +30,7 @@ PAPER_JACOBIAN_MS = 57.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--problem", type=Path, default=PROBLEM)
     parser.add_argument("--scheme", default="backward-euler", help="the paper's by default")
     parser.add_argument("--repeats", type=int, default=21)

@@ -44,6 +44,7 @@ from peer_case import (
 )
 from peer_simulators import MUJOCO_STEP_S, RECORDING_STEP_S, UnstableSimulationError, simulate_flex
 from scipy.optimize import least_squares, minimize
+from script_arguments import make_parser
 from studies import markdown
 
 import collocation_sysid as cs
@@ -554,9 +555,7 @@ def compare(names: list[str], out: Path | None) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return the exit code, 2 if MuJoCo is missing."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--only", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES))
     parser.add_argument("--out", type=Path, help="file for the table; without it, only print")
     parser.add_argument("--candidate", choices=[*CANDIDATES, BEST], help=argparse.SUPPRESS)

@@ -12,11 +12,11 @@ of a parameter (most are logarithms).
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
 import numpy as np
+from script_arguments import make_parser
 
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -84,9 +84,7 @@ def measure(name: str, cases: tuple[str, ...], max_time_s: float) -> None:
 
 def main() -> None:
     """Measure the problems that the command line names."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("problems", nargs="*", default=list(DEFAULT_PROBLEMS))
     parser.add_argument("--cases", nargs="*", default=CASES, choices=CASES)
     parser.add_argument("--max-time-s", type=float, default=1e6)

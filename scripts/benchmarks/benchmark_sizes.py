@@ -13,7 +13,6 @@ steps are enough to measure the cost of one.
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import resource
 import time
@@ -22,6 +21,7 @@ from typing import get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 from synthetic import swing
 
 from collocation_sysid import Body, Collocation, Experiment, Grasp, Markers, Parameter, Parameters
@@ -75,7 +75,7 @@ class PartCost:
 
 def main() -> None:
     """Run the benchmark with the options of the command line, and print its table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--size", nargs="+", choices=[*SIZES], default=[*SIZES])
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--factorisation", nargs="+", choices=get_args(Choice), default=["auto"])

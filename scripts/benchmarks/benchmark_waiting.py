@@ -8,7 +8,6 @@ installation. The table has wall time, processor time, and the time to the first
 
 from __future__ import annotations
 
-import argparse
 import os
 import pty
 import select
@@ -20,6 +19,8 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+from script_arguments import make_parser
 
 PROBLEM = Path(__file__).parents[2] / "problems" / "foam_cylinder" / "recording.toml"
 # Program that runs the command line.
@@ -37,7 +38,7 @@ class WaitingTimes:
 
 def main() -> None:
     """Time the commands several times, and print a table of the medians."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--problem", type=Path, default=PROBLEM)
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()

@@ -8,10 +8,11 @@ them.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import urllib.request
 from pathlib import Path
+
+from script_arguments import make_parser
 
 FOLDER = Path(__file__).parents[2] / "problems" / "phantom_compression"
 COMMIT = "52b1271f0f8a966c168e5ddc0886190f12c6551f"
@@ -24,7 +25,7 @@ RUNS = tuple(f"A{k}" for k in range(1, 6))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--from",
         dest="source",

@@ -13,7 +13,6 @@ step of the pressure as the problem assumes it.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import urllib.request
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from script_arguments import make_parser
 
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording.marker_files import read_markers
@@ -85,9 +85,7 @@ class ArmShape:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--from",
         dest="source",

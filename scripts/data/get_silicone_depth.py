@@ -11,13 +11,13 @@ image; the cameras that come with the images are some degrees off it.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from script_arguments import make_parser
 
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.fem.meshes.mesh import TetMesh
@@ -39,7 +39,7 @@ ANGLE_LIMITS_DEG = (15, 12, 10, 8, 6, 5, 4, 3, 3, 3, 3, 3)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--from", dest="source", type=Path, required=True, help="the folder")
     source = parser.parse_args().source
     missing = [name for name in IMAGES if not (source / f"{name}.json").is_file()]

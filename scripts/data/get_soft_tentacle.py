@@ -8,11 +8,11 @@ written as one row, in the frame of the clamped section, z upwards.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
 import numpy as np
+from script_arguments import make_parser
 
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
@@ -43,7 +43,7 @@ HEXAGON_FACTOR = (np.pi / 4 / (5 * np.sqrt(3) / 16)) ** 0.25
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--from", dest="source", type=Path, required=True, help="a folder of CSVs")
     source = parser.parse_args().source
     tentacle().write(FOLDER / "tentacle.vtu")

@@ -9,11 +9,12 @@ the extra: pip install 'collocation-sysid[c3d]'. The meshes are written here too
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import sys
 import urllib.request
 from pathlib import Path
+
+from script_arguments import make_parser
 
 from collocation_sysid.fem.meshes.structured import box_mesh
 
@@ -31,7 +32,7 @@ MESHES = {"beam.vtu": (5, 2, 2), "beam_coarse.vtu": (3, 1, 1)}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument(
         "--from",
         dest="source",

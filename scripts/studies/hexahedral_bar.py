@@ -9,7 +9,6 @@ Run as a script it compares sag, frequency and decay of a slender cantilever wit
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 
 Array = np.ndarray
 # Spectral radius of the generalized-alpha method at high frequencies.
@@ -371,5 +371,5 @@ def _beam_check() -> None:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
+    make_parser(__doc__).parse_args()
     _beam_check()

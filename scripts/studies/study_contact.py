@@ -12,7 +12,6 @@ finite elements and with Hertz's formula from the same forces.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -22,6 +21,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.stats import sem
 from scipy.stats import t as student
+from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -317,9 +317,7 @@ def print_force_ratios(name: str) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parts = ("sphere", "cylinder", "poked")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--twins", type=int, default=100, help="of `poked`")

@@ -13,13 +13,13 @@ boundary between the materials.
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 from synthetic import swing
 
 import collocation_sysid as cs
@@ -264,7 +264,7 @@ def cost() -> None:
 
 def main() -> None:
     """Run the study with the options of the command line, and print its tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=10)
     parser.add_argument("--cost", action="store_true")
     parser.add_argument("--only", default="", help="twins whose name contains this text")

@@ -19,6 +19,7 @@ import time
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
@@ -159,7 +160,7 @@ def identify(cameras: int, number: int, options: argparse.Namespace) -> list[tup
 
 def main() -> None:
     """Print a table with one row for each number of cameras."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=24)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--places", choices=("known", "unknown"), default="known")

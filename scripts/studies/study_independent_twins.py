@@ -14,7 +14,6 @@ of that version's environment and another `--answers`.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections import Counter
@@ -27,6 +26,7 @@ import hexahedral_bar
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 
 import collocation_sysid as cs
 
@@ -76,9 +76,7 @@ class Twin:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--folder", type=Path, default=Path("independent_twins"))

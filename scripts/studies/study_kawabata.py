@@ -11,11 +11,11 @@ are root mean squares of engineering stresses.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from script_arguments import make_parser
 from studies import markdown
 
 import collocation_sysid as cs
@@ -87,9 +87,7 @@ LAWS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--laws", nargs="+", help="names of laws; all by default")
     options = parser.parse_args()
     laws = [law for law in LAWS if options.laws is None or law.name in options.laws]

@@ -11,13 +11,13 @@ values, whatever its status.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from script_arguments import make_parser
 from studies import TRUTH, Variant, markdown, number, run_variants, save, worst_error
 from synthetic import swing
 
@@ -115,9 +115,7 @@ class MethodScore:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--starts", type=int, default=40)
     parser.add_argument("--spread", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)

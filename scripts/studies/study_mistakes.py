@@ -21,6 +21,7 @@ import contact_twins
 import depth_twins
 import filmed_twins
 import numpy as np
+from script_arguments import make_parser
 from twins import BODIES, SOFT, sensing_twin, twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
@@ -121,9 +122,7 @@ def main() -> None:
 
 def _options() -> argparse.Namespace:
     """Return the options of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     groups = ["tracks", "wrench", "depth", "video", "obstacle"]
     parser.add_argument("--groups", nargs="+", choices=groups, default=groups)
     parser.add_argument("--body", choices=list(BODIES), default="bar")

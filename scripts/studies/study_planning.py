@@ -15,7 +15,6 @@ zero-vibration shaper.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -23,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from script_arguments import make_parser
 from studies import markdown, number, save
 
 import collocation_sysid as cs
@@ -61,9 +61,7 @@ Motion = Callable[[Array], Array]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
     parser.add_argument("--out", type=Path, default=Path("results/study_planning"))
     arguments = parser.parse_args()

@@ -17,7 +17,6 @@ FOLDER has the files of NIST, such as `MGH09.dat`, from https://www.itl.nist.gov
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import sys
 import time
@@ -34,6 +33,7 @@ import numpy as np
 from regressions import Regression, as_problem, read_regression
 from scipy.linalg import hilbert
 from scipy.optimize import curve_fit, least_squares, root_scalar
+from script_arguments import make_parser
 from studies import markdown
 
 from collocation_sysid.common.array_types import Array
@@ -232,7 +232,7 @@ def diagonal_of_inverse(matrix: list[list[Fraction]]) -> list[Fraction]:
 
 def main() -> None:
     """Run the study and print its tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--names", nargs="*", help="regressions; all by default")
     parser.add_argument("--profiles", action="store_true", help="profile likelihoods alone")

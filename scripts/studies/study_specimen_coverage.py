@@ -9,12 +9,12 @@ anisotropic nor drifting, so that the combined intervals would be too wide.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from script_arguments import make_parser
 from studies import Intervals, count_coverage, statistical_intervals
 
 import collocation_sysid as cs
@@ -90,9 +90,7 @@ CASES = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=200)
     parser.add_argument("--case", type=int, choices=range(len(CASES)), help="one of the cases")
     options = parser.parse_args()

@@ -1,47 +1,31 @@
-"""Results for the measured beam: joint fit, refinement, cross-validation, and Poisson's ratio.
+"""Results for the measured beam: joint fit of three trials, and prediction of each from the others.
 
-The problem is one of problems/srl_beam. Every part changes a few of its keys and solves it again by
-reduced space.
+The problem is one of problems/srl_beam, solved by reduced space.
 
-    python scripts study_srl_beam --from FOLDER              # all: a quarter of an hour
     python scripts study_srl_beam --from FOLDER --problem memory.toml --parts joint validation
 """
 
 from __future__ import annotations
 
-import argparse
-import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-from get_srl_beam import FOLDER, ORIGIN_M, SIZE_M
-from numpy.typing import NDArray
+from get_srl_beam import FOLDER
+from script_arguments import make_parser
 
 from collocation_sysid import Problem, Solution, solve
-from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.parameters import FieldCoefficients
 from collocation_sysid.program.collocation import ExperimentIterate
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.identifiability import identifiability_sentences
-from collocation_sysid.statistics.linearised import LinearisedFit, linearise_fit
+from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.residuals.diagnostics import diagnose_markers
-from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
+from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 TRIALS = ("gravity", "load52", "load101")
-# Element and bricks along x, y and z.
-MESHES = (
-    ("tet4", (5, 2, 2)),
-    ("tet4", (10, 4, 4)),
-    ("tet10", (3, 1, 1)),
-    ("tet10", (5, 2, 2)),
-    ("tet10", (8, 3, 3)),
-)
-SUBSTEPS = (1, 2, 4)
-SCHEMES = ("midpoint", "bdf2", "backward-euler")
 
 
 @dataclass(frozen=True)
@@ -61,25 +45,9 @@ class Beam:
         return Problem.read(FOLDER / self.file, [*files, *overrides])
 
 
-@dataclass(frozen=True, eq=False)
-class BeamFit:
-    """Solved problem with its linearised residuals and uncertainties."""
-
-    solution: Solution
-    linearised: LinearisedFit
-    uncertainty: Uncertainty
-
-
 def main() -> None:
-    parts = {
-        "joint": print_joint_fit,
-        "refinement": print_refinement,
-        "validation": print_validation,
-        "poisson": print_poisson,
-    }
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parts = {"joint": print_joint_fit, "validation": print_validation}
+    parser = make_parser(__doc__)
     parser.add_argument("--from", dest="source", type=Path, default=FOLDER, help="the recordings")
     parser.add_argument("--problem", default="problem.toml", help="a file of problems/srl_beam")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
@@ -95,30 +63,18 @@ def shipped(beam: Beam) -> Solution:
     return solve(beam.load())
 
 
-def fit(problem: Problem, solution: Solution | None = None) -> BeamFit:
-    """Solve a problem unless its solution is passed, and compute the uncertainties."""
-    solution = solution or solve(problem)
-    if not solution.status.converged:
-        print(f"NOT CONVERGED: {solution.message}")
-    linearised = linearise_fit(solution.collocation, solution.z)
-    return BeamFit(
-        solution, linearised, uncertainty_from_fit(linearised, problem.parameters, solution.q)
-    )
-
-
 # Parts ----------------------------------------------------------------------------------------
 
 
 def print_joint_fit(beam: Beam) -> None:
     """Print the fit of one material to the three trials: parameters, nuisance parameters and notes."""
-    joint_fit = fit(beam.load(), shipped(beam))
-    solution = joint_fit.solution
-    uncertainty = joint_fit.uncertainty
+    problem, solution = beam.load(), shipped(beam)
+    linearised = linearise_fit(solution.collocation, solution.z)
+    uncertainty = uncertainty_from_fit(linearised, problem.parameters, solution.q)
     print(f"{solution.message} {solution.iterations} sweeps, {solution.timing.total:.0f} s")
     print(f"\n{'parameter':14}{'value':>12}   95 % interval ({uncertainty.errors} errors)")
     for name, estimate in uncertainty.estimates.items():
         print(f"{name:14}{estimate.value:12.5g}   {interval(estimate)}")
-    print("\ncorrelations\n" + matrix(uncertainty.names, uncertainty.correlation))
     print("\nnuisance parameters, and their standard deviations")
     for part in solution.collocation.iterates(solution.z):
         nuisance = part.transcription.nuisance
@@ -129,30 +85,8 @@ def print_joint_fit(beam: Beam) -> None:
     notes = dict.fromkeys(
         (*solution.notes, *uncertainty.notes, *identifiability_sentences(uncertainty))
     )
-    sentences = [diagnosis.sentence for diagnosis in diagnose_markers(joint_fit.linearised)]
+    sentences = [diagnosis.sentence for diagnosis in diagnose_markers(linearised)]
     print("\n" + "\n".join(f"- {sentence}" for sentence in (*notes, *sentences)))
-
-
-def print_refinement(beam: Beam) -> None:
-    """Print the joint fit on other meshes, with other time steps, and with other schemes."""
-    print(f"{'':34}{'E [kPa]':>8}  95 % interval    γ_r [ms]  γ_m [1/s]  RMS [mm]")
-    shipped_answer = shipped(beam)
-    for substeps in SUBSTEPS:
-        for scheme in SCHEMES:
-            steps = f"transcription.substeps={substeps}"
-            problem = with_guesses_from(
-                beam.load(f"transcription.scheme={scheme}", steps), shipped_answer
-            )
-            print_row(f"{scheme}, {10 / substeps:g} ms", fit(problem))
-    with tempfile.TemporaryDirectory() as folder:
-        for element, divisions in MESHES:
-            mesh = Path(folder) / "beam.vtu"
-            box_mesh(SIZE_M, divisions, ORIGIN_M).write(mesh)
-            problem = with_guesses_from(
-                beam.load(f"object.mesh={mesh}", f"object.element={element}"), shipped_answer
-            )
-            bricks = " x ".join(map(str, divisions))
-            print_row(f"{element} {bricks}, {len(problem.bodies[0].nodes_m)} nodes", fit(problem))
 
 
 def print_validation(beam: Beam) -> None:
@@ -169,25 +103,6 @@ def print_validation(beam: Beam) -> None:
         values = "".join(f"{solution.parameters[name]:15.5g}" for name in free)
         print(f"{trial:12}{values}", end="")
         print(f"{with_nuisance:30.3f}{without:10.3f}{joint_rms_mm[trial]:14.3f}", flush=True)
-
-
-def print_poisson(beam: Beam) -> None:
-    """Print fits with Poisson's ratio estimated, and fixed at several values."""
-    shipped_answer = shipped(beam)
-    free = "parameters.poisson={ guess = 0.45, lower = 0.05, upper = 0.495 }"
-    free_fit = fit(with_guesses_from(beam.load(free), shipped_answer))
-    print_row("estimated", free_fit)
-    ratio = free_fit.uncertainty.estimates["poisson"]
-    print(f"ν = {ratio.value:.3f}, {interval(ratio)}")
-    notes = dict.fromkeys(
-        (*free_fit.uncertainty.notes, *identifiability_sentences(free_fit.uncertainty))
-    )
-    print("\n".join(f"- {sentence}" for sentence in notes))
-    for value in (0.3, 0.4, 0.45, 0.48, 0.49):
-        problem = with_guesses_from(
-            beam.load(f"parameters.poisson={{ fixed = {value} }}"), shipped_answer
-        )
-        print_row(f"fixed at {value}", fit(problem))
 
 
 def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[float, float]:
@@ -212,19 +127,6 @@ def predicted_rms_mm(problem: Problem, trial: str, solution: Solution) -> tuple[
 # Tables ---------------------------------------------------------------------------------------
 
 
-def print_row(label: str, beam_fit: BeamFit) -> None:
-    """Print modulus, interval, damping and RMS distances of one fit in one line."""
-    young = beam_fit.uncertainty.estimates["young_pa"]
-    low, high = young.statistical95 or (np.nan, np.nan)
-    values = beam_fit.solution.parameters
-    print(
-        f"{label:34}{1e-3 * young.value:8.1f}  {1e-3 * low:.1f} to {1e-3 * high:.1f}"
-        f"{1e3 * values['gamma_r_s']:12.2f}{values['gamma_m_1_s']:11.2f}"
-        f"  {rms_line(beam_fit.solution)}",
-        flush=True,
-    )
-
-
 def interval(estimate: Estimate) -> str:
     """Return the statistical interval as text, or the reason why there is none."""
     if estimate.statistical95 is None:
@@ -232,15 +134,6 @@ def interval(estimate: Estimate) -> str:
     low, high = estimate.statistical95
     reason = f" ({estimate.reason})" if estimate.reason else ""
     return f"{low:.4g} to {high:.4g}{reason}"
-
-
-def matrix(names: Sequence[str], values: NDArray[np.float64]) -> str:
-    """Return a matrix (p, p) as text, with names of rows and columns."""
-    rows = (
-        f"{name:14}" + "".join(f"{value:13.3f}" for value in row)
-        for name, row in zip(names, values, strict=True)
-    )
-    return "\n".join([" " * 14 + "".join(f"{name:>13}" for name in names), *rows])
 
 
 def with_guesses_from(problem: Problem, solution: Solution) -> Problem:

@@ -10,10 +10,10 @@ estimates are 734.3, 182.8, 0.021 and 0.91, and in a simulation with these the e
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from script_arguments import make_parser
 from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, number, run_variants, save
 
 from collocation_sysid.extras.studies.rows import Row
@@ -46,9 +46,7 @@ PAPER_ROW = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     names = [variant.name for variant in VARIANTS]
     parser.add_argument("--methods", nargs="*", choices=names, default=names[:-1])
     parser.add_argument("--time-s", type=float, default=180.0, help="time limit of a run [s]")

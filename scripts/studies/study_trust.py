@@ -9,7 +9,6 @@ only if the answer would be rated "good" without them.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import time
@@ -20,6 +19,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from script_arguments import make_parser
 from studies import markdown
 from twins import random_poses
 from wrong_twins import FAULTS
@@ -83,7 +83,7 @@ class VerdictOutcome:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=200, help="number of twins without a fault")
     parser.add_argument("--faulty", type=int, default=9, help="number of twins with each fault")
     parser.add_argument("--only", nargs="*", choices=["none", *FAULTS], default=["none", *FAULTS])

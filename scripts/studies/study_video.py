@@ -10,7 +10,6 @@ EGL, and OpenCV.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import tempfile
 import time
@@ -20,6 +19,7 @@ import numpy as np
 import rendered_video
 from make_templates import VIDEO_IMAGES, VIDEO_POINTS, write_poses_csv
 from scipy.interpolate import CubicSpline
+from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.problem.new import create_problem
@@ -56,7 +56,7 @@ def film_problem(folder: Path, shape: CubicSpline, rate_hz: float, cameras: int,
 
 def main() -> None:
     """Print a table with one row for each video."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = make_parser(__doc__)
     parser.add_argument("--rates", default="60,30")
     parser.add_argument("--cameras", default="1,2")
     parser.add_argument("--seeds", default="5")

@@ -9,7 +9,6 @@ row takes half a minute of processor time, that of the fine mesh several minutes
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from make_phantom_mesh import SECTIONS_MM, quarter_revolution
+from script_arguments import make_parser
 
 from collocation_sysid import Problem, run
 from collocation_sysid.errors import InputError, SimulationError
@@ -38,7 +38,7 @@ ASSUMPTIONS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--only", nargs="*", choices=("specimens", "assumed", "meshes"))
     only = parser.parse_args().only or ("specimens", "assumed", "meshes")
     print(

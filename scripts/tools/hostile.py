@@ -22,7 +22,6 @@ with limits of time and memory. Its outcome is
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -43,6 +42,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
+from script_arguments import make_parser
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
@@ -745,7 +745,7 @@ KINDS = {each.name: each for each in FILES}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
+    parser = make_parser(__doc__)
     parser.add_argument("--count", type=int, default=100, help="number of cases of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", choices=list(KINDS), default=list(KINDS))

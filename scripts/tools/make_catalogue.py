@@ -13,7 +13,6 @@ fail or that exceed the time limit are listed as omitted.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import subprocess
@@ -32,6 +31,7 @@ from catalogue import (
     catalogue_page,
 )
 from catalogue_sources import ROOT, SOURCES, CatalogueSource
+from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
@@ -54,7 +54,7 @@ TIME_LIMIT_S = 1500.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--reuse", action="store_true", help="use the run folders that exist")
     parser.add_argument("--page-only", action="store_true", help="write the page from the JSON")
     parser.add_argument("--long", action="store_true", help="solve long problems too")

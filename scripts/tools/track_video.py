@@ -14,7 +14,6 @@ Needs OpenCV: pip install 'collocation-sysid[video]'.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import sys
 from collections.abc import Iterable, Iterator
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from script_arguments import make_parser
 
 from collocation_sysid.common.files import in_counting_order
 
@@ -259,7 +259,7 @@ def stated_points(text: str) -> tuple[list[str], np.ndarray]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Track the points of a video and write their table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser = make_parser(__doc__)
     parser.add_argument("video", type=Path, help="video, or folder of images")
     parser.add_argument("--out", type=Path, required=True, help="table of tracks, CSV")
     parser.add_argument("--mask", type=Path, help="image that is not black where the body is")

@@ -256,14 +256,6 @@ def test_noise_that_persists_from_image_to_image_widens_the_interval():
     assert 2 < widths[1] / widths[0] < 5.0
 
 
-@pytest.mark.slow
-def test_intervals_contain_the_truth_at_their_nominal_rate():
-    """Of twins with noise alike over three pixels and a bias; see scripts/studies/study_depth.py."""
-    from study_depth import contains_truth
-
-    assert 0.9 <= np.mean([contains_truth(seed) for seed in range(40)]) <= 1.0
-
-
 def test_a_dropout_is_a_cloud_without_points():
     seen = points_from_image(image_m(), cs.DepthCamera(MATRIX))
     depth = cs.Depth("front", [0.0, 1.0], [seen, seen[:0]], 1e-3)
