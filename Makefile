@@ -59,7 +59,7 @@ dist: $(CORE) ## build wheel and sdist, install each afresh, and solve a problem
 	@for file in dist/*.whl dist/*.tar.gz; do \
 	  echo "Trying $$file" && rm -rf $(TRIED) && $(PYTHON) -m venv $(TRIED) && \
 	  $(TRIED)/bin/python -m pip install --quiet --disable-pip-version-check $$file && \
-	  (cd build && tried/bin/collocation-sysid explain verdict > /dev/null && \
+	  (cd build && tried/bin/collocation-sysid explain trust > /dev/null && \
 	    tried/bin/collocation-sysid solve ../problems/foam_cylinder/recording.toml \
 	    --out tried/run --quiet > /dev/null) || exit 1; \
 	done

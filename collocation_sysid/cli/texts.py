@@ -89,8 +89,8 @@ def schema() -> None:
 @command(
     commands,
     "explain",
-    "explain verdict",
-    "explain trust scheme",
+    "explain trust",
+    "explain budget scheme",
     "explain resample_hz",
     "explain theory | less",
 )

@@ -50,7 +50,7 @@ TOPICS: dict[str, Topic] = {
     ),
     "description": Topic(
         "The description",
-        "wrong_description",
+        "trust",
         remedy="Compare units, frames, labels and clocks of the problem file with the laboratory's "
         "notes. The command check tests the recordings for common mistakes before a solve.",
         messages={
@@ -218,7 +218,7 @@ TOPICS: dict[str, Topic] = {
     ),
     "noise": Topic(
         "Size of the noise",
-        "verdict",
+        "trust",
         remedy="The error bars are computed from the residuals. State the sensor's noise as sigma "
         "if it is known. If a single marker deviates, look for exchanged labels and "
         "reflections in its track.",

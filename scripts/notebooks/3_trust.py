@@ -479,7 +479,7 @@ for name in names:
 # (usable after checking the listed reasons) or `doubtful` (something is wrong with the data, the
 # model or the solution). The verdict considers convergence, the size and the pattern of the
 # residuals, parameters at a bound, the forward simulation, and the discretisation error
-# ([verdict](../../docs/howto/verdict.md)). It does not consider the width of the intervals: the
+# ([verdict](../../docs/howto/trust.md)). It does not consider the width of the intervals: the
 # table marks an estimate whose interval is wider than its value as "not determined", here λ and ν.
 
 # %%

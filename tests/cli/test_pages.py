@@ -38,15 +38,15 @@ CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve
 def test_topics_are_listed_with_a_line_each():
     lines = run_command("explain").out.splitlines()
     assert len(lines) == 1 + len(page_files())
-    assert next(line for line in lines if line.startswith("verdict")).split(maxsplit=1)[
+    assert next(line for line in lines if line.startswith("trust")).split(maxsplit=1)[
         1
-    ].strip() == ("Reading the verdict")
+    ].strip() == ("Trust in an answer")
 
 
 def test_a_page_is_shown_with_its_links_as_topics():
     shown = run_command("explain", "trust").out
-    assert shown.startswith("# When the answer can't be trusted\n")
-    assert "The verdict (`explain verdict`) of a run names the problems of its result." in " ".join(
+    assert shown.startswith("# Trust in an answer\n")
+    assert "its estimates and their combined intervals (`explain budget`)." in " ".join(
         shown.split()
     )
     for topic in page_files():
@@ -54,10 +54,10 @@ def test_a_page_is_shown_with_its_links_as_topics():
 
 
 def test_an_unknown_topic_is_refused_with_the_likely_one():
-    outcome = run_command("explain", "verdit")
+    outcome = run_command("explain", "trusst")
     assert outcome.code == 2
-    assert "TOPIC: found 'verdit'; expected one of actuation, " in outcome.err
-    assert "did you mean 'verdict'?" in outcome.err
+    assert "TOPIC: found 'trusst'; expected one of actuation, " in outcome.err
+    assert "did you mean 'trust'?" in outcome.err
 
 
 def test_keys_of_the_problem_file_are_explained():
@@ -102,7 +102,7 @@ def test_the_advised_command_works():
     assert said == "what to do: collocation-sysid explain trust scheme"
     shown = run_command(*said.removeprefix("what to do: ").split()[1:])
     assert shown.code == 0
-    assert "# When the answer can't be trusted\n" in shown.out
+    assert "# Trust in an answer\n" in shown.out
     assert "# Choosing a scheme\n" in shown.out
 
 

@@ -92,7 +92,7 @@ def test_commands_of_a_page_run(page: Path, checkout: Path):
 def test_pages_agree_on_how_often_the_verdict_is_right():
     pages = [
         ROOT / name
-        for name in ("README.md", "docs/howto/verdict.md", "docs/studies/verdict_reliability.md")
+        for name in ("README.md", "docs/howto/trust.md", "docs/studies/verdict_reliability.md")
     ]
     counts = [
         re.search(r"(\d+) (?:faultless|correct simulated).*?none of (\d+)", each.read_text(), re.S)

@@ -1,4 +1,4 @@
-"""Every check for every kind of measurement: the table of docs/howto/verdict.md."""
+"""Every check for every kind of measurement: the table of docs/howto/trust.md."""
 
 from __future__ import annotations
 
@@ -462,19 +462,21 @@ CHECKS = {
     ),
 }
 TESTS = Path(__file__).parents[1]
-PAGE = (TESTS.parent / "docs" / "howto" / "verdict.md").read_text()
+PAGE = (TESTS.parent / "docs" / "howto" / "trust.md").read_text()
 
 
 def table():
-    """Cells of the table in the documentation by the check and the kind, and its sentences."""
+    """Reason why a check does not concern a kind of measurement, or "yes", by check and kind in
+    the documentation, and its sentences.
+    """
     section = PAGE.partition("## Checks by measurement")[2].partition("\n## ")[0]
-    rows = re.findall(r"(?m)^\| (.+) \|$", section)
-    header, *lines = [row.split(" | ") for row in rows]
-    cells = {
-        (line[0], kind): cell
-        for line in lines
-        for kind, cell in zip(header[1:], line[1:], strict=True)
-    }
+    _, *lines = re.findall(r"(?m)^\| (.+?) \|(?: (.+))? \|$", section)
+    kinds = re.findall(r"(?m)^Kinds of measurement: (.+)\.$", section)[0].split(", ")
+    cells = {(title, kind): "yes" for title, _ in lines for kind in kinds}
+    for title, exceptions in lines:
+        for kind, reason in re.findall(r"([a-z ]+) (\d+)(?:, |$)", exceptions):
+            assert (title, kind) in cells
+            cells[title, kind] = reason
     return cells, re.findall(r"(?m)^(\d+)\. ", section)
 
 

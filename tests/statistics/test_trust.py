@@ -46,7 +46,7 @@ from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 RNG = np.random.default_rng
 PACKAGE = Path(__file__).parents[2] / "collocation_sysid"
-VERDICT_PAGE = Path(__file__).parents[2] / "docs" / "howto" / "verdict.md"
+TRUST_PAGE = Path(__file__).parents[2] / "docs" / "howto" / "trust.md"
 FOAM_CYLINDER = Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
 # Of λ = 800 Pa and μ = 600 Pa, with which its tracks were made.
 EXACT = UncertaintyOptions(assumptions=Assumptions.exact())
@@ -134,7 +134,7 @@ def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():
 
 
 def test_the_page_states_the_threshold_of_doubtful_residuals_that_the_code_uses():
-    words = re.sub(r"\s+", " ", VERDICT_PAGE.read_text(encoding="utf-8"))
+    words = re.sub(r"\s+", " ", TRUST_PAGE.read_text(encoding="utf-8"))
     (check, doubtful) = re.findall(r"more than ([\d.]+) times `sigma_m`", words)
     assert (float(check), float(doubtful)) == (MISFIT, GROSS_MISFIT)
     for seed in range(3):
