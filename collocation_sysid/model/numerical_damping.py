@@ -23,7 +23,7 @@ from .schemes import Scheme, Stencil
 
 # Largest number of substeps tried by `substeps_needed`; more would be too slow to be useful.
 MAX_SUBSTEPS = 4096
-# Default of the largest relative error of the period in `substeps_needed`.
+# Largest absolute relative error of the period in `substeps_needed`.
 PERIOD_ERROR = 0.01
 
 
@@ -93,11 +93,11 @@ def substeps_needed(
     angular_frequency_rad_s: float,
     timestep_s: float,
     damping_limit: float,
-    period_error: float = PERIOD_ERROR,
     damping_ratio: float = 0.0,
 ) -> int | None:
     """Return the fewest substeps that keep numerical damping and period error within limits, by
-    bisection: both are assumed to decrease with the step.
+    bisection: both are assumed to decrease with the step. The period error is at most
+    `PERIOD_ERROR`, evaluated without physical damping.
 
     Parameters
     ----------
@@ -107,8 +107,6 @@ def substeps_needed(
         Time between samples.
     damping_limit : float
         Largest absolute numerical damping ratio.
-    period_error : float
-        Largest absolute relative error of the period, evaluated without physical damping.
     damping_ratio : float
         Physical damping ratio ζ, below 1.
 
@@ -134,7 +132,7 @@ def substeps_needed(
             )
             for ratio in (0.0, damping_ratio)
         )
-        return abs(damped.damping_ratio) <= damping_limit and abs(mode.period_error) <= period_error
+        return abs(damped.damping_ratio) <= damping_limit and abs(mode.period_error) <= PERIOD_ERROR
 
     high = 1
     while not suffices(high):

@@ -6,7 +6,6 @@ problem file.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from functools import lru_cache
 from itertools import product
 from typing import ClassVar
@@ -75,18 +74,13 @@ class Solid(ABC):
         return np.zeros(3)
 
 
-def _unit_vector_converter(name: str) -> Callable[[ArrayLike], Array]:
-    """Return a function that normalises a vector (3,), not zero."""
-
-    def made(value: ArrayLike) -> Array:
-        """Return the normalised vector (3,)."""
-        vector = float_converter((3,), name)(value)
-        length = float(np.linalg.norm(vector))
-        if not length > 0:
-            raise InputError(f"{name} is zero; expected a direction")
-        return vector / length
-
-    return made
+def _unit_normal(value: ArrayLike) -> Array:
+    """Return the normalised vector (3,) of a normal, not zero."""
+    vector = float_converter((3,), "normal of a plane")(value)
+    length = float(np.linalg.norm(vector))
+    if not length > 0:
+        raise InputError("normal of a plane is zero; expected a direction")
+    return vector / length
 
 
 @lru_cache(maxsize=64)
@@ -109,9 +103,7 @@ class Plane(Solid):
 
     has_tilt: ClassVar[bool] = True
 
-    normal: Array = key(
-        Vector, converter=_unit_vector_converter("normal of a plane"), default=(0.0, 0.0, 1.0)
-    )
+    normal: Array = key(Vector, converter=_unit_normal, default=(0.0, 0.0, 1.0))
     point_m: Array = key(
         Vector, converter=float_converter((3,), "point_m of a plane"), default=(0.0,) * 3
     )

@@ -39,8 +39,6 @@ class RigidFit:
         Rotations R; NaN at missing frames.
     residual_m : (T,) array
         Weighted root mean square over the markers present; NaN at missing frames.
-    marker_residual_m : (T, B) array
-        Distance of each marker from its place in the pose; NaN where missing.
     missing : (T,) bool array
         Frames without three markers off one line.
     """
@@ -48,7 +46,6 @@ class RigidFit:
     positions_m: Array
     quaternions_xyzw: Array
     residual_m: Array
-    marker_residual_m: Array
     missing: NDArray[np.bool_]
 
     def poses(self, t_s: ArrayLike) -> PoseSequence:
@@ -96,7 +93,7 @@ def fit_poses(
     tracks_m : (T, B, 3) array
         Measured positions, NaN where missing.
     weights : (B,) array, optional
-        At least 0; all 1 by default. A marker of weight 0 has no influence, but has a residual.
+        At least 0; all 1 by default. A marker of weight 0 has no influence.
 
     Raises
     ------
@@ -123,7 +120,6 @@ def fit_poses(
     rotations, translations = _best_motions(repeated, tracks, weight=weight)
     fitted = np.einsum("tij,bj->tbi", rotations, reference) + translations[:, None]
     distance = np.linalg.norm(tracks - fitted, axis=2)
-    distance[missing] = np.nan
     total = np.where(missing, np.nan, weight.sum(axis=1))
     residual = np.sqrt(np.nansum(weight * distance**2, axis=1) / total)
     quaternions = Rotation.from_matrix(rotations).as_quat()
@@ -132,7 +128,6 @@ def fit_poses(
         np.where(gap, np.nan, translations),
         np.where(gap, np.nan, quaternions),
         residual_m=residual,
-        marker_residual_m=distance,
         missing=missing,
     )
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,7 +19,7 @@ SHORTEST_STEP_S = 1e-12
 _PRINTED_DECIMALS = range(10)
 
 
-def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = None) -> float:
+def sample_interval_s(t_s: ArrayLike, what: str) -> float:
     """Return the mean time between samples, which must be the same throughout.
 
     Steps may differ from the mean by `STEP_TOLERANCE` of it, and by the rounding of times to the
@@ -33,8 +31,6 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
         At least two sample times.
     what : str
         What was sampled, for messages.
-    source : str or Path, optional
-        The file, for messages.
 
     Raises
     ------
@@ -46,11 +42,10 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
     if times.ndim != 1 or len(times) < 2:
         raise InputError(
             f"{what}: the number of samples is {times.size}; expected at least two, because the "
-            "interval between samples is needed",
-            source,
+            "interval between samples is needed"
         )
     if fault := first_unordered_time(times):
-        raise InputError(f"{what}: {fault[1]}", source, where=f"row {fault[0] + 1}")
+        raise InputError(f"{what}: {fault[1]}", None, where=f"row {fault[0] + 1}")
     steps = np.diff(times)
     if not has_even_steps(times):
         # A lost frame also shifts the mean, and with it every other step: name the worst.
@@ -60,7 +55,7 @@ def sample_interval_s(t_s: ArrayLike, what: str, source: str | Path | None = Non
             f"{what}: the time jumps by {steps[row]:.6g} s from t_s = {times[row]:.9g} to "
             f"{times[row + 1]:.9g}, where other steps are {typical_s:.6g} s; samples must be "
             "evenly spaced: fill lost frames with blank rows, or set resample_hz",
-            source,
+            None,
             where=f"row {row + 2}",
         )
     return float(times[-1] - times[0]) / len(steps)

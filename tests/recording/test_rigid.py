@@ -62,7 +62,6 @@ def test_a_weight_of_zero_leaves_a_marker_out(rng):
     fit = fit_poses(CLUSTER_M, tracks, [1, 1, 1, 0])
     assert_rotations(fit.quaternions_xyzw, rotations)
     np.testing.assert_allclose(fit.residual_m, 0.0, atol=1e-12)
-    np.testing.assert_allclose(fit.marker_residual_m[:, 3], 0.02 * np.sqrt(3))
 
 
 def test_missing_markers_are_done_without(rng):
@@ -71,7 +70,6 @@ def test_missing_markers_are_done_without(rng):
     tracks[::2, 1] = np.nan
     fit = fit_poses(CLUSTER_M, tracks)
     assert_rotations(fit.quaternions_xyzw, rotations)
-    assert np.isnan(fit.marker_residual_m[::2, 1]).all()
     assert np.isfinite(fit.residual_m).all()
 
 
