@@ -36,16 +36,10 @@ STARTS = {"auto": "coarse", "false": "direct"}
 
 @dataclass(frozen=True)
 class Measurement:
-    """One solve with its cost.
-
-    Attributes
-    ----------
-    solution : Solution
-    processor_s, wall_s : float
-        Processor and wall time of the solve [s].
-    """
+    """One solve with its cost."""
 
     solution: Solution
+    # Processor and wall time of the solve [s].
     processor_s: float
     wall_s: float
 
@@ -68,15 +62,7 @@ def main() -> None:
 
 
 def swung_problem(mesh: str, steps: int) -> Problem:
-    """Return the problem of a swung cylinder with noisy markers and no guess.
-
-    Parameters
-    ----------
-    mesh : str
-        Rings x layers.
-    steps : int
-        Number of samples.
-    """
+    """Return the problem of a swung cylinder with noisy markers and no guess."""
     body = Body(cylinder(mesh), density_kg_m3=20.0, damping="rayleigh", threads=1)
     experiment = swung_cylinder(body, steps)
     tracks = simulate(experiment, TRUTH, "midpoint", substeps=1).markers_m
@@ -88,16 +74,7 @@ def swung_problem(mesh: str, steps: int) -> Problem:
 
 
 def measure(problem: Problem, start: str, nodes: int) -> Measurement:
-    """Return a solve with its times, and print them.
-
-    Parameters
-    ----------
-    problem : Problem
-    start : {"auto", "false"}
-        Option `coarse_start`.
-    nodes : int
-        Option `coarse_start_nodes`.
-    """
+    """Return a solve with its times, and print them."""
     option: Literal["auto", False] = "auto" if start == "auto" else False
     method = ReducedSpace(coarse_start=option, coarse_start_nodes=nodes)
     began_s = time.perf_counter()

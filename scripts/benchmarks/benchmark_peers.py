@@ -80,30 +80,17 @@ def computing_time_s() -> float:
 
 @dataclass
 class Progress:
-    """Parameter values of a search over time.
+    """Parameter values of a search over time."""
 
-    Attributes
-    ----------
-    began_s : float
-        Computing time when the search began [s].
-    times_s : list of float
-        Times of the entries since the beginning [s].
-    values : list of dict
-        Best values so far at these times, by parameter name.
-    counts : list of int
-        Number of simulated motions at these times.
-    best_loss : float
-        Sum of squared residuals of the last entry.
-    simulations : int
-        Number of simulated motions.
-    """
-
+    # Computing time when the search began [s].
     began_s: float = field(default_factory=computing_time_s)
+    # Times of the entries since the beginning [s].
     times_s: list[float] = field(default_factory=list)
+    # Best values so far at these times, by parameter name.
     values: list[dict[str, float]] = field(default_factory=list)
-    counts: list[int] = field(default_factory=list)
-    best_loss: float = np.inf
-    simulations: int = 0
+    counts: list[int] = field(default_factory=list)  # number of simulated motions at these times
+    best_loss: float = np.inf  # sum of squared residuals of the last entry
+    simulations: int = 0  # number of simulated motions
 
     @property
     def passed_s(self) -> float:
@@ -131,30 +118,14 @@ class Progress:
 
 @dataclass(frozen=True)
 class Track:
-    """Result of a candidate.
+    """Result of a candidate."""
 
-    Attributes
-    ----------
-    times_s : list of float
-        Times of the entries [s].
-    values : list of dict
-        Parameter values of the entries.
-    counts : list of int
-        Simulated motions until the entries; for interior point iterations.
-    total_s : float
-        Time until the candidate stops [s].
-    simulations : int
-        Simulated motions until the candidate stops.
-    has_ended : bool
-        False: the candidate was stopped at the limit of computing time.
-    """
-
-    times_s: list[float]
-    values: list[dict[str, float]]
-    counts: list[int]
-    total_s: float
-    simulations: int
-    has_ended: bool
+    times_s: list[float]  # times of the entries [s]
+    values: list[dict[str, float]]  # parameter values of the entries
+    counts: list[int]  # simulated motions until the entries; for interior point iterations
+    total_s: float  # time until the candidate stops [s]
+    simulations: int  # simulated motions until the candidate stops
+    has_ended: bool  # False: the candidate was stopped at the limit of computing time
 
 
 # Candidates ---------------------------------------------------------------------------------------
@@ -304,27 +275,14 @@ def solve_with_mujoco(
 
 @dataclass(frozen=True)
 class Candidate:
-    """Tool that identifies the parameters.
-
-    Attributes
-    ----------
-    title : str
-        Name in the table.
-    run : callable
-        Function of the experiment and a `Progress`, in which it records its search.
-    package : str or None
-        Distribution that it needs; None: none.
-    module : str or None
-        Module of the distribution, or None where both names are the same.
-    is_compiled : bool
-        True: the first run compiles code, and the second one is measured.
-    """
+    """Tool that identifies the parameters."""
 
     title: str
+    # Function of the experiment and a `Progress`, in which it records its search.
     run: Callable[[cs.Experiment, Progress], None]
-    package: str | None = None
-    module: str | None = None
-    is_compiled: bool = False
+    package: str | None = None  # distribution that it needs; None: none
+    module: str | None = None  # module of the distribution, or None where both names are the same
+    is_compiled: bool = False  # True: the first run compiles code, and the second one is measured
 
     def missing_requirement(self) -> str | None:
         """Return how to install what is missing, or None."""
@@ -443,19 +401,7 @@ def measure_in_own_process(name: str) -> Track:
 def row(
     name: str, track: Track, best: Mapping[str, float], reduced_space_s: float | None
 ) -> tuple[str, ...]:
-    """Return a row of the table.
-
-    Parameters
-    ----------
-    name : str
-        Candidate.
-    track : Track
-        Its result.
-    best : dict of str to float
-        The best answer.
-    ours_s : float or None
-        Time of this project's reduced space [s]; None: unknown.
-    """
+    """Return a row of the table."""
     entry = reached_entry(track, best)
     reached_s = None if entry is None else track.times_s[entry]
     ratio = reached_s / reduced_space_s if reached_s and reduced_space_s else None
@@ -474,17 +420,7 @@ def row(
 def table(
     tracks: Mapping[str, Track], failures: Mapping[str, str], best: Mapping[str, float]
 ) -> str:
-    """Return the results as a Markdown table.
-
-    Parameters
-    ----------
-    tracks : dict of str to Track
-        Results by candidate.
-    unmeasured : dict of str to str
-        Reason by candidate, for those without a result.
-    best : dict of str to float
-        The best answer.
-    """
+    """Return the results as a Markdown table."""
     heads = (
         "candidate",
         "time to 1 % over that of this project",
@@ -521,15 +457,7 @@ def report(
 
 
 def compare(names: list[str], out: Path | None) -> None:
-    """Run candidates one after the other, and print the table after each.
-
-    Parameters
-    ----------
-    names : list of str
-        Candidates.
-    out : path or None
-        File for the table, whose folder is created; None: only print.
-    """
+    """Run candidates one after the other, and print the table after each."""
     best = measure_in_own_process(BEST).values[-1]
     tracks = {}
     failures = {}

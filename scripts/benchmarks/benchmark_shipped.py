@@ -45,17 +45,7 @@ def problem_file(name: str) -> Path:
 
 
 def measure(name: str, cases: tuple[str, ...], max_time_s: float) -> None:
-    """Solve a shipped problem by reduced space and in each of the cases, and print the results.
-
-    Parameters
-    ----------
-    name : str
-        Name below `problems`, see `problem_file`.
-    cases : tuple of str
-        Some of `CASES`.
-    max_time_s : float
-        Wall time after which interior point ends [s].
-    """
+    """Solve a shipped problem by reduced space and in each of the cases, and print the results."""
     problem = Problem.read(problem_file(name))
     began_s = time.process_time()
     reference = solve(problem, ReducedSpace())

@@ -68,15 +68,7 @@ def main() -> None:
 
 
 def time_command(arguments: list[str], cache: str) -> WaitingTimes:
-    """Run a command on a pseudo-terminal, and return its times.
-
-    Parameters
-    ----------
-    arguments : list of str
-        Arguments of the command line.
-    cache : str
-        Folder of compiled kernels.
-    """
+    """Run a command on a pseudo-terminal, and return its times."""
     own_terminal, command_terminal = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": cache, "TERM": "xterm"}
     before = os.times()

@@ -36,29 +36,7 @@ def simulate_flex(
     step_s: float = MUJOCO_STEP_S,
     integrator: str = "Euler",
 ) -> Array:
-    """Simulate the cylinder by MuJoCo.
-
-    Parameters
-    ----------
-    mesh : TetMesh
-        The cylinder.
-    values : dict of str to float
-        Values of the parameters of `peer_case.TRUTH`.
-    step_s : float
-        Time step [s].
-    integrator : {"Euler", "discrete"}
-        MuJoCo's integrator after the body has settled: explicit or implicit for the flex.
-
-    Returns
-    -------
-    positions_m : (T, n, 3) array
-        Positions of the nodes at the samples [m].
-
-    Raises
-    ------
-    UnstableSimulationError
-        If MuJoCo warns of bad positions, velocities or accelerations.
-    """
+    """Simulate the cylinder by MuJoCo."""
     mujoco: Any = import_module("mujoco")
     # Without this, MuJoCo writes its warnings to a file in the current folder.
     mujoco.set_mju_user_warning(lambda _: None)

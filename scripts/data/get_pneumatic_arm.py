@@ -60,28 +60,18 @@ RAMP_S = 1e-3
 
 @dataclass(frozen=True)
 class ArmShape:
-    """Dimensions of the arm [m]; those without a source are assumptions.
+    """Dimensions of the arm [m]; those without a source are assumptions."""
 
-    Attributes
-    ----------
-    radius_m, length_m, cross_m : float
-        Radius and length of the arm and thickness of the cross between its four chambers, from the
-        simplified geometries of the authors.
-    wall_m : float
-        Thickness of the outer wall, not documented; chosen such that the static travels at all six
-        pressures are about those measured.
-    cap_m : float
-        Thickness of the closed end at the tip, not documented.
-    layers : int
-        Layers of elements along the chambers.
-    """
-
+    # Radius and length of the arm and thickness of the cross between its four chambers, from the
+    # simplified geometries of the authors.
     radius_m: float = 0.0222
     length_m: float = 0.100
     cross_m: float = 0.0044
+    # Thickness of the outer wall, not documented; chosen such that the static travels at all six
+    # pressures are about those measured.
     wall_m: float = 0.0037
-    cap_m: float = 0.006
-    layers: int = 3
+    cap_m: float = 0.006  # thickness of the closed end at the tip, not documented
+    layers: int = 3  # layers of elements along the chambers
 
 
 def main() -> None:

@@ -120,13 +120,6 @@ def aligned_rotation(normals: Array, rotation: Array) -> Array:
 def bar(motion: np.ndarray, refinement: int = 2) -> TetMesh:
     """Return the mesh of the bar: 30 mm square between heads of 60 mm, of which one is in the
     clamp.
-
-    Parameters
-    ----------
-    motion : (4, 4) array
-        Pose of the object.
-    refinement : int
-        Number of bricks along 30 mm.
     """
     bricks = 6 * refinement, 4, refinement
     grid = box_mesh((6.0, 2.0, 1.0), bricks)

@@ -87,23 +87,7 @@ def tension(folder: Path) -> None:
 def write_bench_table(
     folder: Path, header: str, t_s: Array, displacement_column: Array, noise: float, scale: float
 ) -> None:
-    """Write the table of a test bench, with simulated forces or stresses.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the problem.
-    header : str
-        Header of the table.
-    t_s : (T,) array
-        Times [s].
-    displacement_column : (T,) array
-        Column of displacements or strains.
-    noise : float
-        Standard deviation of the third column, in its unit.
-    scale : float
-        Value of the third column over the reaction of the modelled part [N].
-    """
+    """Write the table of a test bench, with simulated forces or stresses."""
     file = folder / "run_1.csv"
 
     def write(measured: Array) -> None:

@@ -72,15 +72,6 @@ def swing(
 def prepare_experiment(problem: Path, poses: str, logged: PoseSequence) -> Experiment:
     """Write the poses, delete old marker tracks, and return the experiment at the times of the
     poses.
-
-    Parameters
-    ----------
-    problem : Path
-        Problem file; the files of poses and tracks are in its folder.
-    poses : str
-        Name of the file of poses.
-    logged : PoseSequence
-        Poses that the robot logs.
     """
     write_poses_csv(problem.parent / poses, logged)
     for tracks in problem.parent.glob("*_markers.csv"):

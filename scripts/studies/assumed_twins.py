@@ -48,15 +48,8 @@ def with_wrong_assumptions(
 ) -> Experiment:
     """Return the experiment with the marker tracks of a body that deviates from the assumptions.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        With one grasp, and with markers at nodes.
-    values : mapping of parameter name to true value
-        With the elastic constants E and ν.
-    errors : mapping of assumption to its error
-        In the unit of the assumption. Errors of the air are shares of the forces of the air in the
-        model; an assumption that is absent is correct.
+    `errors` are in the units of the assumptions; those of the air are shares of the forces of the air
+    in the model, and an assumption that is absent is correct.
     """
     body = _body(experiment, values, errors)
     (grasp,) = experiment.grasps

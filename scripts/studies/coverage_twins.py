@@ -72,37 +72,17 @@ CASES = (
 
 @dataclass(frozen=True, eq=False)
 class CoverageOutcome:
-    """Results of one twin, by error model (K of `ERROR_MODELS`).
+    """Results of one twin, by error model (K of `ERROR_MODELS`)."""
 
-    Attributes
-    ----------
-    converged : bool
-        Whether the solve converged.
-    contains_truth : (K, 6)
-        Whether the intervals of `QUANTITIES` contain the true value; NaN without interval.
-    scores : (K, 4)
-        Errors of the logarithms, divided by their standard errors.
-    correlated : (K,) bool
-        Whether the standard errors are those of correlated errors.
-    """
-
-    converged: bool
+    converged: bool  # whether the solve converged
+    # (K, 6): whether the intervals of `QUANTITIES` contain the true value; NaN without interval.
     contains_truth: Array
-    scores: Array
-    correlated: Array
+    scores: Array  # (K, 4): errors of the logarithms, divided by their standard errors
+    correlated: Array  # (K,): whether the standard errors are those of correlated errors
 
 
 def run(case: TwinKind, sigma_m: float, seed: Sequence[int]) -> CoverageOutcome:
-    """Draw a twin, identify it, and compare the answer with the truth.
-
-    Parameters
-    ----------
-    case : TwinKind
-    sigma_m : float
-        Standard deviation of the noise [m].
-    seed : sequence of int
-        Seed of the noise and of the nuisance parameters.
-    """
+    """Draw a twin, identify it, and compare the answer with the truth."""
     experiment, x = reference(sigma_m)
     rng = np.random.default_rng(seed)
     collocation = twin(experiment, x, case, sigma_m, rng)

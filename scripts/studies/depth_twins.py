@@ -117,18 +117,7 @@ def _experiment(times_s: Array, clamp: PoseSequence, depth: Depth) -> Experiment
 
 
 def _problem(times_s: Array, clamp: PoseSequence, image_samples: Index, seed: int) -> Problem:
-    """Return the problem of one twin.
-
-    Parameters
-    ----------
-    times_s : (T,) array
-        Samples [s].
-    clamp : PoseSequence
-    image_samples : (S,) array of int
-        Indices of the samples that have an image.
-    seed : int
-        Of noise and pose error.
-    """
+    """Return the problem of one twin."""
     rng = np.random.default_rng(seed)
     images_m = np.array(_images_m(tuple(times_s), tuple(image_samples))) + NOISE_M * rng.normal(
         size=(len(image_samples), *SHAPE_PX)

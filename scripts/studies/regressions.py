@@ -24,33 +24,18 @@ UNUSED = {"young_pa": 1e-3, "poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """One regression with P parameters, S observations, and V predictors.
-
-    Attributes
-    ----------
-    name, difficulty : str
-    formula : str
-        f(x; b) in Python, of exp, cos, sin, arctan, pi, the predictors and b1, b2, …
-    x : (S, V) array
-    y : (S,) array
-        Response; the logarithm of the measured one where the model states that.
-    starts : (2, P) array
-        Official starting values.
-    values, errors : (P,) arrays
-        Certified values and standard errors.
-    squares : float
-        Certified residual sum of squares.
-    """
+    """One regression with P parameters, S observations, and V predictors."""
 
     name: str
     difficulty: str
-    formula: str
-    x: Array
-    y: Array
-    starts: Array
+    formula: str  # f(x; b) in Python, of exp, cos, sin, arctan, pi, the predictors and b1, b2, …
+    x: Array  # (S, V)
+    y: Array  # (S,): response; the logarithm of the measured one where the model states that
+    starts: Array  # (2, P): official starting values
+    # (P,): certified values and standard errors.
     values: Array
     errors: Array
-    squares: float
+    squares: float  # certified residual sum of squares
 
     @property
     def names(self) -> list[str]:

@@ -43,21 +43,12 @@ GRACE_S = 60.0
 
 @dataclass(frozen=True)
 class Variant:
-    """Method with options.
-
-    Attributes
-    ----------
-    name : str
-        Name in tables.
-    method : str
-    options : mapping, as in the method's table of a problem file
-    share : float
-        Share of the initial guesses from which the method is run, for methods that are slow.
-    """
+    """Method with options."""
 
     name: str
     method: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    # Share of the initial guesses from which the method is run, for methods that are slow.
     share: float = 1.0
 
     @property
@@ -85,20 +76,11 @@ def run_variants(
     time_s: float = 60.0,
     workers: int = 2,
 ) -> dict[str, list[Row]]:
-    """Run all variants, and return the rows of each by its name.
+    """Run all variants of the method of a problem file, and return the rows of each by its name.
 
-    Parameters
-    ----------
-    path : Path
-        A problem file.
-    variants : sequence of Variant
-    folder : Path
-        Folder of the records; runs that are finished there are not repeated.
-    starts : int
-        Number of initial guesses, log-uniform within a factor `spread` of the truth and equal for
-        all variants; 0 means only the guess of the file.
-    time_s : float
-        Time limit of a run [s]; a run that does not end is killed `GRACE_S` later.
+    `starts` initial guesses, equal for all variants, are log-uniform within a factor `spread` of the
+    truth; 0 means only the guess of the file. Runs whose records are in the folder are not repeated; a
+    run that does not end within `time_s` [s] is killed `GRACE_S` later.
     """
     store = RunStore(folder / "runs")
     limits = RunOptions(workers=workers, time_limit_s=time_s + GRACE_S)
@@ -171,20 +153,12 @@ def run_in_processes(run: Callable[..., T], jobs: Sequence[tuple], workers: int 
 
 @dataclass
 class Coverage:
-    """Counted intervals, by name.
-
-    Attributes
-    ----------
-    twins : int
-        Number of twins.
-    contained : mapping of str to list of bool
-        Whether each interval contains the truth.
-    half_widths : mapping of str to list of float
-        Half width of each interval over the true value.
-    """
+    """Counted intervals, by name."""
 
     twins: int = 0
+    # Whether each interval contains the truth.
     contained: dict[str, list[bool]] = field(default_factory=dict)
+    # Half width of each interval over the true value.
     half_widths: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, intervals: Intervals, truth: Mapping[str, float]) -> None:

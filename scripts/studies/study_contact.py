@@ -77,23 +77,10 @@ def press(
     delta: float | None,
 ) -> tuple[float, float]:
     """Return the force [N], and the mean square distance of the pressure from the contact centre
-    [m²].
+    [m²], of an obstacle that moves by `depth_m` into a quarter of a block.
 
-    Parameters
-    ----------
-    body : Body
-        Quarter of a block, with planes of symmetry x = 0 and y = 0 and its surface at z = 0.
-    shape : Solid
-        Obstacle that touches the surface at the origin.
-    depth_m : float
-        Displacement of the obstacle into the body [m].
-    edge_m : float
-        Edge of the elements at the contact [m].
-    kappa : float or None
-        Contact stiffness in units of E over the edge; None for the default, and contact on all
-        faces.
-    delta : float or None
-        Width of the smooth onset of pressure in units of the edge; None for the default.
+    `kappa` is the contact stiffness in units of E over the edge of the elements at the contact, `delta`
+    the width of the smooth onset of pressure in units of the edge; None for the defaults.
     """
     low = body.nodes_m.min(axis=0)
     symmetry_nodes = [np.flatnonzero(np.abs(body.nodes_m[:, k] - low[k]) < 1e-9) for k in range(3)]
@@ -165,13 +152,6 @@ def sphere_at_depth(cells: int, size_m: float) -> tuple[float, int]:
 
     Stiffness, width and faces of the contact are the defaults. A block of finite size is stiffer
     than a half-space, by a share that is inversely proportional to its size.
-
-    Parameters
-    ----------
-    cells : int
-        Elements to the radius of the contact.
-    size_m : float
-        Edge of the block, in radii of the contact.
     """
     across_m = ticks(round(FINE_M * cells), FINE_M, size_m, 2.0)
     downward_m = ticks(max(1, round(FINE_M * cells / 2)), FINE_M / 2, size_m, 2.0)
@@ -209,16 +189,9 @@ def cylinder(cells: float, kappa: float = 100.0, delta: float = 0.002) -> tuple[
 
 @dataclass(frozen=True)
 class IndentationEstimates:
-    """Young's modulus of one twin with its interval, by finite elements and by Hertz's formula.
+    """Young's modulus of one twin with its interval, by finite elements and by Hertz's formula."""
 
-    Attributes
-    ----------
-    model_pa, hertz_pa : (3,)
-        E, and the lower and upper end of its 95 % interval [Pa].
-    places_held : int
-        Number of onsets of contact within two standard errors of the truth.
-    """
-
+    # (3,): E, and the lower and upper end of its 95 % interval [Pa].
     model_pa: np.ndarray
     hertz_pa: np.ndarray
     covered_onsets: int

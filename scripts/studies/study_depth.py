@@ -26,27 +26,14 @@ from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
 
 @dataclass(frozen=True)
 class SoftTwin:
-    """Results of one twin of the soft bar.
+    """Results of one twin of the soft bar."""
 
-    Attributes
-    ----------
-    young_pa : float
-        Estimate of E [Pa].
-    low_pa, high_pa : float
-        Ends of the combined interval [Pa].
-    statistical_pa : (2,) tuple of float
-        Ends of the statistical interval [Pa].
-    loss, loss_from_truth : float
-        Losses of the solves without a guess and from the true stiffness.
-    verdict : str
-    cost_s : float
-        Processor time of the run without a guess.
-    """
-
-    young_pa: float
+    young_pa: float  # estimate of E [Pa]
+    # Ends of the combined interval [Pa].
     low_pa: float
     high_pa: float
-    statistical_pa: tuple[float, float]
+    statistical_pa: tuple[float, float]  # (2,): ends of the statistical interval [Pa]
+    # Losses of the solves without a guess and from the true stiffness.
     loss: float
     loss_from_truth: float
     verdict: str

@@ -61,27 +61,15 @@ COLUMNS = ("λ", "μ", "γ_r", "γ_m", "E", "ν")
 
 @dataclass(frozen=True, eq=False)
 class FaultOutcome:
-    """Results of one twin, by quantity (`QUANTITIES`).
+    """Results of one twin, by quantity (`QUANTITIES`)."""
 
-    Attributes
-    ----------
-    converged : bool
-        Whether the solve converged.
-    contains_truth : (6,)
-        1 if the statistical interval contains the truth, 0 if not, NaN without interval.
-    combined_contains_truth : (6,)
-        As `contains_truth`, for the combined interval.
-    half_widths : (6,)
-        Half widths of the combined intervals over the true values; NaN without interval.
-    relative : (6,)
-        Standard errors over the true values; NaN without standard error.
-    """
-
-    converged: bool
+    converged: bool  # whether the solve converged
+    # (6,): 1 if the statistical interval contains the truth, 0 if not, NaN without interval.
     contains_truth: Array
-    combined_contains_truth: Array
+    combined_contains_truth: Array  # (6,): as `contains_truth`, for the combined interval
+    # (6,): half widths of the combined intervals over the true values; NaN without interval.
     half_widths: Array
-    relative: Array
+    relative: Array  # (6,): standard errors over the true values; NaN without standard error
 
 
 def main() -> None:
@@ -139,14 +127,7 @@ def positions_m() -> Array:
 
 
 def identified(experiment: Experiment, left_out: Mapping[str, None] | None = None) -> FaultOutcome:
-    """Identify an experiment with default options, starting from the truth.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    left_out : mapping of str to None, optional
-        Names of the rows that the default budget lacks; without it there is no budget.
-    """
+    """Identify an experiment with default options, starting from the truth."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
     collocation, z = solution.collocation, solution.z

@@ -45,32 +45,16 @@ RADIUS_M = 0.015
 
 @dataclass(frozen=True)
 class FieldTwin:
-    """True stiffness of a block, and the prior of the estimated field.
-
-    Attributes
-    ----------
-    name : str
-        Name in the table.
-    kind : str
-        Stiff part: "half", "ball" or "none".
-    ratio : float
-        Stiffness of the stiff part over that of the rest.
-    length_m : float or tuple of float
-        Correlation length of the prior [m]; of several lengths the data select one.
-    modes : int
-        Number of shapes of the field.
-    amplitude : float
-        Standard deviation of the logarithm of stiffness in the prior.
-    markers, steps : int
-        Numbers of markers and of samples.
-    """
+    """True stiffness of a block, and the prior of the estimated field."""
 
     name: str
-    kind: str
-    ratio: float
+    kind: str  # stiff part: "half", "ball" or "none"
+    ratio: float  # stiffness of the stiff part over that of the rest
+    # Correlation length of the prior [m]; of several lengths the data select one.
     length_m: float | tuple[float, ...] = 0.04
-    modes: int = 40
-    amplitude: float = 0.5
+    modes: int = 40  # number of shapes of the field
+    amplitude: float = 0.5  # standard deviation of the logarithm of stiffness in the prior
+    # Numbers of markers and of samples.
     markers: int = 48
     steps: int = 40
 
@@ -140,22 +124,12 @@ TWINS = (
 
 @dataclass(frozen=True)
 class FieldAnswer:
-    """Estimated field of one twin.
-
-    Attributes
-    ----------
-    field : FieldEstimate
-    truth : (cells,)
-        Logarithm of the true E [Pa].
-    mesh : TetMesh
-    processor_time_s : float
-        Processor time of the solve [s].
-    """
+    """Estimated field of one twin."""
 
     field: FieldEstimate
-    truth: Array
+    truth: Array  # logarithm of the true E [Pa]
     mesh: cs.TetMesh
-    processor_time_s: float
+    processor_time_s: float  # processor time of the solve [s]
 
 
 def identify(twin: FieldTwin, seed: int) -> FieldAnswer:

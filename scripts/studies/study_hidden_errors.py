@@ -58,26 +58,14 @@ FIBRES = 0.3
 
 @dataclass(frozen=True)
 class HiddenError:
-    """Real recording and its description.
+    """Real recording and its description."""
 
-    Attributes
-    ----------
-    actual : Experiment
-        Simulated experiment.
-    described : Experiment
-        Experiment that is fitted, with the markers at the same places.
-    more_constants : mapping
-        Constants of the simulated body beside `TRUTH`.
-    assumptions : Assumptions
-        Assumptions of the budget.
-    recorded : function of an array (T, M, 3)
-        Returns the recorded tracks from those with noise [m].
-    """
-
-    actual: cs.Experiment
-    described: cs.Experiment
+    actual: cs.Experiment  # simulated experiment
+    described: cs.Experiment  # experiment that is fitted, with the markers at the same places
+    # Constants of the simulated body beside `TRUTH`.
     more_constants: Mapping[str, float] = field(default_factory=dict)
     assumptions: cs.Assumptions = field(default_factory=cs.Assumptions)
+    # Returns the recorded tracks (T, M, 3) from those with noise [m].
     recorded: Callable[[np.ndarray], np.ndarray] = field(default=lambda tracks_m: tracks_m)
 
 
@@ -302,23 +290,12 @@ ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """Fit of one twin.
+    """Fit of one twin."""
 
-    Attributes
-    ----------
-    young_ratio : float
-        Estimated over true Young's modulus.
-    contains_truth : bool
-        Whether the combined interval contains the true modulus.
-    verdict : str
-    cause : str
-        Beginning of the first reason.
-    """
-
-    young_ratio: float
-    contains_truth: bool
+    young_ratio: float  # estimated over true Young's modulus
+    contains_truth: bool  # whether the combined interval contains the true modulus
     verdict: str
-    cause: str
+    cause: str  # beginning of the first reason
 
 
 def twin(name: str, seed: int, parameters: Mapping[str, cs.Unknown] = UNKNOWN) -> cs.Problem:

@@ -36,21 +36,12 @@ ALL_TESTS = ("uniaxial", "equibiaxial", "planar", "biaxial")
 
 @dataclass(frozen=True)
 class Law:
-    """Material law with the parameters of its fit.
-
-    Attributes
-    ----------
-    name : str
-        Name for the tables.
-    material : str
-        Name of the material law.
-    parameters : dict
-        Constants that are estimated, with guesses where the scan of the stiffness gives none, and
-        constants that are fixed.
-    """
+    """Material law with the parameters of its fit."""
 
     name: str
     material: str
+    # Constants that are estimated, with guesses where the scan of the stiffness gives none, and
+    # constants that are fixed.
     parameters: dict[str, cs.Unknown | float]
 
     @property
@@ -168,15 +159,6 @@ def rms_kpa(
     """Return the root mean square error of predicted stresses [kPa], or "unstable".
 
     "unstable" means that the constants allow no stable equilibrium in one of the experiments.
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-        Experiments of specimens.
-    constants : dict
-        Values of all parameters.
-    is_counted : callable
-        Whether samples (T,) count, from the larger stretch (T,).
     """
     residuals_pa = []
     for experiment in experiments:

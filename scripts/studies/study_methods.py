@@ -90,23 +90,16 @@ integrator = "scheme"
 
 @dataclass(frozen=True)
 class MethodScore:
-    """Successes and times of a method.
-
-    Attributes
-    ----------
-    runs, successes, converged, misled : int
-        Numbers of runs, of successes, of runs that report convergence, and of runs that report
-        convergence at wrong parameters.
-    time_s : float
-        Median time of all runs, including those that were stopped [s].
-    """
+    """Successes and times of a method."""
 
     name: str
+    # Numbers of runs, of successes, of runs that report convergence, and of runs that report
+    # convergence at wrong parameters.
     runs: int
     successes: int
     converged: int
     misled: int
-    time_s: float
+    time_s: float  # median time of all runs, including those that were stopped [s]
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -144,16 +137,6 @@ def main() -> None:
 def write_problem(folder: Path, layers: int, steps: int, step_s: float) -> Path:
     """Write the problem of a swung cylinder with exact tracks of the midpoint rule; return its
     path.
-
-    Parameters
-    ----------
-    folder : Path
-    layers : int
-        Layers of elements.
-    steps : int
-        Number of samples.
-    step_s : float
-        Sampling interval [s].
     """
     folder.mkdir(parents=True, exist_ok=True)
     mesh = cylinder_mesh(RADIUS_M, HEIGHT_M, rings=1, layers=layers)

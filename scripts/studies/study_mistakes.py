@@ -47,52 +47,28 @@ SHOWN_CAUSES = 2
 
 @dataclass(frozen=True)
 class ProblemFamily:
-    """Correct problems of one kind, and the mistakes that are made in them.
+    """Correct problems of one kind, and the mistakes that are made in them."""
 
-    Attributes
-    ----------
-    group, name : str
-        The group that `--groups` selects, and the name of the kind.
-    make : callable
-        Returns the correct problem of a seed.
-    faults : mapping of name to Fault
-    parameter : str
-        Estimated parameter that is compared with the truth.
-    truth : float
-        Its true value.
-    """
-
+    # The group that `--groups` selects, and the name of the kind.
     group: str
     name: str
-    make: Callable[[int], Problem]
+    make: Callable[[int], Problem]  # returns the correct problem of a seed
     faults: Mapping[str, Fault]
-    parameter: str
+    parameter: str  # estimated parameter that is compared with the truth
     truth: float
 
 
 @dataclass(frozen=True)
 class MistakeRow:
-    """One row of the table.
-
-    Attributes
-    ----------
-    name : str
-    checked, solved : str
-        Reports of `check` and of `solve`; the second is empty if the problem was not solved.
-    is_right : bool
-        Whether the problem has no mistake.
-    is_reported : bool
-        Whether `check` names a cause, or refuses the problem.
-    is_good : bool
-        Whether `solve` rates the answer "good".
-    """
+    """One row of the table."""
 
     name: str
+    # Reports of `check` and of `solve`; the second is empty if the problem was not solved.
     checked: str
     solved: str
     is_correct: bool
-    is_reported: bool
-    is_good: bool
+    is_reported: bool  # whether `check` names a cause, or refuses the problem
+    is_good: bool  # whether `solve` rates the answer "good"
 
 
 @dataclass(frozen=True)
@@ -211,20 +187,7 @@ def families(body: str, samples: int) -> list[ProblemFamily]:
 def table_rows(
     kinds: Sequence[ProblemFamily], *, groups: Sequence[str], seeds: int, only: str, is_solved: bool
 ) -> Iterator[MistakeRow]:
-    """Yield the rows of all correct problems, then those of all mistakes.
-
-    Parameters
-    ----------
-    kinds : sequence of Family
-    groups : sequence of str
-        Groups of the families that are included.
-    seeds : int
-        Number of correct problems of each kind.
-    only : str
-        Text that the names of the rows contain.
-    is_solved : bool
-        Whether the problems are solved.
-    """
+    """Yield the rows of all correct problems, then those of all mistakes."""
     chosen = [family for family in kinds if family.group in groups]
     for family in chosen:
         for seed in range(1, seeds + 1):
@@ -240,19 +203,7 @@ def table_rows(
 def table_row(
     name: str, family: ProblemFamily, fault: Fault | None, seed: int, *, is_solved: bool
 ) -> MistakeRow:
-    """Return the row of a problem with a mistake, or without one (None).
-
-    Parameters
-    ----------
-    name : str
-        Name of the row.
-    family : Family
-    fault : Fault or None
-    seed : int
-        Of the correct problem.
-    is_solved : bool
-        Whether the problem is solved.
-    """
+    """Return the row of a problem with a mistake, or without one (None)."""
     described: Problem | None = None
     causes: tuple[Hypothesis, ...] = ()
     refusal = ""

@@ -233,26 +233,14 @@ def smooth(t_s: Array, duration_s: float) -> Array:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Task, and the hand that would do it if the body were rigid.
-
-    Attributes
-    ----------
-    task : Task
-        The task.
-    tip : callable
-        Displacement (T, 3) of the tip from its place before the motion, by the share of the way.
-    hand : callable
-        Coordinates (T, 6) of the rigid hand, by the share of the way.
-    from_s : float
-        Time from which the tip is compared with its reference [s].
-    lead_s : float
-        Time for which the planned hand may move before the tip does, and after it [s].
-    """
+    """Task, and the hand that would do it if the body were rigid."""
 
     task: Task
+    # Displacement (T, 3) of the tip from its place before the motion, by the share of the way.
     tip: Motion
-    hand: Motion
-    from_s: float = 0.0
+    hand: Motion  # coordinates (T, 6) of the rigid hand, by the share of the way
+    from_s: float = 0.0  # time from which the tip is compared with its reference [s]
+    # Time for which the planned hand may move before the tip does, and after it [s].
     lead_s: float = 0.0
 
     @property

@@ -44,22 +44,13 @@ VARIANTS = ("statics", "shipped", *WALLS_M)
 
 @dataclass(frozen=True)
 class TravelError:
-    """Measured and predicted motion of the tip in one recording.
+    """Measured and predicted motion of the tip in one recording."""
 
-    Attributes
-    ----------
-    measured_m, predicted_m : float
-        Final travel of the tip.
-    final_m : float
-        Distance of predicted and measured tip at the end, of means over FINAL_S.
-    rms_m : float
-        RMS distance of the tip over the recording.
-    """
-
+    # Final travel of the tip.
     measured_m: float
     predicted_m: float
-    final_m: float
-    rms_m: float
+    final_m: float  # distance of predicted and measured tip at the end, of means over FINAL_S
+    rms_m: float  # RMS distance of the tip over the recording
 
 
 def main() -> None:
@@ -91,13 +82,7 @@ def print_statics() -> None:
 
 
 def static_travel_m(problem: Problem, fibre_pa: float, mbar: float) -> float:
-    """Return the static travel of the tip without memory, at the authors' modulus.
-
-    Raises
-    ------
-    SimulationError
-        If there is no stable equilibrium.
-    """
+    """Return the static travel of the tip without memory, at the authors' modulus."""
     experiment = problem.experiments[0]
     (pressure,) = experiment.pressures
     assert experiment.markers is not None
@@ -218,13 +203,7 @@ def timing_text(
 def travel_error(
     experiment: Experiment, solution: Solution, delay_s: float, log_lag: float
 ) -> TravelError:
-    """Compare a recording with a simulation at the estimates, for a delay and a lag.
-
-    Raises
-    ------
-    SimulationError
-        If the body cannot be simulated.
-    """
+    """Compare a recording with a simulation at the estimates, for a delay and a lag."""
     (pressure,) = experiment.pressures
     assert pressure.t_s is not None
     shifted_pressure = replace(

@@ -31,33 +31,15 @@ GUESS_SHARE = 0.8
 
 @dataclass(frozen=True)
 class SpecimenCase:
-    """Tests of one material.
-
-    Attributes
-    ----------
-    name : str
-        Name in the table.
-    material : str
-        Name of the material law.
-    truth : mapping
-        True constants.
-    free : tuple of str
-        Names of the constants that are estimated.
-    tests : tuple of str
-        Kinds of deformation.
-    strains : tuple of float
-        First and last strain of each test.
-    has_lateral : bool
-        Whether the lateral stretch is measured.
-    """
+    """Tests of one material."""
 
     name: str
     material: str
     truth: Mapping[str, float]
-    free: tuple[str, ...]
+    free: tuple[str, ...]  # names of the constants that are estimated
     tests: tuple[str, ...]
-    strains: tuple[float, float]
-    has_lateral: bool = False
+    strains: tuple[float, float]  # first and last strain of each test
+    has_lateral: bool = False  # whether the lateral stretch is measured
 
 
 CASES = (

@@ -61,51 +61,26 @@ SOLVED_STATUSES = ("converged", "acceptable")
 
 @dataclass(frozen=True, eq=False)
 class SwungBody:
-    """Recording of a swung body, and its true parameters.
-
-    Attributes
-    ----------
-    experiment : Experiment
-    truth : mapping
-        True constants.
-    scheme : str
-        Scheme of simulation and fit.
-    noise_m : float
-        Standard deviation of each marker coordinate [m], which is also the stated one.
-    """
+    """Recording of a swung body, and its true parameters."""
 
     experiment: Experiment
     truth: Mapping[str, float]
-    scheme: str = "midpoint"
+    scheme: str = "midpoint"  # scheme of simulation and fit
+    # Standard deviation of each marker coordinate [m], which is also the stated one.
     noise_m: float = SIGMA_M
 
 
 @dataclass(frozen=True)
 class StartOutcome:
-    """Result of one start, compared with the best answer of all starts.
+    """Result of one start, compared with the best answer of all starts."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the start, from 0 on; without a guess the seed of the noise.
-    status : str
-        Status of the solve; "refused" if the problem was rejected.
-    sweeps : float
-        Factorisations divided by the number of time steps.
-    loss : float
-    estimates : tuple of float
-        NaN without one.
-    message : str
-    success, same_fit : bool
-        Whether the start succeeds, and only because its fit is equally good.
-    """
-
-    number: int
-    status: str
-    sweeps: float
+    number: int  # number of the start, from 0 on; without a guess the seed of the noise
+    status: str  # status of the solve; "refused" if the problem was rejected
+    sweeps: float  # factorisations divided by the number of time steps
     loss: float
-    estimates: tuple[float, ...]
+    estimates: tuple[float, ...]  # NaN without one
     message: str
+    # Whether the start succeeds, and only because its fit is equally good.
     success: bool = False
     same_fit: bool = False
 
@@ -269,13 +244,7 @@ def guesses(
 
 
 def study(case: SwungBody, starts: NDArray[np.float64]) -> list[StartOutcome]:
-    """Solve from the truth and from every start (S, p), and compare with the best answer.
-
-    Raises
-    ------
-    SystemExit
-        If the solve from the truth does not converge.
-    """
+    """Solve from the truth and from every start (S, p), and compare with the best answer."""
     best = solve(problem_of(case, np.array(list(case.truth.values()))))
     if not best.status.converged:
         raise SystemExit(f"from the truth: {best.message}")

@@ -53,28 +53,14 @@ DAMPING = {"gamma_r_s": 0.01, "gamma_m_1_s": 2.0}
 
 @dataclass(frozen=True)
 class VerdictOutcome:
-    """Verdict on one twin, and the largest error of its parameters.
+    """Verdict on one twin, and the largest error of its parameters."""
 
-    Attributes
-    ----------
-    fault : str
-        "none", or a key of `FAULTS`.
-    seed : int
-    verdict : str
-        "refused" if the problem is rejected before it is solved.
-    reasons : tuple of str
-    worst_errors : float or None
-        Largest error, in standard errors; None without estimates.
-    worst : str or None
-        Name of the parameter with this error.
-    """
-
-    fault: str
+    fault: str  # "none", or a key of `FAULTS`
     seed: int
-    verdict: str
+    verdict: str  # "refused" if the problem is rejected before it is solved
     reasons: tuple[str, ...]
-    worst_errors: float | None
-    worst: str | None
+    worst_errors: float | None  # largest error, in standard errors; None without estimates
+    worst: str | None  # name of the parameter with this error
 
     @property
     def is_right(self) -> bool:

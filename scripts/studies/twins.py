@@ -69,23 +69,7 @@ def twin(
     integrator: str = "newmark",
     substeps: int | Literal["auto"] = "auto",
 ) -> Problem:
-    """Return the correct problem of a simulated recording with noise.
-
-    Parameters
-    ----------
-    name : str
-        Body, a key of `BODIES`.
-    truth : dict
-        True constants, such as `SOFT`.
-    seed : int
-        Seed of motion, markers and noise.
-    samples : int
-        Number of samples.
-    integrator : str
-        Integration scheme of the simulation.
-    substeps : int or "auto"
-        Time steps per sample; "auto" takes as many as the accuracy requires.
-    """
+    """Return the correct problem of a simulated recording with noise."""
     rng = np.random.default_rng(seed)
     size_m, divisions = BODIES[name]
     body = block(size_m, divisions)

@@ -27,17 +27,10 @@ SLIP_M = (0.005, 0.02)
 
 @dataclass(frozen=True)
 class Fault:
-    """Error in a description, and the codes of the hypotheses that name it correctly.
+    """Error in a description, and the codes of the hypotheses that name it correctly."""
 
-    Attributes
-    ----------
-    change : function of an experiment and a random generator
-        Returns the experiment with the error in its description.
-    causes : tuple of str
-        Codes of the correct hypotheses; empty if no hypothesis names this error.
-    """
-
-    change: ExperimentChange
+    change: ExperimentChange  # returns the experiment with the error in its description
+    # Codes of the correct hypotheses; empty if no hypothesis names this error.
     causes: tuple[str, ...]
 
     def __call__(self, problem: Problem, rng: Rng) -> Problem:

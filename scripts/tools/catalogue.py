@@ -46,16 +46,10 @@ this repository unless their problem is in `collocation_sysid/datasets`.
 
 @dataclass(frozen=True)
 class QuantileRange:
-    """Quantiles and extremes of a quantity over a body and its samples.
+    """Quantiles and extremes of a quantity over a body and its samples."""
 
-    Attributes
-    ----------
-    low, high : float
-        5 % quantile of the smallest value at each point, and 95 % quantile of the largest.
-    minimum, maximum : float
-    """
-
-    low: float
+    low: float  # 5 % quantile of the smallest value at each point, and 95 % quantile of the largest
+    # 5 % quantile of the smallest value at each point, and 95 % quantile of the largest.
     high: float
     minimum: float
     maximum: float
@@ -63,79 +57,41 @@ class QuantileRange:
 
 @dataclass(frozen=True)
 class IdentifiedConstant:
-    """One constant of a body, as an entry of the catalogue.
+    """One constant of a body, as an entry of the catalogue."""
 
-    Attributes
-    ----------
-    name : str
-        Name in problem files, with its unit.
-    unit : str
-        Unit of the values; "1" for ratios.
-    combined95 : (lower, upper) or None
-        Combined 95 % interval; None if the constant was stated, or has no interval.
-    is_stated : bool
-        Whether the constant was stated in the problem, not estimated.
-    is_derived : bool
-        Whether the constant follows from the parameters, such as Young's modulus at small strain.
-    reason : str or None
-        Why an estimated constant has no interval.
-    true_value : float or None
-        Value with which a recording was simulated; None for measured data.
-    """
-
-    name: str
-    unit: str
+    name: str  # name in problem files, with its unit
+    unit: str  # unit of the values; "1" for ratios
     value: float
+    # Combined 95 % interval; None if the constant was stated, or has no interval.
     combined95: tuple[float, float] | None
-    is_stated: bool
+    is_stated: bool  # whether the constant was stated in the problem, not estimated
+    # Whether the constant follows from the parameters, such as Young's modulus at small strain.
     is_derived: bool
-    reason: str | None
-    true_value: float | None
+    reason: str | None  # why an estimated constant has no interval
+    true_value: float | None  # value with which a recording was simulated; None for measured data
 
 
 @dataclass(frozen=True)
 class CatalogueEntry:
-    """One identified material.
+    """One identified material."""
 
-    Attributes
-    ----------
-    name, problem, specimen, source, licence : str
-        See `CatalogueSource`.
-    is_measured : bool
-    law : tuple of str
-        Material law of each region, with the number of memory branches.
-    damping : tuple of str
-        Damping law of each region; empty if every recording is static.
-    constants : tuple of IdentifiedConstant
-        Parameters, then derived moduli.
-    stretch : QuantileRange
-        Principal stretches.
-    strain_rate_1_s : QuantileRange or None
-        Magnitude of the principal rates of Green's strain [1/s]; None for equilibria without times.
-    verdict : str
-        "good", "check" or "doubtful".
-    reasons : tuple of str
-        Reasons of the verdict.
-    recordings : tuple of str
-        Names of the fitted recordings.
-    version, problem_sha256 : str
-        Version of the program and checksum of the problem file.
-    """
-
+    # See `CatalogueSource`.
     name: str
     problem: str
     specimen: str
     source: str
     licence: str
     is_measured: bool
-    law: tuple[str, ...]
-    damping: tuple[str, ...]
-    constants: tuple[IdentifiedConstant, ...]
-    stretch: QuantileRange
+    law: tuple[str, ...]  # material law of each region, with the number of memory branches
+    damping: tuple[str, ...]  # damping law of each region; empty if every recording is static
+    constants: tuple[IdentifiedConstant, ...]  # parameters, then derived moduli
+    stretch: QuantileRange  # principal stretches
+    # Magnitude of the principal rates of Green's strain [1/s]; None for equilibria without times.
     strain_rate_1_s: QuantileRange | None
-    verdict: str
-    reasons: tuple[str, ...]
-    recordings: tuple[str, ...]
+    verdict: str  # "good", "check" or "doubtful"
+    reasons: tuple[str, ...]  # reasons of the verdict
+    recordings: tuple[str, ...]  # names of the fitted recordings
+    # Version of the program and checksum of the problem file.
     version: str
     problem_sha256: str
 

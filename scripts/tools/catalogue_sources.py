@@ -10,37 +10,20 @@ ROOT = Path(__file__).parents[2]
 
 @dataclass(frozen=True)
 class CatalogueSource:
-    """One problem of the catalogue.
+    """One problem of the catalogue."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the entry, unique.
-    problem : str
-        Problem file, relative to the repository.
-    specimen : str
-        The recorded body and its test, in words.
-    source : str
-        Who recorded or simulated the data, and where they are published.
-    licence : str
-        Licence of the recordings.
-    twin_script : str
-        Module of `scripts/data` that simulated the recordings and has their constants as `TRUTH`;
-        empty for measured data.
-    static_times_are_recorded : bool
-        Whether the samples of a static recording have the times of the test, so that a strain rate
-        follows from them.
-    is_long : bool
-        Whether the solve takes longer than ten minutes, so that it is left out by default.
-    """
-
-    name: str
-    problem: str
-    specimen: str
-    source: str
-    licence: str
+    name: str  # name of the entry, unique
+    problem: str  # problem file, relative to the repository
+    specimen: str  # the recorded body and its test, in words
+    source: str  # who recorded or simulated the data, and where they are published
+    licence: str  # licence of the recordings
+    # Module of `scripts/data` that simulated the recordings and has their constants as `TRUTH`;
+    # empty for measured data.
     twin_script: str = ""
+    # Whether the samples of a static recording have the times of the test, so that a strain rate
+    # follows from them.
     static_times_are_recorded: bool = False
+    # Whether the solve takes longer than ten minutes, so that it is left out by default.
     is_long: bool = False
 
     @property

@@ -116,17 +116,6 @@ def run(
 ) -> CommandEnd:
     """Run the command line to its end or the limit in a fork of this process, whose modules are
     imported already; it is killed at `WAITING_FACTOR` times the limit.
-
-    Parameters
-    ----------
-    words : sequence
-        Arguments of the command line, without the program.
-    folder : Path
-        Working directory.
-    limit_s : float
-        Limit of processor time [s].
-    before : callable, optional
-        Called in the fork, before the command.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         sys.stdout.flush()
@@ -195,13 +184,7 @@ def _wait(child: int, limit_s: float) -> int | None:
 
 
 def in_fork(work: Callable[[], object]) -> None:
-    """Call a function in a fork, so that its threads do not exist in this process.
-
-    Raises
-    ------
-    RuntimeError
-        If the function fails.
-    """
+    """Call a function in a fork, so that its threads do not exist in this process."""
     child = os.fork()
     if child == 0:
         try:
@@ -284,37 +267,12 @@ DAMAGES = (_truncated, _replaced, _with_gap, _repeated, _zeros, _largest, _with_
 # Changes within the format ------------------------------------------------------------------------
 
 # Values in place of those of a TOML file, cells in place of those of a table, and JSON values.
-TOML_VALUES = (
-    "true",
-    "-1",
-    "0",
-    "1e300",
-    "1e-300",
-    "nan",
-    "inf",
-    "-0.5",
-    "3.7",
-    "10",
-    "1000000000",
-)
+TOML_VALUES = ("true", "-1", "0", "1e300", "1e-300", "nan", "inf", "-0.5", "3.7", "10")
+TOML_VALUES += ("1000000000",)
 TOML_VALUES += ('""', '"x"', '"none"', '"../x.csv"', '"\\u0000"', "[]", "[1]", "[nan, 0, 0]", "{}")
 TOML_VALUES += ("[[1, 2], [3]]", "{ a = 1 }", '["a", 1]', "2024-01-01", "99999999999999999999")
-CELLS = (
-    "",
-    "x",
-    "nan",
-    "inf",
-    "-inf",
-    "1e300",
-    "-1",
-    "0",
-    "1e-300",
-    "1,5",
-    '"',
-    "0x10",
-    "1 2",
-    "é",
-)
+CELLS = ("", "x", "nan", "inf", "-inf", "1e300", "-1", "0", "1e-300", "1,5", '"', "0x10")
+CELLS += ("1 2", "é")
 JSON_VALUES: tuple[Any, ...] = (None, True, -1, 0, 1e308, float("nan"), "", "x", [], {}, [[[]]])
 JSON_VALUES += ({"a": 1}, [1, "a"], 10**30, "../x", [0.0] * 1000)
 _TOKEN = re.compile(
@@ -428,39 +386,20 @@ def changed_json(rng: Rng, content: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class FileKind:
-    """Files of one kind, and the commands that read them.
+    """Files of one kind, and the commands that read them."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the kind in the table.
-    make : callable
-        Function that adds the files to the folder of a problem.
-    file : str
-        Pattern of the file that is damaged; one is drawn if there are several.
-    commands : tuple of command lines
-        One of them is drawn for each case.
-    words : tuple of bytes
-        Words with a special meaning in the format.
-    change : callable, optional
-        Change within the format, in place of damaged bytes.
-    """
-
-    name: str
-    make: Callable[[Path], object]
-    file: str
+    name: str  # name of the kind in the table
+    make: Callable[[Path], object]  # function that adds the files to the folder of a problem
+    file: str  # pattern of the file that is damaged; one is drawn if there are several
+    # One of them is drawn for each case.
     commands: tuple[tuple[str, ...], ...] = (("check", "problem.toml"),)
-    words: tuple[bytes, ...] = ()
+    words: tuple[bytes, ...] = ()  # words with a special meaning in the format
+    # Change within the format, in place of damaged bytes.
     change: Callable[[Rng, bytes], bytes] | None = None
 
     def run(self, cases: CaseSettings) -> Counter[str]:
         """Run all cases and count the outcomes; no case if the package that reads the format is
         missing.
-
-        Raises
-        ------
-        RuntimeError
-            If a command refuses the undamaged file.
         """
         base = cases.folder / f"base_{self.name.replace(' ', '_')}"
         counts = Counter[str]()
@@ -581,19 +520,8 @@ DEFINITIONS = (
 BOTH: tuple[tuple[str, ...], ...] = (("check", "problem.toml"),)
 TOML = (b"[[[[", b"]", b'"', b"'''", b"{", b"= nan", b"= -inf", b"[a.b]", b"[[experiment]]")
 TOML += (b'"\\u001b[2J"', b"\xff", b"_", b"1e400", b"true", b'"../../etc/passwd"')
-CSV = (
-    b"\x00",
-    b"1e308",
-    b"nan",
-    b"-inf",
-    b'"',
-    b";",
-    b"\t",
-    b"\r",
-    b",,,,",
-    b"=1+1",
-    b"\xef\xbb\xbf",
-)
+CSV = (b"\x00", b"1e308", b"nan", b"-inf", b'"', b";", b"\t", b"\r", b",,,,", b"=1+1")
+CSV += (b"\xef\xbb\xbf",)
 XML = (b"&a9;", b"<!--", b"-->", b"]]>", b"<![CDATA[", b"<a>", b"</a>", b'"', *COUNTS)
 
 
@@ -701,23 +629,11 @@ FILES += (
 
 @dataclass(frozen=True)
 class CaseSettings:
-    """Settings of all kinds of cases.
+    """Settings of all kinds of cases."""
 
-    Attributes
-    ----------
-    folder : Path
-        Folder for temporary files.
-    problem : Path
-        Folder of a small problem.
-    count, seed : int
-        Number of cases of a kind, and seed of the random damage.
-    limit_s : float
-    kept : Path or None
-        Folder for the input of cases that are neither refused nor accepted.
-    """
-
-    folder: Path
-    problem: Path
+    folder: Path  # folder for temporary files
+    problem: Path  # folder of a small problem
+    # Number of cases of a kind, and seed of the random damage.
     count: int
     seed: int
     limit_s: float

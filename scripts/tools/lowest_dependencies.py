@@ -12,13 +12,7 @@ PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 
 
 def lowest_pins(requirements: list[str]) -> list[str]:
-    """Return a pin for each requirement of the form "name>=version", without its extras.
-
-    Raises
-    ------
-    ValueError
-        If a requirement states no lowest version.
-    """
+    """Return a pin for each requirement of the form "name>=version", without its extras."""
     pins = []
     for requirement in requirements:
         match = re.fullmatch(r"([\w.-]+)(?:\[.*\])?>=([\d.]+)", requirement)

@@ -19,10 +19,5 @@ def require_no_arguments(description: str | None) -> None:
 
     `--help` prints the description and ends the script; any argument ends it with a message and
     exit code 2, so that a script that writes files never runs by mistake.
-
-    Parameters
-    ----------
-    description : str or None
-        Docstring of the script.
     """
     make_parser(description).parse_args()
