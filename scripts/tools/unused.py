@@ -81,8 +81,11 @@ def find_unused(trees: dict[Path, ast.Module]) -> Iterator[str]:
     words = sum((words_of(tree) for tree in trees.values()), Counter[str]())
     public = set(collocation_sysid.__all__) | documented_words()
     for file, tree in trees.items():
+        is_table = "vars().values()" in ast.unparse(tree) or "vars().items()" in ast.unparse(tree)
         for name, node, owner in definitions(tree):
             if name.startswith("__") or name in public | CALLED:
+                continue
+            if is_table and isinstance(node, ast.Assign):
                 continue
             if file.name == "callbacks.py" and owner:
                 continue  # CasADi calls the methods
@@ -96,22 +99,35 @@ def find_unused(trees: dict[Path, ast.Module]) -> Iterator[str]:
 
 
 def calls_by_name(trees: dict[Path, ast.Module]) -> tuple[dict[str, list[ast.Call]], set[str]]:
-    """Return the calls of each name, and the names that are also passed without a call."""
+    """Return the calls of each name, those of `cls` by the name of the class, and the names that
+    are also passed without a call, of classes as arguments of functions that may construct them.
+    """
     calls = defaultdict[str, list[ast.Call]](list)
     called: set[int] = set()
     passed: set[str] = set()
+    classes = {name for tree in trees.values() for name, _, _ in definitions(tree)}
+    classes = {name for name in classes if name.lstrip("_")[:1].isupper()}
     for tree in trees.values():
+        owners = {
+            id(node): owner.name
+            for owner in tree.body
+            if isinstance(owner, ast.ClassDef)
+            for node in ast.walk(owner)
+        }
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
                 function = node.func
                 name = function.id if isinstance(function, ast.Name) else function.attr
-                calls[name].append(node)
+                calls[owners.get(id(node), name) if name == "cls" else name].append(node)
                 called.add(id(function))
+                if name not in ("isinstance", "issubclass", "cast"):
+                    arguments = [each for each in node.args if isinstance(each, ast.Name)]
+                    passed |= {each.id for each in arguments}
     for tree in trees.values():
         for node in ast.walk(tree):
             if isinstance(node, ast.Name | ast.Attribute) and id(node) not in called:
                 name = node.id if isinstance(node, ast.Name) else node.attr
-                if isinstance(node.ctx, ast.Load):
+                if isinstance(node.ctx, ast.Load) and name not in classes:
                     passed.add(name)
     return calls, passed
 
@@ -153,8 +169,9 @@ def find_single_values(trees: dict[Path, ast.Module]) -> Iterator[str]:
                 continue
             if isinstance(node, ast.ClassDef):
                 given = any(call.args or call.keywords for call in calls[name])
-                if not {"dataclass", "frozen"} <= decorators(node) or not given:
-                    continue  # a state, or a table of constants
+                is_frozen = {"dataclass", "frozen"} <= decorators(node)
+                if not is_frozen or not given or name in passed:
+                    continue  # a state, or a table of constants, or constructed elsewhere
                 parameters = [
                     (each.target.id, position)
                     for position, each in enumerate(
@@ -163,9 +180,10 @@ def find_single_values(trees: dict[Path, ast.Module]) -> Iterator[str]:
                     if isinstance(each.target, ast.Name)
                     and each.target.id not in replaced
                     and "ClassVar" not in ast.unparse(each.annotation)
+                    and not (each.value and "init=False" in ast.unparse(each.value))
                 ]
-                if node.bases:
-                    parameters = [(each, None) for each, _ in parameters]
+                if node.bases and any(call.args for call in calls[name]):
+                    continue
             elif name in passed or decorators(node) & {*REGISTERED, "property", "cached_property"}:
                 continue
             else:
