@@ -214,7 +214,7 @@ def optional_packages() -> Iterator[Extra]:
 
     Nothing is yielded without the library that compares versions.
     """
-    if not _is_importable("packaging"):
+    if not _finds_packaging():
         return
     for name in sorted(set(extra_names()) - set(DEVELOPMENT_EXTRAS)):
         packages = map(_dependency, _requirements(name))
@@ -242,12 +242,10 @@ def _requirements(extra: str) -> Iterator[Requirement]:
             yield requirement
 
 
-def _is_importable(module: str) -> bool:
-    """Return whether a module is found, without importing it; false also for one that is blocked in
-    `sys.modules`.
-    """
+def _finds_packaging() -> bool:
+    """Return whether the module is found; false also if it is blocked in `sys.modules`."""
     try:
-        return importlib.util.find_spec(module) is not None
+        return importlib.util.find_spec("packaging") is not None
     except ValueError:
         return False
 

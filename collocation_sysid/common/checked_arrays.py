@@ -148,7 +148,7 @@ def unconverted_sigma_or_none(sigma: ArrayLike | None) -> float | None:
     return cast("float | None", sigma)
 
 
-def read_only_coordinates(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
+def read_only_coordinates(values: ArrayLike, shape: tuple[int | None, ...]) -> Array:
     """Return a read-only copy of marker positions (T, M, 3), in which coordinates that are not
     finite are NaN.
 
@@ -157,7 +157,7 @@ def read_only_coordinates(values: ArrayLike, shape: tuple[int | None, ...], name
     InputError
         If the values are not numbers, or the shape differs.
     """
-    values = read_only_floats(values, shape, name=name, finite=False)
+    values = read_only_floats(values, shape, name="marker positions", finite=False)
     tracks = np.where(np.isfinite(values), values, np.nan)
     tracks.setflags(write=False)
     return tracks

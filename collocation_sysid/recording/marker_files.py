@@ -65,7 +65,7 @@ class MarkerTable:
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
-        tracks = read_only_coordinates(self.positions_m, shape, name="marker positions")
+        tracks = read_only_coordinates(self.positions_m, shape)
         vars(self)["positions_m"] = tracks
 
 

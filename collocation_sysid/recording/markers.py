@@ -118,7 +118,7 @@ class Markers(Measurement):
         `sigma_m` as an array (M,).
         """
         shape = len(self.t_s), None, 3
-        tracks = read_only_coordinates(self.positions_m, shape, name="marker positions")
+        tracks = read_only_coordinates(self.positions_m, shape)
         m = tracks.shape[1]
         if self.names is None:
             vars(self)["names"] = tuple(f"m{k}" for k in range(1, m + 1))

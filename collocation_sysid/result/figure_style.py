@@ -192,16 +192,16 @@ def format_plain_numbers(axis: Axis, form: str = "g") -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def make_log_axis(axes: Axes, least_ratio: float = 4.0) -> None:
+def make_log_axis(axes: Axes) -> None:
     """Make the y axis logarithmic, with plain numbers where these are short (from 0.001 to
     100,000).
 
-    The limits are widened to span at least the ratio `least_ratio`, so that at least two numbers
-    are shown. Data must have been drawn before.
+    The limits are widened to span at least a ratio of 4, so that at least two numbers are shown.
+    Data must have been drawn before.
     """
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    widen = max(1.0, least_ratio / (high / low)) ** 0.5
+    widen = max(1.0, 4.0 / (high / low)) ** 0.5
     axes.set_ylim(low / widen, high * widen)
     plain = low > 1e-3 and high < 1e5
     few = high / low < (1e3 if plain else 30.0)  # powers beside all else are too wide

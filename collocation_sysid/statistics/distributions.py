@@ -36,11 +36,9 @@ def chi2_isf(tail: ArrayLike, freedom: ArrayLike) -> Any:
     return chdtri(freedom, tail)
 
 
-def student_ppf(share: ArrayLike, freedom: ArrayLike) -> Any:
-    """Return the value below which Student's t with `freedom` degrees of freedom stays with
-    probability `share`.
-    """
-    return stdtrit(freedom, share)
+def student_95(freedom: ArrayLike) -> Any:
+    """Return the half width of the 95 % interval of Student's t with `freedom` degrees of freedom."""
+    return stdtrit(freedom, 0.975)
 
 
 def beta_sf(value: ArrayLike, a: ArrayLike, b: ArrayLike) -> Any:

@@ -33,7 +33,7 @@ from ..fem.laws.constants import constant_named, is_damping
 from ..model.parameters import Parameters
 from ..program.collocation import ExperimentIterate
 from ..program.linear_algebra.lapack import one_blas_thread
-from .distributions import normal_isf, student_ppf
+from .distributions import normal_isf, student_95
 from .estimates import (
     UNDETERMINED,
     Estimate,
@@ -308,7 +308,7 @@ def _error_bars(
             of_score = of_correlated
     determined = factored.fit.root @ of_score @ factored.fit.root.T
     basis = ErrorBasis(kind, used, level, dependence, unexplained, outliers)
-    return covariance, determined, student_ppf(0.975, freedom), basis
+    return covariance, determined, student_95(freedom), basis
 
 
 def _reported_covariance(
@@ -347,7 +347,7 @@ def _widen_by_scatter(
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
     factors = np.where(scatter.find_disagreements(), factors, 1.0)
-    of_few = np.maximum(quantiles, student_ppf(0.975, np.maximum(scatter.degrees_of_freedom, 1)))
+    of_few = np.maximum(quantiles, student_95(np.maximum(scatter.degrees_of_freedom, 1)))
     wide = np.where(scatter.find_disagreements(), of_few, quantiles)
     return covariance_q * np.outer(factors, factors), wide, factors * wide / quantiles
 

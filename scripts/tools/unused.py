@@ -2,9 +2,9 @@
 
     python scripts unused
 
-A name counts as referenced if it occurs anywhere in the package outside its own definition, also
-in a string. Parameters are compared over all calls of functions with the same name, so that a
-parameter of a name that is defined twice may be missed.
+A name of the package counts as referenced if it occurs anywhere in the package outside its own
+definition, also in a string. Parameters are compared over all calls of functions with the same
+name, so that a parameter of a name that is defined twice may be missed.
 """
 
 from __future__ import annotations
@@ -87,6 +87,12 @@ def find_unused(trees: dict[Path, ast.Module]) -> Iterator[str]:
                 continue
             if is_table and isinstance(node, ast.Assign):
                 continue
+            if (
+                isinstance(node, ast.AnnAssign)
+                and node.value
+                and "_method_key" in ast.unparse(node.value)
+            ):
+                continue
             if file.name == "callbacks.py" and owner:
                 continue  # CasADi calls the methods
             if isinstance(node, Definition) and decorators(node) & REGISTERED:
@@ -151,8 +157,11 @@ def values_of(calls: list[ast.Call], name: str, position: int | None) -> set[str
 
 
 def find_single_values(trees: dict[Path, ast.Module]) -> Iterator[str]:
-    """Yield a line for each parameter or field that no call sets, or that all set to one literal."""
-    calls, passed = calls_by_name(trees)
+    """Yield a line for each parameter or field that no call of the package, of scripts and of tests
+    sets, or that all set to one literal.
+    """
+    others = [*ROOT.glob("tests/**/*.py"), *ROOT.glob("scripts/**/*.py")]
+    calls, passed = calls_by_name(trees | {file: ast.parse(file.read_text()) for file in others})
     counts = Counter(
         name
         for tree in trees.values()
@@ -160,6 +169,16 @@ def find_single_values(trees: dict[Path, ast.Module]) -> Iterator[str]:
         if isinstance(node, Definition)
     )
     words = documented_words() | set(collocation_sysid.__all__)
+    classes = [
+        each for tree in trees.values() for each in tree.body if isinstance(each, ast.ClassDef)
+    ]
+    bases = {ast.unparse(base) for each in classes for base in each.bases}
+    texts = {
+        node.value
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
     replaced = {each.arg for call in calls["replace"] for each in call.keywords}
     for file, tree in trees.items():
         for name, node, owner in definitions(tree):
@@ -168,9 +187,11 @@ def find_single_values(trees: dict[Path, ast.Module]) -> Iterator[str]:
             if counts[name] > 1 or not calls[name]:
                 continue
             if isinstance(node, ast.ClassDef):
+                if name.endswith(("Options", "Tolerances")):
+                    continue
                 given = any(call.args or call.keywords for call in calls[name])
                 is_frozen = {"dataclass", "frozen"} <= decorators(node)
-                if not is_frozen or not given or name in passed:
+                if not is_frozen or not given or name in passed | bases:
                     continue  # a state, or a table of constants, or constructed elsewhere
                 parameters = [
                     (each.target.id, position)
@@ -178,9 +199,12 @@ def find_single_values(trees: dict[Path, ast.Module]) -> Iterator[str]:
                         member for member in node.body if isinstance(member, ast.AnnAssign)
                     )
                     if isinstance(each.target, ast.Name)
-                    and each.target.id not in replaced
+                    and each.target.id not in replaced | texts
                     and "ClassVar" not in ast.unparse(each.annotation)
-                    and not (each.value and "init=False" in ast.unparse(each.value))
+                    and not (
+                        each.value
+                        and re.search("init=False|default_factory", ast.unparse(each.value))
+                    )
                 ]
                 if node.bases and any(call.args for call in calls[name]):
                     continue

@@ -12,7 +12,7 @@ from ...common.array_types import Array
 from ...program.streaming import SquareRootInformation
 from ...statistics.assessment import GROSS_MISFIT, HARDLY_TAME, MISFIT, WILD
 from ...statistics.concerns import Concern, concern_if
-from ...statistics.distributions import chi2_sf, student_ppf
+from ...statistics.distributions import chi2_sf, student_95
 from ...statistics.estimates import Estimate
 from ...statistics.thresholds import PERSISTENT
 
@@ -90,7 +90,7 @@ def variance_factor(
     quantile = 1.96
     if chi2_sf(loss, freedom) < TEST_LEVEL:
         factor = loss / freedom
-        quantile = float(student_ppf(0.975, freedom))
+        quantile = float(student_95(freedom))
     return factor * (1 + scatter.lag1) / (1 - scatter.lag1), quantile
 
 

@@ -94,7 +94,7 @@ class _BandFactor:
 
     band: Band  # (half-bandwidth + 1, k): lower band of the factor, in double or single precision
     order: Index  # (k,): free dof of each row of the band
-    positive_definite: bool = True  # always true
+    positive_definite: bool = field(default=True, init=False)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, in the
@@ -121,7 +121,7 @@ class _SkylineFactor:
     # (k,): permutation to the skyline and its inverse.
     order: Index
     rank: Index
-    positive_definite: bool = True  # always true
+    positive_definite: bool = field(default=True, init=False)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
@@ -151,7 +151,7 @@ class _RefinedFactor:
     # whose rates are those of rounding. The rate of a matrix with a skew part is that of this
     # matrix alone: under friction it is tiny in one time step, and large in the next one.
     last_rates: dict[int, float]
-    positive_definite: bool = True  # always true
+    positive_definite: bool = field(default=True, init=False)
     # Not empty after the refinement has failed once.
     divergence_flags: list[bool] = field(default_factory=list)
 

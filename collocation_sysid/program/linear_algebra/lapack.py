@@ -24,10 +24,8 @@ from threadpoolctl import ThreadpoolController
 Band = NDArray[Any]
 
 
-def _routine(name: str, arguments: int) -> Any:
-    """Return a LAPACK routine of SciPy's Cython interface as a ctypes function of `arguments`
-    pointers.
-    """
+def _routine(name: str) -> Any:
+    """Return a LAPACK routine of SciPy's Cython interface as a ctypes function of six pointers."""
     module = import_module("scipy.linalg.cython_lapack")
     capsule = LowLevelCallable.from_cython(module, name).function
     api = ctypes.pythonapi
@@ -36,11 +34,11 @@ def _routine(name: str, arguments: int) -> Any:
     api.PyCapsule_GetPointer.restype = ctypes.c_void_p
     api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
     address = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
-    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)(address)
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 6)(address)
 
 
 # Banded Cholesky factorisation by the type of the numbers.
-_PBTRF = {np.dtype(np.float64): _routine("dpbtrf", 6), np.dtype(np.float32): _routine("spbtrf", 6)}
+_PBTRF = {np.dtype(np.float64): _routine("dpbtrf"), np.dtype(np.float32): _routine("spbtrf")}
 
 
 @cache

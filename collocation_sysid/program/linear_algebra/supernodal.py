@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from ctypes.util import find_library
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from typing import Any
@@ -192,7 +192,7 @@ class SupernodalFactor:
 
     pardiso: Pardiso  # memory of the factor
     pool: list[Pardiso]  # pool of memory that is not in use
-    positive_definite: bool = True  # always true
+    positive_definite: bool = field(default=True, init=False)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
         """Return the solution for right-hand sides (n,) or (n, m); the matrix is symmetric, so

@@ -36,9 +36,7 @@ from .stress_strain import force_picture, harmonic_picture, relaxation_picture, 
 
 
 @own_settings()
-def all_pictures(
-    replays: Sequence[MotionRecord], result: Result, truth: Mapping[str, float] | None = None
-) -> dict[str, Figure]:
+def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
     Pictures without data are left out. A specimen has pictures of its measurements over strain
@@ -51,13 +49,9 @@ def all_pictures(
         the first one with a mesh, with its grasps and markers.
     result : Result
         Content of ``result.json`` of the same run.
-    truth : mapping, optional
-        True values of all estimated parameters by name, see `convergence`; unknown by default.
     """
     names = [n for n, item in result.parameters.items() if not item.fixed and n in result.estimates]
-    pictures = (
-        {"convergence": convergence(result.history, names, truth=truth)} if result.history else {}
-    )
+    pictures = {"convergence": convergence(result.history, names)} if result.history else {}
     if (scan := result.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, best=scan.best)
     confidence = Confidence.from_result(result)

@@ -76,19 +76,12 @@ class Confidence:
         )
 
 
-def ellipse_outline(confidence: Confidence, i: int, j: int, points: int = 181) -> Array:
-    """Return the outline (points, 2) of the joint 95 % region of two logarithms, about their
-    estimates.
-
-    Parameters
-    ----------
-    i, j : int
-        Indices of the two parameters.
-    points : int
-        Number of points of the outline.
+def ellipse_outline(confidence: Confidence, i: int, j: int) -> Array:
+    """Return the outline (181, 2) of the joint 95 % region of the logarithms of parameters i and j,
+    about their estimates.
     """
     pair = [i, j]
-    angle = np.linspace(0.0, 2 * np.pi, points)
+    angle = np.linspace(0.0, 2 * np.pi, 181)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     deviation = np.sqrt(np.diag(confidence.covariance)[pair])
     rho = float(np.clip(confidence.covariance[i, j] / deviation.prod(), -1.0, 1.0))

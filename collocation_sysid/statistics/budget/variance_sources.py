@@ -28,7 +28,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
-from ..distributions import student_ppf
+from ..distributions import student_95
 from ..estimates import Estimate, IntervalCoordinate
 from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step, least_squares_of_fit
 from ..thresholds import DETERMINED, GRANTED
@@ -294,7 +294,7 @@ class VarianceSources:
         if not more:
             return 0.0
         freedom = self.freedom * ((others + more) / more) ** 2
-        return more * float(student_ppf(0.975, freedom) / NORMAL_95) ** 2
+        return more * float(student_95(freedom) / NORMAL_95) ** 2
 
     def combine_covariance(
         self, names: Sequence[str], statistical: Array, sizes: Array, discretisation: Array
