@@ -97,19 +97,13 @@ HARDLY_TAME = Threshold(
     "Share of the samples beyond Huber's threshold that is doubtful.",
     study="verdict_reliability",
 )
-DAMPING_SHARE = Threshold(
-    0.2, "Damping ratio that a scheme adds, over that of the mode: check.", study="time_steps"
-)
+DAMPING_SHARE = Threshold(0.2, "Damping ratio that a scheme adds, over that of the mode: check.")
 GROSS_DAMPING_SHARE = Threshold(
-    1.0, "The added damping ratio over that of the mode that is doubtful.", study="time_steps"
+    1.0, "The added damping ratio over that of the mode that is doubtful."
 )
-LITTLE_DAMPING = Threshold(0.005, "Added damping ratio that never matters.", study="time_steps")
-PERIOD_ERROR = Threshold(
-    0.02, "Relative change of a period by the scheme: check.", study="time_steps"
-)
-GROSS_PERIOD_ERROR = Threshold(
-    0.1, "The relative change of a period that is doubtful.", study="time_steps"
-)
+LITTLE_DAMPING = Threshold(0.005, "Added damping ratio that never matters.")
+PERIOD_ERROR = Threshold(0.02, "Relative change of a period by the scheme: check.")
+GROSS_PERIOD_ERROR = Threshold(0.1, "The relative change of a period that is doubtful.")
 E_FOLDINGS = Threshold(1.0, "Powers of e by which a disturbance may grow in a recording: check.")
 GROSS_E_FOLDINGS = Threshold(7.0, "The powers of e that are doubtful.")
 MOVED = Threshold(
