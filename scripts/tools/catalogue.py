@@ -20,27 +20,20 @@ INTRODUCTION = """# Catalogue of identified materials
 
 This page lists the materials that the shipped problems identify, from measured data and from
 simulated recordings (*twins*). The file [catalogue.json](catalogue.json) has the same entries in SI
-units. `scripts/tools/make_catalogue.py` solves the problems and writes both files; version {version}
-wrote this page. Symbols of constants are explained on the page [materials](howto/material.md).
+units, with all reasons of the verdicts. `scripts/tools/make_catalogue.py` writes both files. Symbols
+of constants are explained on the page [materials](howto/material.md).
 
-**Verdict.** Read the verdict of an entry first. With the verdict "doubtful" model and data do not
-agree, and the constants describe only the recordings of the entry. The reasons of a verdict are
-those that the solve reports.
+**Verdict.** With the verdict "doubtful" model and data do not agree, and the constants describe only
+the recordings of the entry.
 
-**Range of validity.** The data do not support the constants outside the stated stretches and strain
-rates. The stretches are the principal stretches λ = √(eigenvalues of FᵀF) over all quadrature points
-(weighted by volume) and all samples of the fitted recordings. An entry states the 5 % quantile of the
-smallest stretch and the 95 % quantile of the largest stretch, then the smallest and the largest value.
-The strain rate is the largest magnitude of a principal value of the rate of Green's strain, from
-differences between samples. An entry states its 95 % quantile and its largest value. It states no
-strain rate if the samples are equilibria without times.
+**Range of validity.** The data do not support the constants outside the stated principal stretches
+and strain rates (of Green's strain). An entry states the 5 % quantile of the smallest stretch and the
+95 % quantile of the largest one over the volume and all samples, and in brackets both extremes; then
+the 95 % quantile of the strain rate and its largest value, unless the samples are equilibria.
 
-**Intervals** are combined 95 % intervals of noise, discretisation and systematic effects
-([budget](howto/budget.md)). A constant without an interval was stated in the problem, or the column
-"note" gives the reason.
-
-**Licences** are those of the recordings ([licences](licences.md)). Measured data are not part of
-this repository unless their problem is in `collocation_sysid/datasets`.
+**Intervals** are combined 95 % intervals ([budget](howto/budget.md)). A constant without an interval
+was stated in the problem, or the column "note" gives the reason. **Licences** are those of the
+recordings ([licences](licences.md)).
 """
 
 
@@ -116,7 +109,7 @@ class Catalogue:
 
 def catalogue_page(catalogue: Catalogue) -> str:
     """Return the page of the catalogue as Markdown."""
-    parts = [INTRODUCTION.format(version=catalogue.version)]
+    parts = [INTRODUCTION]
     for is_measured, heading in ((True, "Measured materials"), (False, "Twins")):
         entries = [each for each in catalogue.entries if each.is_measured is is_measured]
         if entries:
@@ -161,12 +154,13 @@ def _section(entry: CatalogueEntry) -> str:
         f"### {entry.name}\n",
         f"{entry.specimen[0].upper()}{entry.specimen[1:]}. Law: {', '.join(entry.law)}"
         + (f"; damping: {', '.join(entry.damping)}" if entry.damping else "")
-        + f". Recordings: {', '.join(entry.recordings)}. Problem: `{entry.problem}`.\n",
+        + f". Problem: `{entry.problem}`.\n",
         _table(shown, rows) + "\n",
-        f"- Stretch: 5 % quantile {stretch.low:.4g}, 95 % quantile {stretch.high:.4g}, smallest "
-        f"value {stretch.minimum:.4g}, largest value {stretch.maximum:.4g}.",
-        _rate_sentence(entry.strain_rate_1_s),
-        _verdict_lines(entry),
+        f"- Stretch: {stretch.low:.4g} to {stretch.high:.4g} ({stretch.minimum:.4g}, "
+        f"{stretch.maximum:.4g}){_rate_words(entry.strain_rate_1_s)}.",
+        f"- Verdict: **{entry.verdict}**"
+        + "".join(f"; {reason.split(': ')[0]}" for reason in entry.reasons)
+        + ".",
         f"- Source: {entry.source}. Licence: {entry.licence}.\n",
     ]
     return "\n".join(lines)
@@ -215,21 +209,9 @@ def _rate(rate: QuantileRange | None) -> str:
     return "" if rate is None else f"{rate.high:.2g}"
 
 
-def _verdict_lines(entry: CatalogueEntry) -> str:
-    """Return the verdict and a list of its reasons."""
-    if not entry.reasons:
-        return f"- Verdict: **{entry.verdict}**."
-    reasons = [f"  - {reason}" for reason in entry.reasons]
-    return "\n".join([f"- Verdict: **{entry.verdict}**, because", *reasons])
-
-
-def _rate_sentence(rate: QuantileRange | None) -> str:
-    """Return the line about the strain rate."""
-    if rate is None:
-        return "- Strain rate: none, because the samples are equilibria without times."
-    return (
-        f"- Strain rate: 95 % quantile {rate.high:.3g} 1/s, largest value {rate.maximum:.3g} 1/s."
-    )
+def _rate_words(rate: QuantileRange | None) -> str:
+    """Return the strain rate as the end of a sentence; empty for equilibria without times."""
+    return "" if rate is None else f"; strain rate: {rate.high:.3g} 1/s ({rate.maximum:.3g})"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Mapping[str, str]]) -> str:
