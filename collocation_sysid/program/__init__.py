@@ -21,14 +21,11 @@ Linear algebra
     `sweep` solves the linearised equations of motion forward and backward in time,
     `least_squares` accumulates normal equations in square-root form, `stopwatch` measures time, and
     the package `linear_algebra` factorises one time step.
-Streaming
-    `streaming` is the interface of time marching along a recording that arrives frame by frame:
-    `streaming_model` is its program, `streaming_sweep` marches with sensitivities.
 Simulation
     `simulation` simulates an experiment with the package `forward`.
 Analyses of a motion
     The package `modes`.
 
 Methods use `Collocation`; statistics use `Transcription`, `ExperimentIterate` and `Sweep`;
-predictions use `simulate`; live estimation uses `streaming`.
+predictions use `simulate`.
 """

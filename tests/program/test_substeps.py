@@ -10,7 +10,6 @@ import pytest
 from kit.problems import TRUTH, hung_cube
 
 import collocation_sysid as cs
-from collocation_sysid.extras.live.model import model_from_problem
 from collocation_sysid.methods.solution import Method
 from collocation_sysid.pipeline import Run, run
 from collocation_sysid.problem import Problem
@@ -242,11 +241,6 @@ def test_an_interrupt_at_finer_steps_leaves_the_first_answer_with_a_note(how):
     assert "a finer time step" in kept.omitted_checks
     assert np.isnan(kept.interval("mu_pa")).all()  # systematic effects were not evaluated
     assert "systematic effects were not evaluated" in kept.table()
-
-
-def test_live_estimates_take_one_step_where_none_are_stated():
-    assert model_from_problem(twin(3e-4)).collocation.substeps == 1
-    assert model_from_problem(twin(3e-4, 2)).collocation.substeps == 2
 
 
 @pytest.mark.parametrize("given", ["some", 0, -1])

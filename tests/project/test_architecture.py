@@ -92,9 +92,6 @@ def test_no_imports_go_in_circles():
 # Packages with the mathematics of an identification, and those that use it; see docs/core.md.
 CORE = ("fem", "recording", "model", "program", "methods", "statistics")
 OUTER = ("features", "runs", "result", "extras", "cli", "testing", "pipeline", "installation_check")
-# The module of `program` that live estimation imports, and the largest number of its names.
-STREAMING = "program.streaming"
-STREAMING_NAMES = 12
 
 
 def test_the_core_is_loaded_without_the_packages_that_use_it():
@@ -132,7 +129,7 @@ def test_only_methods_with_sparse_matrices_import_lifted_variables():
     assert {"methods.interior_point", "methods.comparison.merit"} <= importing
     assert [n for n in importing if not n.startswith(LIFTING)] == []
     reached = set()
-    pending = {"methods.reduced_space", "program.streaming", "program.simulation"}
+    pending = {"methods.reduced_space", "program.simulation"}
     while pending:
         name = pending.pop()
         reached.add(name)
@@ -153,24 +150,6 @@ def test_no_module_imports_the_package_by_its_name():
                 assert not (statement.module or "").startswith("collocation_sysid"), name
 
 
-def test_live_estimation_uses_a_small_interface_of_the_program():
-    used = set()
-    for name in MODULES:
-        if not name.startswith("extras.live"):
-            continue
-        assert {each for each in imports(name) if each.startswith("program")} <= {STREAMING}, name
-        for statement in ast.walk(tree_of(name)):
-            if not isinstance(statement, ast.ImportFrom):
-                continue
-            assert statement.module != "program", (
-                f"{name} does not name what it uses of {STREAMING}"
-            )
-            if statement.module == STREAMING:
-                used |= {each.name for each in statement.names}
-    assert "StreamingSweep" in used
-    assert len(used) <= STREAMING_NAMES
-
-
 def imported_names(name: str, packages: tuple[str, ...]) -> dict[str, str]:
     """Names that a module imports from the modules of some packages, with these modules."""
     path = MODULES[name]
@@ -189,16 +168,13 @@ def imported_names(name: str, packages: tuple[str, ...]) -> dict[str, str]:
 
 def test_extras_import_from_the_program_only_the_names_on_the_page_of_the_core():
     page = (PACKAGE.parent / "docs" / "core.md").read_text()
-    (paragraph,) = (part for part in page.split("\n- ") if "extras import only these names" in part)
+    (paragraph,) = (part for part in page.split("\n- ") if "xtras import only these names" in part)
     listed = set(re.findall(r"`(\w+)`", paragraph.split(":", 1)[1]))
     extras = [name for name in MODULES if name.startswith("extras.")]
     imported = {
-        name: module
-        for extra in extras
-        for name, module in imported_names(extra, ("model", "program", "methods")).items()
-        if module != STREAMING
+        name for extra in extras for name in imported_names(extra, ("model", "program", "methods"))
     }
-    assert set(imported) == listed
+    assert imported == listed
 
 
 def test_the_contribution_guide_names_the_layers():

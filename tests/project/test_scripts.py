@@ -21,7 +21,6 @@ COMMANDS = (
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
     "study_kawabata --laws neo-hookean",
-    "study_live --twins 2 --rows 3",
     "study_methods --starts 1 --methods reduced-space --workers 1",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
     "study_mistakes --groups video --only turned --seeds 1 --check-only",

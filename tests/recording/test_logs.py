@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kit.frames import swing
 from kit.logs import KINDS, START_S, URDF, Messages, bag, dataset, json_mcap, recorded
 from kit.problem_files import run_command, write_problem
 from kit.robot_log import POSES, robot_problem
@@ -685,7 +686,11 @@ def test_the_node_of_the_pages_makes_frames_that_live_reads(
         of = Messages()
         called["/gripper"](of.pose(0.5, (0, 0, 1), about_z(0.3))[-1])
         called["/markers"](of.markers(0.5, {"tip": (1, 2, 3)})[-1])
-        frame = FrameReader([1], ["low", "tip"]).read(listening.recv(10_000).decode())
+        (hung,) = swing().experiments
+        names = ("low", "tip", *hung.markers.names[2:])
+        seen = replace(hung, markers=replace(hung.markers, names=names))
+        frame = FrameReader(seen, swing()).read(listening.recv(10_000))
     assert frame is not None
     assert frame.t_s == pytest.approx(START_S + 0.5)
-    np.testing.assert_allclose(frame.tracks_m, [[np.nan] * 3, [1, 2, 3]])
+    np.testing.assert_allclose(frame.poses[1][:3, 3], (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(frame.tracks_m[:2], [[np.nan] * 3, [1, 2, 3]])

@@ -2,202 +2,103 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import socket
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Iterable, Iterator
+from queue import SimpleQueue
+from typing import TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from ...problem import Problem
-from ...program.streaming import StreamingModel
+from ...common.array_types import Array
+from ...common.signal_handling import ABANDONED_THREAD
+from ...pipeline import Run
 from ...recording.experiment import Experiment
 from ...recording.sample_times import TIME_TOLERANCE_S
-from ...runs.result_content import Result
 from .estimator import LiveUpdate
-from .frames import Frame
+from .frames import Frame, moving_grasps
+
+T = TypeVar("T")
 
 # Largest accepted datagram [bytes].
 DATAGRAM_BYTES = 65536
-# Address of this machine; datagrams from others are not received.
-LOCALHOST = "127.0.0.1"
 
 
-def decode_lines(lines: Iterable[bytes]) -> Iterator[str]:
-    """Return an iterator of lines as text, decoded from UTF-8.
-
-    Invalid bytes are replaced by a character that no number or name contains, without an error.
-    Line breaks are kept.
-    """
-    return (line.decode("utf-8", errors="replace") for line in lines)
-
-
-def receive_datagrams(port: int, opened: Callable[[int], None] | None = None) -> Iterator[str]:
-    """Yield lines of text that arrive as UDP datagrams at a port of this machine, until an empty
-    datagram.
-
-    A datagram may contain several lines; a line does not continue in the next datagram. Datagrams
-    longer than `DATAGRAM_BYTES` are cut. Lines have no line break; see `decode_lines` for invalid
-    bytes. The port is opened when the first line is asked for, and closed at the end; waiting has
-    no time limit.
-
-    Parameters
-    ----------
-    port : int
-        Port; 0 for any free one.
-    opened : callable, optional
-        Called with the port once it is open.
-
-    Raises
-    ------
-    OSError
-        If the port is in use.
-    """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind((LOCALHOST, port))
-        if opened is not None:
-            opened(receiver.getsockname()[1])
+def receive_lines(receiver: socket.socket) -> Iterator[bytes]:
+    """Yield the lines of datagrams until an empty one, and close the socket."""
+    with receiver:
         while datagram := receiver.recv(DATAGRAM_BYTES):
-            yield from decode_lines(datagram.splitlines())
+            yield from datagram.splitlines()
 
 
-def read_problem(recording: Path, overrides: Sequence[str], allow_code: bool) -> Problem:
-    """Return the problem of a file, or that of the folder of a run.
+def arrived(items: Iterable[T]) -> Iterator[list[T]]:
+    """Yield lists of the items that have arrived since the previous list, at least one in each.
 
-    Parameters
-    ----------
-    recording : Path
-        Problem file; or the folder of a run, whose copy of the problem is read, with data files
-        relative to the folder of the original problem.
-    overrides : sequence of str
-        Changes of keys, as in the option ``--set``.
-    allow_code : bool
-        Whether Python code to which the problem refers may be executed.
-
-    Raises
-    ------
-    InputError
-        If the file or folder has no valid problem.
+    A thread waits for the items, so that none is lost while the caller computes.
     """
-    if not recording.is_dir():
-        return Problem.read(recording, overrides, allow_code=allow_code)
-    home = Result.read(recording).problem_folder(
-        recording, "which a replay needs: replay its problem from a problem file"
-    )
-    return Problem.read(recording / "problem.toml", overrides, allow_code=allow_code, folder=home)
+    queue: SimpleQueue[T | None] = SimpleQueue()
+
+    def read() -> None:
+        try:
+            for item in items:
+                queue.put(item)
+        finally:
+            queue.put(None)
+
+    threading.Thread(target=read, name=ABANDONED_THREAD, daemon=True).start()
+    item: T | None
+    while (item := queue.get()) is not None:
+        batch = [item]
+        while not queue.empty() and (item := queue.get()) is not None:
+            batch.append(item)
+        yield batch
+        if item is None:
+            return
 
 
-def frames_of_recording(experiment: Experiment, model: StreamingModel) -> Iterator[Frame]:
-    """Yield the frames of an experiment's recording, one for each sample time of `experiment`.
+def frames_of_recording(experiment: Experiment) -> Iterator[Frame]:
+    """Yield the frames of an experiment's recording, one for each of its sample times.
 
-    Each has the poses of the moving grasps and the markers of that time. Samples of instruments
-    come with the first frame that is not earlier; those after the last frame are left out.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        Experiment whose markers are measured at its sample times.
-    model : StreamingModel
-        Model of the experiment, which gives the moving grasps and the order of the instruments.
+    Samples of sensors come with the first frame that is not earlier; those after the last frame are
+    left out.
     """
-    poses = [experiment.grasps[k].poses.at(experiment.t_s) for k in model.moving_grasps]
-    quaternion_series = [Rotation.from_matrix(rotations).as_quat() for rotations, _ in poses]
-    series = [(gauge.sample_times_s, gauge.measured_values) for gauge in experiment.readings]
-    series += [(sensor.t_s, sensor.values) for sensor in model.experiment.sensors_by_grasp.values()]
-    samples = [
-        (number, float(at_s), values)
-        for number, each in enumerate(series, 1)
-        for at_s, values in zip(*each, strict=True)
-    ]
-    frame_of = np.searchsorted(experiment.t_s, [at_s - TIME_TOLERANCE_S for _, at_s, _ in samples])
-    for k, t_s in enumerate(experiment.t_s):
-        positions_m = np.array([translations[k] for _, translations in poses])
-        quaternions = np.array([each[k] for each in quaternion_series])
-        frame_samples = tuple(
-            each for each, frame in zip(samples, frame_of, strict=True) if frame == k
-        )
-        tracks_m = experiment.markers.positions_at_samples_m[k]
-        yield Frame(
-            float(t_s),
-            (positions_m, quaternions),
-            tracks_m=tracks_m,
-            instrument_samples=frame_samples,
-        )
+    markers = experiment.markers
+    frames_s = experiment.t_s + (0 if markers.offsets_s is None else markers.offsets_s)
+    numbers = moving_grasps(experiment)
+    matrices = np.tile(np.eye(4), (len(numbers), len(frames_s), 1, 1))
+    for motion, number in zip(matrices, numbers, strict=True):
+        motion[:, :3, :3], motion[:, :3, 3] = experiment.grasps[number - 1].poses.at(frames_s)
+    samples: list[list[tuple[str | int, float, Array]]] = [[] for _ in frames_s]
+    sensors = {each.name: each for each in experiment.readings}
+    for key, sensor in {**sensors, **experiment.sensors_by_grasp}.items():
+        frame_of = np.searchsorted(frames_s, sensor.sample_times_s - TIME_TOLERANCE_S)
+        values = sensor.measured_values
+        for k, at_s, each in zip(frame_of, sensor.sample_times_s, values, strict=True):
+            if k < len(samples):
+                samples[k].append((key, float(at_s), each))
+    for k, t_s in enumerate(frames_s):
+        poses = dict(zip(numbers, matrices[:, k], strict=True))
+        yield Frame(float(t_s), poses, markers.positions_m[k], tuple(samples[k]))
 
 
-def paced_frames(
-    frames: Iterator[Frame],
-    rate_hz: float,
-    clock: Callable[[], float] = time.monotonic,
-    wait: Callable[[float], None] = time.sleep,
-) -> Iterator[Frame]:
-    """Yield frames at a constant rate, whatever their own times; the first one immediately.
-
-    Frame k is due k / `rate_hz` after the first; after a delay the overdue ones follow
-    immediately.
-
-    Parameters
-    ----------
-    frames : iterator of Frame
-        Frames to pass on unchanged.
-    rate_hz : float
-        Frames per second, above zero.
-    clock, wait : callable
-        Function that returns a time [s], and a function that waits for a time [s].
-    """
-    began = clock()
+def paced_frames(frames: Iterable[Frame], rate_hz: float) -> Iterator[Frame]:
+    """Yield frames at a constant rate, the first one immediately; overdue ones follow at once."""
+    began_s = time.monotonic()
     for number, frame in enumerate(frames):
-        waiting_s = began + number / rate_hz - clock()
-        if waiting_s > 0:
-            wait(waiting_s)
+        time.sleep(max(0.0, began_s + number / rate_hz - time.monotonic()))
         yield frame
 
 
-@contextmanager
-def without_garbage_of_startup() -> Iterator[None]:
-    """Context within which all objects that exist at its beginning are excluded from garbage
-    collection, after one collection.
-
-    A collection of all objects takes longer than some frames.
-    """
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-
-
-def update_as_json(update: LiveUpdate) -> str:
-    """Return an update as one line of JSON, without line break.
-
-    The keys are "t_s", "parameters" (by name "value", "statistical_std_error" and
-    "statistical95"), "trust" ("verdict" and "reasons"), "marker_rms_m", "pixel_rms", "latency_s"
-    (rounded to microseconds) and "notes". Standard errors and intervals that are None, and errors
-    that are NaN, are null; `relinearised` is left out.
-    """
-    parameters = {
-        name: {
-            "value": each.value,
-            "statistical_std_error": each.statistical_std_error,
-            "statistical95": each.statistical95,
-        }
-        for name, each in update.estimates.items()
-    }
-    rms_m, rms_px = update.marker_rms_m, update.pixel_rms
-    return json.dumps(
-        {
-            "t_s": update.t_s,
-            "parameters": parameters,
-            "trust": {"verdict": update.trust.verdict, "reasons": update.trust.reasons},
-            "marker_rms_m": rms_m if np.isfinite(rms_m) else None,
-            "pixel_rms": rms_px if np.isfinite(rms_px) else None,
-            "latency_s": round(update.latency_s, 6),
-            "notes": update.notes,
-        },
-        ensure_ascii=False,
-    )
+def as_json(answer: LiveUpdate | Run) -> str:
+    """Return an answer, or the final result with its verdict, as one line of JSON."""
+    keys = ("value", "statistical_std_error", "statistical95")
+    parameters = {n: {key: getattr(e, key) for key in keys} for n, e in answer.estimates.items()}
+    if isinstance(answer, LiveUpdate):
+        known = {name: getattr(answer, name) for name in ("t_s", "misfit", "latency_s", "note")}
+        known["misfit"] = answer.misfit if np.isfinite(answer.misfit) else None
+    else:
+        trust = answer.trust
+        known = {"trust": {"verdict": trust.verdict, "reasons": trust.reasons}}
+    return json.dumps({"parameters": parameters, **known}, ensure_ascii=False)
