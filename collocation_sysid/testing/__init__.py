@@ -6,8 +6,7 @@ docs/howto/extend.md.
 
 - `material_check`: energy, stress, stiffness, objectivity, compiled forces.
 - `damping_check`: derivatives, dissipation, objectivity, compiled forces.
-- `force_check`, `sensor_check`, `nuisance_check`: values and derivatives in small programs.
-- `scheme_check`: coefficients, stability, order, simulated motions.
+- `force_check`, `sensor_check`: values and derivatives in small programs.
 - `method_check`: answer, history, restart and options.
 - `missing_constant_check`: message for a constant that a problem does not state.
 - `property_check`, `finite_differences`: comparisons; `program_derivatives`: matrices of a program;
@@ -19,16 +18,6 @@ from .damping_check import check_damping
 from .force_check import check_force
 from .material_check import check_material
 from .method_check import check_method
-from .nuisance_check import check_nuisance
-from .scheme_check import check_scheme
 from .sensor_check import check_sensor
 
-__all__ = [
-    "check_damping",
-    "check_force",
-    "check_material",
-    "check_method",
-    "check_nuisance",
-    "check_scheme",
-    "check_sensor",
-]
+__all__ = ["check_damping", "check_force", "check_material", "check_method", "check_sensor"]

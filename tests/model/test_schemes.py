@@ -16,7 +16,7 @@ from collocation_sysid.model.schemes import SCHEMES, STATIC, as_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp
 
-# Tables; `check_scheme` checks their coefficients
+# Tables; `kit.scheme_check` checks their coefficients
 
 
 def test_row_zero_is_the_static_problem():

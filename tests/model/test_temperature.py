@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from kit.nuisance_check import check_nuisance
 from kit.problems import IDEAL, hung_cube
 
 import collocation_sysid as cs
@@ -15,7 +16,6 @@ from collocation_sysid.statistics.budget.consider_analysis import changes_of_ass
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.testing import check_nuisance
 
 TRUTH = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
 NAME = TEMPERATURE.name

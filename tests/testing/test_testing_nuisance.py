@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from kit.nuisance_check import check_nuisance
 from kit.problems import bar_loaded, driven_bar, hung_cube, pressed_cube
 from kit.wrenches import wristed_cube
 
@@ -19,7 +20,6 @@ from collocation_sysid.recording.nuisance import (
     TEMPERATURE,
     TOOL_CENTRE,
 )
-from collocation_sysid.testing import check_nuisance
 
 
 def cube_with_camera() -> cs.Experiment:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from kit.scheme_check import check_scheme
 
 from collocation_sysid.model.schemes import SCHEMES, Scheme, Stencil
-from collocation_sysid.testing import check_scheme
 
 MIDPOINT = SCHEMES["midpoint"]
 BDF2 = SCHEMES["bdf2"]

@@ -8,17 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from ..common.array_types import Array
-from ..errors import SimulationError
-from ..fem.body import Body
-from ..fem.meshes.structured import box_mesh
-from ..model.schemes import Scheme, Stencil, as_scheme
-from ..program.simulation import simulate
-from .finite_differences import observed_order
-from .program_derivatives import check_program
-from .property_check import PropertyCheck
-from .round_trip import check_pickling
-from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, usual_constants
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.errors import SimulationError
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.model.schemes import Scheme, Stencil, as_scheme
+from collocation_sysid.program.simulation import simulate
+from collocation_sysid.testing.finite_differences import observed_order
+from collocation_sysid.testing.program_derivatives import check_program
+from collocation_sysid.testing.property_check import PropertyCheck
+from collocation_sysid.testing.round_trip import check_pickling
+from collocation_sysid.testing.small_problems import (
+    DENSITY_KG_M3,
+    program_of,
+    swung_experiment,
+    usual_constants,
+)
 
 # Rounding of sums of coefficients.
 ROUNDING = 1e-12

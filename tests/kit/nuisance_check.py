@@ -10,20 +10,25 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..common.array_types import Array
-from ..fem.body import Body
-from ..model.nuisance_map import NuisanceMap
-from ..problem.code_loader import CodeLoader
-from ..problem.nuisance_schema import CustomNuisanceSection
-from ..program.collocation import Collocation
-from ..program.markers.residual import MarkerResidual
-from ..recording.deviation import Deviation
-from ..recording.experiment import Experiment
-from ..recording.nuisance import KINDS, Nuisance
-from .program_derivatives import check_program
-from .property_check import PropertyCheck
-from .round_trip import check_pickling, check_problem_file
-from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.fem.body import Body
+from collocation_sysid.model.nuisance_map import NuisanceMap
+from collocation_sysid.problem.code_loader import CodeLoader
+from collocation_sysid.problem.nuisance_schema import CustomNuisanceSection
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.markers.residual import MarkerResidual
+from collocation_sysid.recording.deviation import Deviation
+from collocation_sysid.recording.experiment import Experiment
+from collocation_sysid.recording.nuisance import KINDS, Nuisance
+from collocation_sysid.testing.program_derivatives import check_program
+from collocation_sysid.testing.property_check import PropertyCheck
+from collocation_sysid.testing.round_trip import check_pickling, check_problem_file
+from collocation_sysid.testing.small_problems import (
+    DENSITY_KG_M3,
+    program_of,
+    swung_experiment,
+    uneven_box,
+)
 
 # Standard deviation of a kind that has none by default.
 USUAL_SIGMA = 0.01
