@@ -397,7 +397,7 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
 
 
 @pytest.mark.parametrize("late", ["find_misspecifications", "profile_likelihoods"])
-def test_so_do_error_bars_an_interrupt_after_them(tiny, monkeypatch, late):
+def test_error_bars_survive_a_later_interrupt(tiny, monkeypatch, late):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
@@ -453,7 +453,7 @@ def test_the_module_is_the_command_line():
 # Progress -----------------------------------------------------------------------------------------
 
 
-def test_a_terminal_shows_iterations_as_they_come(tiny):
+def test_a_terminal_shows_each_iteration(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
     with progress_shown.SolveProgress(console, cs.Problem.read("problem.toml")) as progress:

@@ -188,7 +188,7 @@ def test_an_empty_cache_is_made(monkeypatch, tmp_path):
         ("many", 1, "COLLOCATION_SYSID_THREADS = 'many' is not a whole number"),
     ],
 )
-def test_threads_and_what_determines_them(monkeypatch, value, count, source):
+def test_the_report_states_the_source_of_the_number_of_threads(monkeypatch, value, count, source):
     monkeypatch.setenv("COLLOCATION_SYSID_THREADS", value)
     threads = thread_state()
     assert (threads.count, threads.source) == (count, source)

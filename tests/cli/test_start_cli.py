@@ -113,7 +113,7 @@ def test_starts_need_something_to_spread_about(folder):
     assert (alone.code, "– – – –" in alone.out) == (0, True)
 
 
-def test_a_comparison_without_a_guess_tells_where_it_started(folder):
+def test_a_comparison_without_a_guess_states_its_start(folder):
     out = folder / "compared"
     command = ("compare-methods", folder / "problem.toml", "--methods", "reduced-space", *UNGUESSED)
     truth = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]

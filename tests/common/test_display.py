@@ -82,7 +82,7 @@ def test_a_terminal_breaks_no_word_that_is_longer_than_its_lines():
     assert shown_in(12, "  two words and more", terminal=True) == ["  two words", "and more"]
 
 
-def test_rows_are_lines_where_no_terminal_shows_them():
+def test_rows_are_lines_outside_a_terminal():
     table = Table(
         "", ("", "mooney-rivlin", *"abcde"), (("solver.key", *"12345", "above 0\nWhat it is."),)
     )
@@ -152,7 +152,7 @@ def markdown_tokens(name: str) -> list[Token]:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_markdown_shows_names_as_they_are(name: str):
+def test_markdown_shows_names_unchanged(name: str):
     def structure(name: str) -> list[tuple[str, int]]:
         tokens = markdown_tokens(name)
         return [(each.type, each.level) for each in tokens if not each.type.startswith("text")]

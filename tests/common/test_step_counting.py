@@ -38,7 +38,7 @@ def test_a_phase_reports_its_share_from_zero_to_its_end():
     assert shares == [0.0, 0.25, 0.5, 0.75, 1.0, 1.0, None]
 
 
-def test_a_phase_within_another_belongs_to_it():
+def test_a_nested_phase_belongs_to_the_outer_one():
     shares = []
     with listen_to_shares(shares.append), counted_phase(StepUnit.TIME_STEP, 2):
         with counted_phase(StepUnit.TIME_STEP, 100):

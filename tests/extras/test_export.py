@@ -664,7 +664,7 @@ def test_a_file_is_not_written_through_a_link(run_folder, tmp_path):
     assert (ended.code, "is a folder; expected a file" in ended.err) == (2, True)
 
 
-def test_an_experiment_that_is_not_there_is_refused(run_folder, tmp_path):
+def test_an_unknown_experiment_is_refused(run_folder, tmp_path):
     ended = run_command("export", run_folder, "--to", "json", "--experiment", "sway")
     assert ended.code == 2
     assert "expected one of swing" in ended.err
@@ -968,7 +968,7 @@ def pressed_block(
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_facets_lie_on_the_surface_of_their_solid_and_look_out_of_it(name):
+def test_facets_lie_on_the_surface_of_their_solid_and_face_outwards(name):
     solid, about_m = SOLIDS[name], np.array([0.02, 0.02, 0.02])
     facets = Facets.from_solid(solid, about_m, 0.1, tolerance_m=2e-5)
     gap = ca.Function("gap", [place := ca.SX.sym("p", 3)], [solid.signed_distance(place)])

@@ -182,7 +182,7 @@ def test_forces_rank_the_platens_where_there_are_no_markers():
     )
 
 
-def test_of_one_pressing_the_end_of_its_load_is_held_out():
+def test_the_end_of_the_load_of_one_pressing_is_held_out():
     pressing = pressed_block("xyz", "a", np.linspace(0.0, -0.03, 9), np.zeros(9))
     left, start_s = reserve_test_data(Problem([pressing], TRUTH), "a")
     wrench = left.experiments[0].grasps[1].wrench
@@ -208,14 +208,14 @@ def test_files_with_other_data_are_no_models_of_one_another(tmp_path: Path):
 # Held out ---------------------------------------------------------------------------------------
 
 
-def test_of_two_recordings_one_is_held_out(tmp_path: Path):
+def test_one_of_two_recordings_is_held_out(tmp_path: Path):
     several = Problem.read(write_problem(tmp_path, {"a": 6, "b": 7}))
     left, start_s = reserve_test_data(several, "b")
     assert [(e.name, e.validation) for e in left.experiments] == [("a", False), ("b", True)]
     assert start_s == -np.inf
 
 
-def test_of_one_recording_the_last_third_is_held_out(tiny: Path):
+def test_the_last_third_of_one_recording_is_held_out(tiny: Path):
     alone = Problem.read(tiny / "problem.toml")
     left, start_s = reserve_test_data(alone, "swing")
     (kept,), (whole,) = left.experiments, alone.experiments
@@ -383,7 +383,7 @@ def test_files_are_combined_with_materials(bar, tiny):
     assert len({run.key for run in planned}) == len(planned) == 2 * len(found)
 
 
-def test_a_value_is_written_as_toml_reads_it():
+def test_a_written_value_is_read_back_by_toml():
     value = {"a.b": {"guess": 1e-5, "bounds": [1, -2.5]}, "text": 'a "quoted" ß', "flag": True}
     assert tomllib.loads(f"value = {as_inline_toml(value)}")["value"] == value
 
@@ -431,7 +431,7 @@ def test_a_region_or_all_of_a_body_has_the_material(bar, tiny, region, material,
     assert set(problem.parameters.names) == set(expected.split())
 
 
-def test_a_region_keeps_constants_of_its_own_where_it_has_some(bar, tiny):
+def test_a_region_keeps_its_own_constants(bar, tiny):
     TWO_REGIONS(tiny)
     own = ("parameters.stiff.young_pa=900", "object.region.0.material=neo-hookean")
     rid = "c10_pa", "c20_pa", "c30_pa"
@@ -525,7 +525,7 @@ STEADY = np.full(8, 1e-5)
 WAVY = STEADY * (1 + 0.3 * np.cos(np.arange(8)))
 
 
-def test_of_models_that_predict_alike_the_one_with_fewer_parameters_is_taken():
+def test_the_smallest_of_models_with_equal_predictions_is_taken():
     small = row_of("small", 4, {"a": (1.01 * WAVY).tolist()}, 900)
     large = row_of("large", 6, {"a": (WAVY + 1e-6 * np.sin(np.arange(8))).tolist()}, 899)
     rows = rows_of(small, large)
@@ -716,7 +716,7 @@ def test_a_model_that_fits_better_but_predicts_worse_is_not_taken():
     assert "large fits better, but does not predict better" in advice(rows)
 
 
-def test_recordings_that_disagree_leave_it_open():
+def test_recordings_that_disagree_leave_the_choice_open():
     small = row_of("small", 4, {"a": (2 * STEADY).tolist(), "b": STEADY.tolist()}, 900)
     large = row_of("large", 6, {"a": STEADY.tolist(), "b": (1.5 * STEADY).tolist()}, 850)
     rows = rows_of(small, large)

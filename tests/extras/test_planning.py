@@ -950,7 +950,7 @@ def test_a_tendon_bends_the_shipped_tentacle(tmp_path: Path):
 # Reliability --------------------------------------------------------------------------------------
 
 
-def test_the_monitor_of_ipopt_never_asks_it_to_stop():
+def test_the_monitor_never_asks_ipopt_to_stop():
     seen = []
     full = FullProgram(program())
     monitor = iteration_monitor(full, lambda *each: seen.append(each), 3, [])
@@ -1561,7 +1561,7 @@ def test_an_interrupt_before_a_plan_is_simulated_writes_nothing(tmp_path, monkey
 
 
 @pytest.mark.long
-def test_the_folder_of_a_plan_checks_its_execution_and_identifies_from_it(tmp_path: Path):
+def test_an_execution_is_checked_and_identified_in_the_folder_of_a_plan(tmp_path: Path):
     problem = write_problem(tmp_path, {"swing": 10})
     (tmp_path / "task.toml").write_text(GOOD.replace("0.02\n[[", "0.01\n[["))
     plan = plan_motion(problem, tmp_path / "task.toml", LIMITS)

@@ -54,7 +54,7 @@ def test_the_surface_moves_as_the_fit(recording, arrays):
     assert (nodes[np.array(triangles)] == arrays["surface"]).all()
 
 
-def test_its_colours_are_those_of_the_stress(recording, run_folder, arrays):
+def test_colours_of_a_recording_are_those_of_the_stress(recording, run_folder, arrays):
     import meshio
 
     frames = sorted((run_folder / "frames").glob("*.vtu"))
@@ -115,7 +115,7 @@ def test_one_experiment_is_written_alone(run_folder, tmp_path):
     assert run_command("export", run_folder, "--to", "rerun", "--experiment", "nod").code == 2
 
 
-def test_a_recording_can_be_a_file_beside_others(run_folder, tmp_path):
+def test_a_recording_is_written_beside_other_files(run_folder, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     file = tmp_path / "swing.rrd"
     outcome = run_command("export", run_folder, "--to", file)
@@ -148,7 +148,7 @@ def test_a_recording_without_checksum_cannot_be_verified(run_folder):
     assert "has no predictions to verify" in outcome.err
 
 
-def test_without_the_extra_the_error_names_it(run_folder, tmp_path, monkeypatch):
+def test_a_missing_extra_is_named(run_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(rerun_recording, "find_spec", lambda _: None)
     before = contents(tmp_path)
     with pytest.raises(cs.InputError, match=r"pip install 'collocation-sysid\[rerun\]'"):

@@ -128,7 +128,7 @@ def test_errors_of_surface_and_grip_move_the_nodes_by_their_size():
     assert 0.1 < largest_m / (0.01 * thickness_m(body)) < 5
 
 
-def test_faults_are_as_large_as_they_are_called():
+def test_faults_have_the_size_in_their_name():
     rng, measured = np.random.default_rng(0), study_faults.exact_recording()
     before = measured.markers.positions_m
     late, stated = study_faults.FAULTS["clock 2 ms late"](measured, rng)

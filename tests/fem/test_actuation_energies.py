@@ -179,7 +179,7 @@ def test_an_inflated_sphere_converges_to_its_radial_solution():
     assert abs(errors[1]) < 0.06 * (radius_m - INNER)
 
 
-def test_faces_of_a_box_and_a_ball_are_those_with_all_their_corners_in_it():
+def test_faces_of_a_box_or_ball_have_all_corners_inside():
     body = Body(box_with_cavity(), density_kg_m3=1e3)
     for selection in (Ball((0.015,) * 3, 0.009), Box((0.009,) * 3, (0.021,) * 3)):
         volume = Pressure(selection, 1e3).on_body(body).require_measure()

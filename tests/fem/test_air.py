@@ -211,14 +211,14 @@ def test_the_combined_interval_is_halved_where_air_is_known():
     assert next(iter(found.line.shares)) == "air_drag"
 
 
-def test_air_that_is_left_out_makes_damping_too_large_and_the_budget_has_no_air():
+def test_omitted_air_makes_damping_too_large_and_the_budget_has_no_air():
     found = estimated(recorded(1.0, "none"))
     assert found.statistical95[0] > 1.05 * TRUTH[GAMMA_M]
     assert not set(OF_AIR) & set(found.line.shares)
 
 
 @pytest.mark.long
-def test_air_that_was_not_there_makes_damping_too_small_and_the_budget_contains_it():
+def test_modelled_air_in_a_vacuum_makes_damping_too_small_within_the_budget():
     found = estimated(recorded(0.0, AIR_KG_M3))
     assert found.statistical95[1] < TRUTH[GAMMA_M]
     assert next(iter(found.line.shares)) == "air_drag"

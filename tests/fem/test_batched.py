@@ -153,7 +153,7 @@ def test_any_number_of_instances_gives_the_same_compiled(count):
         np.testing.assert_allclose(each, other, rtol=1e-14)
 
 
-def test_instances_are_evaluated_by_casadi_where_they_cannot_be_compiled(broken_compiler, cache):
+def test_instances_without_compiled_code_are_evaluated_by_casadi(broken_compiler, cache):
     inputs = [np.ones((3, 4)), np.ones((1, 4))]
     distance, _ = make_instance_evaluator(distance_and_slopes(), compiled=True)(inputs)
     np.testing.assert_array_equal(distance, np.full((1, 4), 2.0))
@@ -361,7 +361,7 @@ def test_kernel_refuses_functions_without_vector_code():
 
 
 @pytest.mark.parametrize("evaluator", ["simd", "casadi"])
-def test_there_is_no_note_where_the_evaluator_is_as_asked_for(small_mesh, evaluator):
+def test_the_requested_evaluator_has_no_note(small_mesh, evaluator):
     assert new_body(small_mesh, evaluator=evaluator).notes == ()
     assert new_body(small_mesh).notes == ()
 

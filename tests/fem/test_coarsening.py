@@ -51,7 +51,7 @@ def test_every_node_is_kept_or_moved_onto_one_with_its_label():
     assert np.ptp(held_m[:, 0]) == pytest.approx(np.ptp(BOX.points_m[labels == 1, 0]))
 
 
-def test_a_mesh_that_cannot_be_coarser_stays_as_it_is():
+def test_a_mesh_that_cannot_be_coarser_is_unchanged():
     small = box_mesh((0.1, 0.1, 0.1), (1, 1, 1))
     coarse = coarsened(small, 1)
     assert len(coarse.mesh.points_m) == len(small.points_m)

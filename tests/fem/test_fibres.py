@@ -80,7 +80,7 @@ def test_dispersed_fibres_in_equibiaxial_tension_have_their_closed_form():
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-2)
 
 
-def test_fibres_across_the_tension_are_slack_unless_they_carry_compression():
+def test_fibres_that_carry_tension_only_are_slack_across_the_tension():
     slack, stiff = (
         stresses_pa(
             "uniaxial", Fibres(direction=[1, 0, 0], tension_only=tension), {"fibre_pa": 4e4}

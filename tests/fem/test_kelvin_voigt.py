@@ -80,7 +80,7 @@ def test_forces_balance_and_exert_no_torque(element, rng):
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("material", [*COMPILED, of_a_user])
-def test_undeformed_it_is_rayleighs(material, element, rng):
+def test_kelvin_voigt_damping_of_an_undeformed_body_is_rayleighs(material, element, rng):
     """So that damping ratios of small oscillations are the same."""
     bodies = [small_body(material, element, "casadi", law) for law in ("kelvin-voigt", "rayleigh")]
     _, v = state(bodies[0], rng)

@@ -89,7 +89,7 @@ def test_force_is_the_slope_of_the_potential_by_the_velocities(material, rng):
         assert relative_error(-np.sum(force * direction), slope) < 1e-9
 
 
-def test_of_st_venant_and_kirchhoffs_material_it_is_the_rate_of_the_elastic_stress(rng):
+def test_damping_of_st_venant_kirchhoff_is_the_rate_of_the_elastic_stress(rng):
     """P_v = F γ_r Ṡ: γ_r times the rate of the elastic force, but for that of F alone."""
     body = damped_body("st-venant-kirchhoff")
     points = np.vstack([np.zeros(3), 0.1 * np.eye(3)])
@@ -123,14 +123,14 @@ def test_forces_balance_and_exert_no_torque(element, rng):
 
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("material", ["neo-hookean", "yeoh", "linear"])
-def test_undeformed_it_is_kelvin_and_voigts(material, element, rng):
+def test_material_damping_of_an_undeformed_body_is_kelvin_and_voigts(material, element, rng):
     bodies = [damped_body(material, element, damping=law) for law in ("material", "kelvin-voigt")]
     _, v = moving_state(bodies[0], rng)
     found, expected = (damping_force(body, body.nodes_m.reshape(1, -1), v) for body in bodies)
     assert relative_error(found, expected) < 1e-12
 
 
-def test_without_gamma_r_there_is_none(rng):
+def test_without_gamma_r_material_damping_vanishes(rng):
     body = damped_body()
     x, v = moving_state(body, rng)
     assert not damping_force(body, x, v, gamma_r_s=0.0).any()
@@ -152,7 +152,7 @@ def test_material_and_kelvin_voigt_differ_at_large_strain(rng):
     assert forces[0] / forces[1] == pytest.approx(1.5**4, rel=1e-9)
 
 
-def test_a_memory_leaves_the_damping_force_as_it_is(rng):
+def test_a_memory_does_not_change_the_damping_force(rng):
     """The law acts on the long-term energy; branches of memory stand beside it."""
     plain = damped_body()
     with_memory = damped_body(prony=["prony_1"])

@@ -94,7 +94,7 @@ def test_energy_is_positive_when_deformed(law, rng):
 
 
 @pytest.mark.parametrize("name", ROTATION_INVARIANT)
-def test_all_of_them_are_isotropic(name, rng):
+def test_every_material_is_isotropic(name, rng):
     law = Law(name)
     rotations = Rotation.from_quat(rng.standard_normal((5, 4))).as_matrix()
     for F, R in zip(deformations(rng), rotations, strict=True):
@@ -287,7 +287,7 @@ def test_a_material_is_itself_and_names_are_looked_up():
     assert as_material("gent") is MATERIALS["gent"]
 
 
-def test_unknown_material_is_refused_with_the_names_there_are():
+def test_unknown_material_is_refused_with_the_known_names():
     with pytest.raises(InputError, match="no material 'rubber'; available: neo-hookean, "):
         as_material("rubber")
     with pytest.raises(InputError, match="did you mean 'mooney-rivlin'"):

@@ -184,7 +184,9 @@ def mixed_stiffness(library: Library, poisson: float, pressure: skfem.Element) -
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, INCOMPRESSIBLE])
 @pytest.mark.parametrize("material", ["neo-hookean", "linear"])
-def test_at_rest_it_is_the_mixed_element_of_constant_pressures(small_mesh, material, poisson):
+def test_stiffness_at_rest_is_that_of_the_mixed_element_of_constant_pressures(
+    small_mesh, material, poisson
+):
     body = Body(small_mesh, material, 30.0, P0)
     library = Library(small_mesh, skfem.ElementTetP2(), intorder=2)
     expected = mixed_stiffness(library, poisson, skfem.ElementTetP0())
@@ -223,7 +225,7 @@ def test_a_beam_sags_as_with_taylor_and_hoods_element(poisson, plain_below, line
     assert locked < linear_below
 
 
-def test_away_from_incompressibility_it_agrees_with_plain_elements_under_refinement():
+def test_compressible_bodies_agree_with_plain_elements_under_refinement():
     sags = [
         [sag_m(stiffness(body, 0.3), body) for body in (beam(P0, m), beam("tet10", m))]
         for m in (1, 2, 3)
@@ -305,7 +307,7 @@ def test_reduced_space_finds_the_truth():
 
 
 @pytest.mark.long
-def test_with_noise_it_finds_an_optimum_of_the_whole_program(rng):
+def test_reduced_space_with_noise_finds_an_optimum_of_the_whole_program(rng):
     tracks = bar().markers.positions_m
     noisy = with_markers(bar(), tracks + 1e-4 * rng.standard_normal(tracks.shape))
     solution = ReducedSpace()(Collocation([noisy], GUESS))

@@ -397,7 +397,7 @@ def test_unnamed_groups_of_one_tag_and_two_dimensions_are_distinguished(tmp_path
         mesh.select(Named("physical_7"))
 
 
-def test_a_cell_of_several_groups_is_in_all_of_them(tmp_path):
+def test_a_cell_of_several_groups_is_in_every_group(tmp_path):
     entity = "1 0 0 0 1 1 1 {} 1 1\n"
     assert entity.format("1 1") in MSH_FILES["4.1"]
     both = MSH_FILES["4.1"].replace(entity.format("1 1"), entity.format("2 1 2"))
@@ -491,7 +491,7 @@ def test_unreadable_files_give_one_error_and_print_nothing(tmp_path, capfd, name
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_format_that_needs_another_package_names_it(tmp_path, monkeypatch):
+def test_a_format_names_the_package_that_it_needs(tmp_path, monkeypatch):
     def read_content(path):
         raise InputError("ModuleNotFoundError: No module named 'h5py'")
 

@@ -32,7 +32,7 @@ def test_cached_objects_are_loaded_by_key():
     assert jit.load_object("other") is None
 
 
-def test_folders_and_files_that_it_makes_are_the_users_alone(folder):
+def test_created_folders_and_files_belong_to_the_user_alone(folder):
     old = os.umask(0)
     try:
         file = entry(folder)

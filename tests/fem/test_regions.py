@@ -325,7 +325,7 @@ SECOND = {
 
 
 @pytest.mark.parametrize("how", SECOND)
-def test_cells_of_a_region_are_selected_in_any_of_these_ways(slab, how):
+def test_cells_of_a_region_are_selected_in_several_ways(slab, how):
     second = slab.centres_m[:, 0] > 0.1
     body = Body(slab, density_kg_m3=1.0, regions=[Region("second", SECOND[how](second))])
     np.testing.assert_array_equal(body.parts[1].cells, np.flatnonzero(second))

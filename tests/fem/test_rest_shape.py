@@ -210,7 +210,7 @@ def test_with_the_scan_described_the_interval_contains_the_truth(described):
     assert "rest_shape" not in significant(run)
 
 
-def test_of_a_scan_in_an_unknown_orientation_the_budget_contains_the_error():
+def test_the_budget_contains_the_error_of_a_scan_in_an_unknown_orientation():
     run = cs.run(problem_of(measured(None, mesh_from="scan"), **ONE_STEP), seek_causes=False)
     estimate = run.estimates["young_pa"]
     assert abs(estimate.value / TRUTH["young_pa"] - 1) > 0.3

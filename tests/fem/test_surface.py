@@ -82,7 +82,7 @@ def test_an_open_surface_file_is_named(tmp_path):
         TetMesh.from_surface(tmp_path / "square.obj", 0.1)
 
 
-def test_pytetwild_fills_a_surface_and_the_cache_repeats_it(tmp_path, monkeypatch):
+def test_pytetwild_fills_a_surface_and_the_cache_repeats_the_mesh(tmp_path, monkeypatch):
     pytest.importorskip("pytetwild")
     monkeypatch.chdir(tmp_path)
     points, triangles = cube_surface((100.0, 40.0, 40.0))

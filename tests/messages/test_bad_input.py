@@ -739,7 +739,7 @@ def test_another_file_in_place_of_a_run_folder_is_refused(tiny):
     assert_refused(tiny, words, "report", "problem.toml")
 
 
-def test_a_missing_file_leads_to_the_instructions_beside_it(tiny):
+def test_a_missing_file_leads_to_the_instructions_in_its_folder(tiny):
     both(remove(MARKERS), write("README.md", "Ask the laboratory."))(tiny)
     assert_refused(tiny, ("README.md", "how to get it"), "check", "problem.toml")
 

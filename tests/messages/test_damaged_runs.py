@@ -228,7 +228,7 @@ def elsewhere(tmp_path: Path) -> Path:
 
 @links
 @pytest.mark.parametrize("name", ["x.png", "problem.toml"])
-def test_a_page_shows_nothing_that_links_lead_to_elsewhere(run: Path, elsewhere: Path, name: str):
+def test_the_page_of_a_run_shows_nothing_behind_links(run: Path, elsewhere: Path, name: str):
     (run / name).unlink(missing_ok=True)
     (run / name).symlink_to(elsewhere)
     assert run_command("report", run).code == 0
@@ -238,7 +238,7 @@ def test_a_page_shows_nothing_that_links_lead_to_elsewhere(run: Path, elsewhere:
 
 
 @links
-def test_nor_does_that_of_a_study(tmp_path: Path, elsewhere: Path):
+def test_the_page_of_a_study_shows_nothing_behind_links(tmp_path: Path, elsewhere: Path):
     study = tmp_path / "study"
     study.mkdir()
     summary = {"schema": 5, "kind": "sweep", "title": "a", "problem": "p", "headline": "",

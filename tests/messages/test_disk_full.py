@@ -116,7 +116,7 @@ def test_an_answer_that_finds_no_room_leaves_the_earlier_run(tiny: Path):
         assert contents(tiny) == before
 
 
-def test_a_file_keeps_its_ending_while_it_is_written(tmp_path: Path):
+def test_a_file_keeps_its_ending_while_being_written(tmp_path: Path):
     with replaced_file(tmp_path / "deep" / "a.tar.png") as draft:
         assert draft.suffix == ".png"
         draft.write_text("x")

@@ -247,7 +247,7 @@ def test_a_file_of_depths_or_digits_without_end_is_refused(tiny: Path, text: str
 
 
 @pytest.mark.parametrize("value", ["[" * 5000 + "]" * 5000, "9" * 5000])
-def test_so_is_such_an_override(tiny: Path, value: str):
+def test_an_override_of_depths_or_digits_without_end_is_refused(tiny: Path, value: str):
     refused("check", "problem.toml", *settings(f"title={value}"))
     refused("check", "problem.toml", *settings("a." * 3000 + "b=1"))
 
@@ -305,7 +305,7 @@ def test_a_solve_that_memory_cannot_hold_is_refused(tiny: Path, monkeypatch: pyt
         ("transcription.substeps=10000", "9 samples of 10,000 substeps of a body of 36"),
     ],
 )
-def test_a_problem_that_memory_cannot_hold_is_refused_when_it_is_read(
+def test_a_problem_that_memory_cannot_hold_is_refused_by_the_reader(
     tiny: Path, monkeypatch: pytest.MonkeyPatch, setting: str, found: str
 ):
     monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 1e3)
@@ -327,7 +327,7 @@ def test_unknown_positions_of_more_markers_than_memory_can_hold_are_refused(
     assert "expected fewer markers (markers.names), their positions (reference_m)" in message
 
 
-def test_a_generated_mesh_that_memory_cannot_hold_is_refused_before_it_is_made(
+def test_a_generated_mesh_that_memory_cannot_hold_is_refused_early(
     tiny: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(problem_size, "machine_memory_mb", lambda: 2e3)
@@ -348,7 +348,7 @@ def test_generated_meshes_have_the_counts_that_were_expected(made: TetMesh, coun
     assert (len(made.points_m), len(made.tetrahedra)) == counts
 
 
-def test_long_work_is_announced_before_it_begins(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+def test_long_work_is_announced_at_its_beginning(tiny: Path, monkeypatch: pytest.MonkeyPatch):
     announced: list[str] = []
     Problem.read("problem.toml", say=announced.append)
     assert announced == []
@@ -361,7 +361,7 @@ def test_long_work_is_announced_before_it_begins(tiny: Path, monkeypatch: pytest
     assert "MB of recordings, most of them in swing_markers.csv" in announced[1]
 
 
-def test_so_it_is_on_the_command_line(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+def test_long_work_is_announced_on_the_command_line(tiny: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(problem_size, "ANNOUNCED_SOLVE_S", 0.0)
     assert "a solve takes about" in run_command("check", "problem.toml").err
     assert "takes about" not in run_command("check", "problem.toml", "--quiet").err
@@ -471,7 +471,7 @@ def test_an_interrupt_during_imports_prints_nothing(name: str):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_nor_does_one_while_the_commands_are_built():
+def test_an_interrupt_while_the_commands_are_built_prints_nothing():
     done = ended(COMMANDED)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
@@ -487,7 +487,7 @@ def test_a_solver_that_hears_no_signal_is_left_behind(tiny: Path):
 
 @pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_two_signals_end_it_at_once(tiny: Path):
+def test_two_signals_end_a_solve_at_once(tiny: Path):
     done = ended(DEAF.format(name="SIGINT", times=2))
     assert done.returncode == 130
     assert "nothing was written to run" in done.stderr
@@ -642,7 +642,7 @@ def test_depth_archives_of_the_wrong_shape_are_refused(tmp_path: Path, shape: tu
         read_depth(tmp_path / "depth.npz", count_m=None, length_m=None)
 
 
-def test_text_that_no_memory_can_hold_is_refused_before_it_is_read(
+def test_text_that_no_memory_can_hold_is_refused_unread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(files, "machine_memory_mb", lambda: 6000.0)

@@ -74,9 +74,7 @@ def test_a_key_in_angle_brackets_is_as_unknown_as_any_other(tiny: Path, table: s
     assert f"{key}: unknown key" in refused("check", "problem.toml")
 
 
-def test_a_key_without_end_is_refused_before_it_is_parsed(
-    tiny: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_key_without_end_is_refused_unparsed(tiny: Path, monkeypatch: pytest.MonkeyPatch):
     key = 50_000 * "a." + "b = 1\n"
     monkeypatch.setattr(tomllib, "loads", lambda _: pytest.fail("this takes minutes"))
     for part in (key, key.replace("a.", "'a' . "), key.replace("a.", '"a".'), f"[{key[:-5]}]\n"):
@@ -93,7 +91,7 @@ def test_long_words_and_lists_are_no_endless_keys(tiny: Path):
 
 @pytest.mark.skipif(os.name != "posix", reason="alarms of POSIX")
 @pytest.mark.parametrize("value", ["1.0", "{}", "{ tied_to = 'mu_pa' }"])
-def test_of_endless_unknown_parameters_the_first_is_named(tiny: Path, value: str):
+def test_the_first_of_endless_unknown_parameters_is_named(tiny: Path, value: str):
     many = "".join(f"mu_pb{k} = {value}\n" for k in range(20_000))
     replace_text("[parameters]\n", f"[parameters]\n{many}")(tiny)
     with bounded(60):
@@ -116,7 +114,7 @@ def test_an_invisible_character_in_a_number_is_made_visible(tiny: Path, mark: st
     assert "'0.0\ufffd1'; expected a number" in refused("check", "problem.toml")
 
 
-def test_nor_are_others_places_in_a_list_or_counts(tiny: Path):
+def test_foreign_digits_are_no_places_in_a_list_and_no_counts(tiny: Path):
     words = settings("experiment.٠.start=undeformed")
     assert "expected its number, from 0" in refused("check", "problem.toml", *words)
     assert "whole numbers" in refused("compare-models", "problem.toml", "--prony", "0,١")
@@ -153,7 +151,7 @@ def test_a_message_quotes_no_more_than_helps(tiny: Path, edit):
 @pytest.mark.parametrize(
     "override", [NULS, f"title.a={NULS}", f"experiment.{NULS}.x=1", f"{NULS}=[", f"mu_pa=[{NULS}"]
 )
-def test_nor_does_it_of_an_override(tiny: Path, override: str):
+def test_a_message_about_an_override_quotes_no_more_than_helps(tiny: Path, override: str):
     refused("check", "problem.toml", *settings(override))
 
 
@@ -174,12 +172,12 @@ def test_escapes_of_a_terminal_are_shown_and_not_sent(tiny: Path, edit):
     assert "[31m" in refused("check", "problem.toml")
 
 
-def test_a_message_is_one_line_whatever_it_quotes(tiny: Path):
+def test_a_message_is_one_line_for_any_quotation(tiny: Path):
     replace_text("[object]", '[object]\n"a\\nerror: forged" = 1')(tiny)
     assert "object.a␊error: forged: unknown key" in refused("check", "problem.toml")
 
 
-def test_names_that_are_shown_in_tables_are_shown_as_they_are(tiny: Path):
+def test_names_in_tables_are_shown_unchanged(tiny: Path):
     for file in ("problem.toml", MARKERS):
         text = (tiny / file).read_text()
         name = r'"\u001b[2J[/b]:smile:"' if file == "problem.toml" else "\x1b[2J[/b]:smile:"

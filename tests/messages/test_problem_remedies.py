@@ -213,7 +213,7 @@ def test_followed_remedies_lead_to_the_problem_without_the_mistake(made, tmp_pat
 
 
 @pytest.mark.parametrize(("old", "new"), BENCH.values(), ids=BENCH)
-def test_so_do_those_of_a_bench(made, tmp_path, old, new):
+def test_followed_remedies_lead_to_the_bench_without_the_mistake(made, tmp_path, old, new):
     expected = state(made / "bench" / "problem.toml")
     folder = tmp_path / "bench"
     shutil.copytree(made / "bench", folder)

@@ -30,7 +30,7 @@ def test_the_true_parameters_are_recovered(name: str):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["hung-cube", "bar-let-go"])
-def test_with_noise_it_is_the_optimum_of_the_reduced_space(name: str):
+def test_the_answer_with_noise_is_that_of_the_reduced_space(name: str):
     collocation = collocation_of(name, noise_m=1e-3, steps=12)
     solution, reference = (AugmentedLagrangian()(collocation), ReducedSpace()(collocation))
     assert solution.status is Status.CONVERGED

@@ -78,7 +78,7 @@ def test_the_true_parameters_are_recovered(plugin: str):
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_with_noise_it_is_the_optimum_of_the_reduced_space(plugin: str):
+def test_the_answer_with_noise_is_that_of_the_reduced_space(plugin: str):
     collocation = cube(1e-4)
     solution = answer(plugin, collocation)
     reference = ReducedSpace()(collocation)

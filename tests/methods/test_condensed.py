@@ -165,7 +165,7 @@ def ones(structure: tuple[np.ndarray, np.ndarray], height: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_held_dofs_are_where_the_grasps_are_and_multipliers_balance_them(name: str, rng):
+def test_held_dofs_are_those_of_grasps_and_are_balanced_by_multipliers(name: str, rng):
     collocation, whole, program = made(name, ON_TIME)
     z, y = (some_point(collocation, program, rng), rng.normal(size=program.constraint_count))
     at, of_rows = (program.complete_variables(z), program.complete_multipliers(z, 1.0, y))
@@ -195,7 +195,7 @@ def test_a_clock_adds_no_entry_between_timesteps_that_motion_does_not_join(subst
     assert apart[1] <= transcription.dynamics.largest_lag
 
 
-def test_steps_take_slopes_as_they_are_at_the_nearest_sample(rng):
+def test_steps_take_slopes_of_the_nearest_sample(rng):
     whole = Collocation([late_cube(DEFAULT)], GUESS)
     program = condense(whole)
     (transcription,) = whole.transcriptions

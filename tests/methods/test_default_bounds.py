@@ -193,7 +193,7 @@ def test_a_scan_continues_where_stiffer_bodies_fit_ever_better(misfit, least, mo
 
 
 @pytest.mark.parametrize("guess", [2e11, 0.01])
-def test_a_guess_beyond_a_default_bound_replaces_it(guess):
+def test_a_guess_beyond_a_default_bound_replaces_the_bound(guess):
     (item,) = Parameters.from_mapping({"young_pa": cs.Unknown(guess)}).scalars
     assert item.lower < guess < item.upper
     with pytest.raises(cs.InputError, match="expected a value within"):

@@ -239,7 +239,7 @@ def test_the_initial_point_is_not_the_answer():
 
 
 @pytest.mark.long
-def test_where_reduced_space_finds_no_motion_ipopt_starts_without_it():
+def test_ipopt_starts_without_a_motion_from_reduced_space():
     collocation = Collocation([measured(hung_cube())], soft_guess())
     solution = PRECISE(collocation)
     assert "found none" in note_of(solution)
@@ -418,7 +418,7 @@ def test_from_the_answer_of_reduced_space_five_iterations_suffice(tmp_path):
 
 
 @pytest.mark.long
-def test_a_start_with_finer_steps_is_continued_with_these():
+def test_a_start_with_finer_steps_is_continued_with_finer_steps():
     problem = soft_bar()
     answer = WarmStart.of(ReducedSpace()(replace(problem, substeps=2).collocation()))
     assert answer.substeps == 2

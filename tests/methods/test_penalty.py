@@ -75,7 +75,7 @@ def test_newton_steps_at_large_rho_find_the_truth(name: str):
 
 
 @pytest.mark.long
-def test_the_slack_falls_as_one_over_rho_and_the_bias_with_it():
+def test_slack_and_bias_fall_as_one_over_rho():
     collocation = collocation_of("hung-cube", noise_m=1e-4)
     weights, slacks, thetas = [1e5, 1e6, 1e7, 1e8], [], []
     start = None
@@ -149,7 +149,7 @@ def test_rising_schedules_end_within_the_violation(schedule):
     assert solution.history[-1].violation_n == pytest.approx(solution.max_violation_n)
 
 
-def test_budgets_end_it():
+def test_limits_of_iterations_and_time_end_the_search():
     collocation = collocation_of("hung-cube")
     few = Penalty(max_iterations=7)(collocation)
     assert few.status is Status.ITERATION_LIMIT

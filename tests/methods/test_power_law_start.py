@@ -124,7 +124,7 @@ def test_intervals_of_two_terms_of_a_foam_contain_the_truth(seed):
         assert high - low < max(abs(truth), 1.0)
 
 
-def test_different_ratios_of_compressibility_are_found_where_tests_determine_them():
+def test_different_determined_ratios_of_compressibility_are_found():
     truth = FOAM | {"mu_2_pa": 2e4, "beta_1": 0.05, "beta_2": 1.5}
     tests = (*FOAM_TESTS, ("confined", np.linspace(0.0, -0.3, 15)))
     start, items = start_of(without_guess("hyperfoam-2", measured("hyperfoam-2", truth, tests, 20)))
@@ -167,7 +167,7 @@ def test_terms_that_run_together_are_held_apart():
     assert abs(distance) == pytest.approx(0.5, abs=0.01)
 
 
-def test_terms_that_run_together_are_left_out_where_they_explain_little_of_a_misfit():
+def test_terms_that_run_together_and_explain_little_are_left_out():
     """A ripple that no term explains is larger than what the second term explains."""
     tests = []
     for test, largest in (("uniaxial", 2.0), ("equibiaxial", 1.0), ("planar", 1.5)):

@@ -75,7 +75,7 @@ def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
 
 
 @pytest.mark.parametrize("make", [hung_cube, released_cube, bar_in_two_hands])
-def test_with_noise_it_is_the_optimum_of_interior_point(make):
+def test_the_answer_with_noise_is_that_of_interior_point(make):
     collocation = Collocation([noisy(make(15))], GUESS)
     solution = ReducedSpace()(collocation)
     reference = InteriorPoint(tolerance=1e-12)(collocation)
@@ -112,7 +112,7 @@ def test_fixed_parameters_stay_and_the_others_are_found():
     assert solution.parameters["gamma_r_s"] == TRUTH["gamma_r_s"]
 
 
-def test_with_all_parameters_fixed_it_simulates():
+def test_a_search_with_all_parameters_fixed_simulates():
     fixed = Parameters(tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH))
     solution = ReducedSpace()(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
@@ -141,7 +141,7 @@ def test_a_bound_that_excludes_the_truth_is_active_at_the_answer(bound: dict):
     assert solution.kkt_residual < KKT
 
 
-def test_a_prior_pulls_as_it_does_in_interior_point():
+def test_a_prior_pulls_as_in_interior_point():
     parameters = with_parameter("lambda_pa", prior=(220.0, 0.01))
     collocation = Collocation([measured(hung_cube())], parameters)
     solution = ReducedSpace()(collocation)

@@ -384,7 +384,7 @@ def test_a_body_that_can_never_be_simulated_is_refused():
 
 
 @pytest.mark.long
-def test_with_a_guess_it_is_left_to_the_method():
+def test_a_problem_with_a_guess_is_not_scanned():
     given = too_soft() | {n: Unknown(3e-3, 2e-3, 4e-3) for n in ("lambda_pa", "mu_pa")}
     solution = solve(cube(given | {"gamma_r_s": 1e-3, "gamma_m_1_s": 1.0}))
     assert solution.status is Status.NOT_SIMULABLE

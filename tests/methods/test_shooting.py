@@ -88,7 +88,7 @@ def test_the_true_parameters_are_recovered(experiment: str):
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
 @pytest.mark.parametrize("make", [hung_cube, bar_in_two_hands, bar_let_go])
-def test_with_noise_it_is_the_optimum_of_the_reduced_space(make, gradient):
+def test_the_answer_with_noise_is_that_of_the_reduced_space(make, gradient):
     collocation = with_noise(make())
     solution = Shooting(gradient)(collocation)
     reference = ReducedSpace()(collocation)
@@ -119,7 +119,7 @@ def test_experiments_are_fitted_together_up_to_a_bound(gradient):
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-def test_with_all_parameters_fixed_it_simulates(gradient):
+def test_a_search_with_all_parameters_fixed_simulates(gradient):
     fixed = Parameters(tuple(Parameter(name, TRUTH[name], is_fixed=True) for name in TRUTH))
     solution = Shooting(gradient)(Collocation([measured(hung_cube())], fixed))
     assert solution.status is Status.CONVERGED
@@ -175,7 +175,7 @@ def test_trials_that_cannot_be_simulated_are_stepped_back_from(gradient, monkeyp
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-def test_where_everything_else_fails_it_stalls_at_the_guess(gradient, monkeypatch):
+def test_a_search_without_a_simulable_step_stalls_at_the_guess(gradient, monkeypatch):
     def only_the_guess(collocation, p, stopwatch=None):
         if not np.array_equal(p, GUESS.guess_q):
             raise SimulationError("it fails", 0.1)

@@ -15,7 +15,7 @@ def test_results_are_in_the_order_of_the_items():
     assert map_experiments(lambda k: k**2, range(7), threads=2) == [k**2 for k in range(7)]
 
 
-def test_items_wait_for_each_other_only_where_there_are_threads_for_them():
+def test_items_wait_for_each_other_only_with_enough_threads():
     both = threading.Barrier(2)
     map_experiments(lambda _: both.wait(timeout=10), range(2), threads=2)
     alone = map_experiments(lambda _: threading.current_thread(), range(2), threads=1)

@@ -74,7 +74,7 @@ def test_first_step_takes_its_inertia_from_the_start_velocity(backward_euler):
 
 
 @pytest.mark.parametrize("lag", [0, 1, 2])
-def test_jacobian_blocks_are_the_printed_ones(backward_euler, lag: int):
+def test_jacobian_blocks_are_those_of_the_paper(backward_euler, lag: int):
     collocation, x = backward_euler
     transcription = collocation.transcriptions[0]
     body, step, free = transcription.body, transcription.dynamics.step_s, transcription.free_dofs

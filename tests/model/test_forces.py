@@ -151,7 +151,7 @@ def test_tendon_loss_and_factor_count_and_a_tendon_only_pulls():
     assert pressure.with_calibration(1.0, 0.0, np.log(2)).lag_s == pytest.approx(2 * pressure.lag_s)
 
 
-def test_forces_on_the_way_to_other_times_lie_between_them(transcription, rng):
+def test_forces_between_two_times_lie_between_their_values(transcription, rng):
     x, v = states(transcription, rng)
     theta = transcription.constants.theta(transcription.parameters.guess_q)
     here, there = (

@@ -98,14 +98,14 @@ def some_positions(program: Collocation, rng: np.random.Generator) -> np.ndarray
     return rigid + 1e-3 * rng.normal(size=rigid.shape)
 
 
-def test_rows_vanish_where_it_follows_from_the_motion(program, rng):
+def test_rows_vanish_where_the_variable_follows_from_the_motion(program, rng):
     z = program.pack(program.guess_p, [some_positions(program, rng)])
     (carried,) = program.lifted
     assert (z[carried.columns] > 0.01).all()
     np.testing.assert_allclose(program.constraint_values(z)[carried.rows], 0.0, atol=1e-14)
 
 
-def test_a_programs_matrices_have_it(program, rng):
+def test_matrices_of_a_program_contain_the_variable(program, rng):
     z = program.pack(program.guess_p, [some_positions(program, rng)])
     (carried,), y = program.lifted, rng.normal(size=program.constraint_count)
     z[carried.columns] += 0.01 * rng.normal(size=carried.count)
@@ -124,7 +124,7 @@ def test_a_programs_matrices_have_it(program, rng):
     assert np.abs(hessian[carried.columns][:, : program.nq]).max() > 0
 
 
-def test_columns_that_eliminate_it_are_those_of_its_rows(program, rng):
+def test_eliminating_columns_are_those_of_the_rows(program, rng):
     """Forward −J_h⁻¹ J_p of the rows, backward their transpose."""
     x = some_positions(program, rng)
     z, (transcription,), (carried,) = (

@@ -50,7 +50,7 @@ ONE_OF_EACH = {
 # What they do
 
 
-def test_without_nuisance_markers_read_where_they_are():
+def test_markers_without_nuisance_read_their_positions():
     cube = hung_cube()
     plain = simulate(cube, TRUTH, "midpoint", substeps=1).markers_m
     np.testing.assert_allclose(readings(cube, np.zeros(0)), plain, atol=1e-15)
@@ -139,7 +139,7 @@ def test_a_tilt_turns_gravity_and_keeps_its_size():
     assert angle == pytest.approx(np.arctan(0.05 * np.sqrt(5)), rel=1e-9)
 
 
-def test_without_gravity_there_is_no_tilt():
+def test_a_body_without_gravity_has_no_tilt():
     floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
     nuisance = NuisanceMap.from_experiment(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
     assert nuisance.size == 0
@@ -312,7 +312,7 @@ def test_a_place_beyond_an_edge_of_the_surface_settles():
     assert np.isclose(distance_m, [1e-4, 0.007, 0.0247], atol=1e-9).any()
 
 
-def test_a_problem_with_other_places_does_not_keep_the_charts_of_the_old_ones():
+def test_other_places_do_not_keep_the_earlier_charts():
     cube = replace(hung_cube(4), nuisance=ONE_OF_EACH["place"])
     charted = Collocation([cube], GUESS, associations={cube.name: first_association(cube)})
     exact = replace(charted, experiments=[replace(cube, nuisance=IDEAL)])

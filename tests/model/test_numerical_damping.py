@@ -88,7 +88,7 @@ def test_the_substeps_named_are_the_fewest_that_suffice(scheme):
     assert not good(needed - 1)
 
 
-def test_few_substeps_suffice_for_slow_modes_and_none_are_enough_for_absurd_ones():
+def test_few_substeps_suffice_for_slow_modes_and_none_for_absurd_modes():
     assert substeps_needed(MIDPOINT, 1.0, STEP_S, 0.005) == 1
     assert substeps_needed(EULER, 1e6, STEP_S, 0.005) is None
 

@@ -66,7 +66,7 @@ def test_a_nuisance_parameter_of_a_user_is_found_beside_the_material(name: str, 
     np.testing.assert_allclose(solution.theta, list(TRUTH.values()), rtol=1e-3)
 
 
-def test_a_run_reports_the_numerical_damping_and_the_verdict_judges_it():
+def test_a_run_reports_the_users_parameter_and_the_verdict_judges_it():
     cube = known_to(replace(hung_cube(14), nuisance=only(SCALE)), 1e-4)
     far = 5.0  # deviations of its prior
     seen = seen_with(cube, np.array([far]))
@@ -82,7 +82,7 @@ def test_a_run_reports_the_numerical_damping_and_the_verdict_judges_it():
     assert re.search(r"camera scale (9\.\d|10) % \(prior ±2 %\)", said)
 
 
-def test_without_it_the_answer_is_wrong():
+def test_an_omitted_nuisance_parameter_spoils_the_answer():
     """What the parameter is for: stiffness takes the blame for the scale."""
     cube = known_to(replace(hung_cube(14), nuisance=only(SCALE)), 1e-5)
     seen = seen_with(cube, np.array([-2.0]))

@@ -244,7 +244,7 @@ def test_a_tied_parameter_is_a_multiple_of_another(rng):
     assert_derivatives(parameters, box(), rng)
 
 
-def test_a_tie_to_a_fixed_value_is_fixed_with_it():
+def test_a_tie_to_a_fixed_value_is_fixed():
     given = {"mu_pa": 300.0, "lambda_pa": Tied("mu_pa"), "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
     parameters = Parameters.from_mapping(given)
     np.testing.assert_allclose(ThetaMap(parameters, box()).theta([]), [300.0, 300.0, 0.0, 0.0])

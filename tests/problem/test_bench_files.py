@@ -159,7 +159,7 @@ def test_rows_without_times_are_equilibria_of_a_body_without_memory(tmp_path):
         Problem.read(file)
 
 
-def test_columns_are_named_where_they_are_not_recognised(written):
+def test_unrecognised_columns_are_named(written):
     file = written("Takt [s],Kanal 1 (mm),Kanal 2,rest\n0,0,0,5\n1,2,3,5\n")
     moved = read_displacement(file, {"t": "Takt [s]", "displacement": "Kanal 1 (mm)"})
     np.testing.assert_allclose(moved.positions_m[:, 2], [0, 2e-3])
@@ -255,7 +255,7 @@ def block_problem(folder: Path, text: str = SHARED) -> Path:
     return folder / "problem.toml"
 
 
-def test_experiments_share_keys_that_they_do_not_state(tmp_path):
+def test_experiments_share_keys_stated_above(tmp_path):
     problem = Problem.read(block_problem(tmp_path))
     first, second = problem.experiments
     np.testing.assert_allclose(first.t_s, [0, 0.2])
@@ -522,7 +522,7 @@ def test_units_have_their_defined_factors(unit: str, dimension: str, si: float):
         ("video", {"body.vtu", "poses.csv", "front.csv", "front.yaml"}),
     ],
 )
-def test_a_new_problem_of_each_kind_runs_as_it_is(tmp_path, monkeypatch, kind, data):
+def test_a_new_problem_of_each_kind_runs_unchanged(tmp_path, monkeypatch, kind, data):
     monkeypatch.chdir(tmp_path)
     begun = run_command("new", "mine", "--kind", kind)
     assert begun.code == 0
@@ -755,9 +755,7 @@ def test_a_shape_that_cannot_be_meshed_is_refused(tmp_path, shape, words):
         ("box_m = [0.02, 24, 0.02]", "object.box_m: found 24 m; expected at most 10 m, likely"),
     ],
 )
-def test_a_length_in_millimetres_is_named_and_not_the_edges_that_it_makes_too_many(
-    tmp_path, shape, words
-):
+def test_a_length_in_millimetres_is_named_instead_of_too_many_edges(tmp_path, shape, words):
     text = SHARED.replace('mesh = "block.vtu"', f"{shape}\nedge_length_m = 0.0005")
     with pytest.raises(InputError) as caught:
         Problem.read(block_problem(tmp_path, text))

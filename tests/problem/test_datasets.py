@@ -106,7 +106,7 @@ def test_a_copy_of_measured_data_has_source_licence_and_schema(tmp_path):
         copy_dataset("diani", tmp_path / "diani")
 
 
-def test_a_copy_of_a_simulated_recording_names_a_schema_beside_it(tmp_path):
+def test_a_copy_of_a_simulated_recording_names_a_schema_in_its_folder(tmp_path):
     file, *_ = copy_dataset("foam_cylinder", tmp_path)
     assert file.name == "recording.toml"
     for each in (file, tmp_path / "problem.toml"):

@@ -40,7 +40,7 @@ def validate(file: Path, schema: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["compression", "swing", "tension", "video"])
-def test_a_template_names_the_schema_and_follows_it(kind, tmp_path):
+def test_a_template_follows_the_schema_that_it_names(kind, tmp_path):
     assert first_line(TEMPLATES / kind / "problem.toml") == f"#:schema {SCHEMA_FILE}"
     file, *others = create_problem(tmp_path / "mine", kind)
     assert first_line(file) == f"#:schema {SCHEMA_FILE}"
@@ -52,7 +52,7 @@ def test_a_template_names_the_schema_and_follows_it(kind, tmp_path):
 
 
 @pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
-def test_a_shipped_problem_names_the_schema_and_follows_it(file):
+def test_a_shipped_problem_follows_the_schema_that_it_names(file):
     directive, _, path = first_line(file).partition(" ")
     assert directive == "#:schema"
     schema = file.parent / path
@@ -105,7 +105,7 @@ def test_the_reference_is_the_first_line_once():
     assert again == '#:schema https://example.org/schema.json\ntitle = ""\n'
 
 
-def test_a_schema_of_others_is_left_alone(tmp_path):
+def test_another_schema_is_left_alone(tmp_path):
     own = tmp_path / "mine" / SCHEMA_FILE
     own.parent.mkdir()
     own.write_text("mine")

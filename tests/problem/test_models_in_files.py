@@ -113,7 +113,7 @@ def test_a_slip_in_the_model_is_one_message(tiny, old: str, new: str, expected: 
     assert expected in refusal(tiny)
 
 
-def test_foreign_code_is_not_run_unless_it_is_allowed(tiny):
+def test_foreign_code_is_run_only_where_allowed(tiny):
     OWN_MATERIAL(tiny)
     (tiny / "mine.py").write_text(MINE + "\nopen('was_run', 'w')\n")
     assert "--allow-code" in refusal(tiny)

@@ -166,7 +166,7 @@ def test_an_outline_is_on_the_surface(name: str):
     assert max(abs(float(gap(each))) for each in points_m) < 1e-9
 
 
-def test_pictures_have_outlines_where_obstacles_are_and_keep_them():
+def test_pictures_keep_the_outlines_of_obstacles():
     cube = pressed_cube(4)
     seen = MotionRecord.from_experiment(cube)
     assert seen.obstacles_m is not None

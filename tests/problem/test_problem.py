@@ -101,7 +101,7 @@ def test_the_velocity_of_a_body_that_is_thrown_is_stated_in_the_file(tiny):
         experiment_of(tiny, "experiment.swing.start=equilibrium")
 
 
-def test_the_text_as_run_has_the_overrides_in_it(tiny):
+def test_the_text_as_run_contains_the_overrides(tiny):
     given = (tiny / "problem.toml").read_text()
     assert text_of(load(tiny)) == given
     text = text_of(load(tiny, "parameters.mu_pa.guess=250"))
@@ -235,7 +235,7 @@ def test_a_grasp_is_a_table_or_a_list_of_tables(tiny):
     np.testing.assert_array_equal(one[0].poses.positions_m, listed[0].poses.positions_m)
 
 
-def test_a_second_hand_without_poses_stays_where_it_is(tiny):
+def test_a_second_hand_without_poses_does_not_move(tiny):
     second = "{ nodes = { box_m = [[-1, -1, -1], [1, 1, 0.001]] } }"
     replace_text(GRASP, f"[{GRASP}, {second}]")(tiny)
     experiment = experiment_of(tiny)
@@ -268,7 +268,7 @@ def test_places_of_markers_without_a_reference_start_from_their_first_sample(tin
     )
 
 
-def test_some_markers_may_have_a_reference_and_others_not(tiny):
+def test_a_part_of_the_markers_may_have_a_reference(tiny):
     known = experiment_of(tiny).markers
     replace_text("mid = [0.03, 0.02, 0.03], ", "")(tiny)
     experiment = experiment_of(tiny)
@@ -282,7 +282,7 @@ def test_some_markers_may_have_a_reference_and_others_not(tiny):
     )
 
 
-def test_a_marker_that_is_late_is_placed_where_it_was_first_seen(tiny):
+def test_a_late_marker_is_placed_by_its_first_sample(tiny):
     replace_text(f"reference_m = {REFERENCES}", "")(tiny)
     for column in (1, 2, 3):
         replace_cell(MARKERS, 2, column, "")(tiny)
@@ -433,7 +433,7 @@ def test_poses_of_another_rate_need_no_resampling(tiny):
     np.testing.assert_allclose(*held, atol=1e-5)
 
 
-def test_poses_of_the_gripper_carry_the_body_that_it_holds(tiny):
+def test_poses_of_the_gripper_carry_the_held_body(tiny):
     expected = experiment_of(tiny)
     of_body = np.eye(4)
     of_body[:3, :3] = Rotation.from_quat([0.5, -0.5, 0.5, 0.5]).as_matrix()

@@ -162,7 +162,7 @@ def test_curves_become_specimens_in_si_units(curves):
     assert shear.measurements[0].measured_values[:, 0] == pytest.approx([-300.0, 0.0, 600.0])
 
 
-def test_unknown_authors_and_tests_are_refused_with_the_known_ones(curves):
+def test_unknown_authors_and_tests_are_refused_with_the_known_names(curves):
     with pytest.raises(cs.InputError, match=r"author: found 'Meunier'.*mean 'Meunier_2008'"):
         cs.datasets.hyperelastic_curves("Meunier", "yeoh")
     with pytest.raises(cs.InputError, match=r"tests: found 'ET'; expected one of UT"):

@@ -80,7 +80,7 @@ def test_markers_on_the_gripper_give_its_poses_and_are_not_fitted(tracked):
     )
 
 
-def test_a_marker_of_the_gripper_is_fitted_if_it_is_named(tracked):
+def test_a_named_marker_of_the_gripper_is_fitted(tracked):
     driven_by_markers(tracked)
     experiment = load(
         tracked,

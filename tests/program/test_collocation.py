@@ -128,7 +128,7 @@ def test_gauss_newtons_hessian_is_the_exact_one_where_readings_are_met():
     np.testing.assert_allclose(found, exact, atol=1e-9 * np.abs(exact).max())
 
 
-def test_values_are_written_where_they_are_wanted():
+def test_values_are_written_into_given_arrays():
     collocation = Collocation([swung(), swung(steps=3)], GUESS)
     z = some_point(collocation)
     y = np.ones(collocation.constraint_count)
@@ -329,7 +329,7 @@ def test_the_numpy_combiner_fills_the_same_values(monkeypatch):
         assert relative_error(found, expected) < 1e-14
 
 
-def test_a_program_with_other_associations_equals_one_made_for_them(rng):
+def test_a_program_with_other_associations_equals_a_new_one(rng):
     """What was cached before is shared only where it does not depend on them."""
     before = Collocation([cube_with_nuisance(5), swung()], GUESS)
     before.hessian(some_point(before, rng), 1.0, None)

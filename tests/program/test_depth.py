@@ -58,7 +58,7 @@ def test_stiffness_is_found_with_the_camera_20_mm_and_10_degrees_off(rng):
     ("axis", "way"),
     [((0.61, -0.71, 0.36), (-0.54, 0.48, -0.7)), ((0.83, 0.31, 0.46), (-0.09, 0.53, -0.84))],
 )
-def test_a_camera_sees_the_faces_that_are_turned_to_where_it_is_found_to_be(axis, way, rng):
+def test_a_camera_sees_the_faces_turned_to_its_estimated_place(axis, way, rng):
     """Not to where it is said to be: 20 mm and 10 degrees off, it would not see the bar's top."""
     camera = cs.DepthCamera(
         MATRIX, pose=moved(np.radians(10) * np.array(axis), 0.02 * np.array(way))

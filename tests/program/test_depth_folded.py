@@ -52,7 +52,7 @@ def seen_in(shift_m: np.ndarray, settled: bool = True) -> tuple[SurfaceCorrespon
     return there, own
 
 
-def test_of_a_folded_body_where_it_is_nothing_counts_as_hidden():
+def test_no_point_of_a_folded_body_at_its_place_counts_as_hidden():
     sighting, _ = seen_in(np.zeros(3))
     assert sighting.excluded_counts["hidden"] == 0
     used = sighting.is_compared[0]

@@ -64,7 +64,7 @@ def test_the_interval_contains_the_truth_with_a_step_error(run):
     assert abs(off[1]) < 0.5 * off[0]
 
 
-def test_all_images_are_kept_for_pictures_and_four_of_them_with_outlines(run):
+def test_all_images_are_kept_for_pictures_and_four_with_outlines(run):
     (replay,) = replays(run)
     rows = replay.visible_points["front"]
     points = rows[np.isfinite(rows[:, 4])]

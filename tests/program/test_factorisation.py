@@ -51,7 +51,7 @@ def kept(pattern: SymmetricPattern, values: np.ndarray, free: np.ndarray) -> np.
     return sp.csr_array(pattern.matrix(values)).toarray()[np.ix_(free, free)]
 
 
-def test_the_band_is_taken_where_it_costs_less():
+def test_the_band_is_taken_where_cheaper():
     free = without_first_nodes(BAR.pattern)
     assert Factoriser(BAR.pattern, free).is_banded
     # A star: hardly any fill-in, and the widest of bands.
@@ -119,9 +119,7 @@ def test_a_skew_part_may_outweigh_the_symmetric_one(size: float):
 
 @pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
 @pytest.mark.parametrize("size", [0.1, 1.0, 100.0], ids=["refined", "slowly", "whole"])
-def test_in_wide_bands_the_skew_part_is_solved_for_whether_or_not_it_is_small(
-    size: float, transposed: bool
-):
+def test_wide_bands_are_solved_with_small_and_large_skew_parts(size: float, transposed: bool):
     free = without_first_nodes(WIDE)
     values, skew = (random_values(WIDE, 100.0), size * random_values(WIDE, 0.0, seed=3))
     skew[WIDE.diagonal] = 0

@@ -18,7 +18,7 @@ def motion() -> cs.Trajectory:
     return cs.simulate(lit_cube(), TRUTH, "midpoint", substeps=1)
 
 
-def test_a_beam_is_as_long_as_the_way_to_the_face_that_it_hits(motion: cs.Trajectory):
+def test_a_beam_ends_at_the_face_that_it_hits(motion: cs.Trajectory):
     cube = motion.experiment
     faces = cube.body.mesh.surface
     at_samples = [sensor.with_samples(cube.t_s, None) for sensor in cube.readings]

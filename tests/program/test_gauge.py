@@ -101,7 +101,7 @@ def test_a_static_experiment_is_read_too():
 
 
 @pytest.mark.long
-def test_error_bars_and_verdict_know_them():
+def test_error_bars_and_verdict_contain_unknowns_of_sensors():
     made = noisy(swung())
     finished = run(Problem([made], GUESS), seek_causes=False)
     assert finished.uncertainty is not None
@@ -349,7 +349,7 @@ def test_an_invalid_custom_sensor_in_a_file_is_one_message(worn: Path, edit, wor
     assert words in " ".join(done.err.split())
 
 
-def test_a_readings_code_is_not_run_unless_it_is_allowed(worn: Path):
+def test_code_of_a_reading_is_run_only_where_allowed(worn: Path):
     write("mine.py", "raise SystemExit")(worn)
     done = run_command("solve", "problem.toml")
     assert done.code == 2

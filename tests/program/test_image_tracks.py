@@ -161,7 +161,7 @@ def test_an_unknown_pose_is_found_from_the_body_at_rest() -> None:
     assert any("pose of 'front' as found: pose = [[" in note for note in notes(solution.parts[0]))
 
 
-def test_the_estimated_pose_shows_points_where_they_are_predicted() -> None:
+def test_the_estimated_pose_shows_points_at_their_predictions() -> None:
     residual = residual_of(tracks_of())
     phi = 0.5 * np.random.default_rng(6).normal(size=residual.nuisance.size)
     phi[residual.nuisance.indices_of_labels([residual.sensor.unknown_label("delay_s")])] = 0.0
@@ -208,7 +208,7 @@ def test_cameras_share_the_places_of_points_with_the_same_name() -> None:
     assert count[1].nuisance.size - count[0].nuisance.size == 10  # of the second camera alone
 
 
-def test_a_place_that_one_camera_states_is_known_to_the_others() -> None:
+def test_a_place_stated_for_one_camera_is_known_to_all() -> None:
     places = residual_of(tracks_of("front"), tracks_of("top", known=False)).correspondences
     np.testing.assert_allclose(
         places.association.prior_places_m, list(PLACES_M.values()), atol=1e-12
@@ -262,7 +262,7 @@ def test_points_behind_an_obstacle_are_not_compared() -> None:
     assert [compared["hidden"][n] for n in others] == [compared["free"][n] for n in others]
 
 
-def test_a_solid_hides_what_is_behind_it_and_not_what_touches_it() -> None:
+def test_a_solid_hides_points_behind_and_not_points_in_touch() -> None:
     points = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.21], [0.0, 0.0, 0.8]])
     eyes = np.tile([0.0, 0.0, 2.0], (4, 1))
 

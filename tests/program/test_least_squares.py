@@ -46,7 +46,7 @@ def test_the_best_between_bounds_is_that_of_bounded_least_squares(rng):
 
 
 @pytest.mark.parametrize("rows", [0, 2, 9])
-def test_of_several_best_it_is_the_shortest(rng, rows):
+def test_the_shortest_of_several_minimisers_is_found(rng, rows):
     slope, residual = rng.normal(size=(rows, 4)), rng.normal(size=rows)
     slope[:, 3] = slope[:, 1]
     found = (

@@ -73,7 +73,7 @@ def test_the_fastest_turn_is_the_angle_between_the_poses_of_two_grid_times(subst
     assert (turn.angle_rad / turn.step_s) == pytest.approx(expected / step_s, rel=1e-3)
 
 
-def test_a_fast_turn_is_warned_of_with_the_substeps_that_cure_it():
+def test_a_warning_of_a_fast_turn_names_sufficient_substeps():
     cube = swung(8.0)
     (concern,) = rotation_step_concerns(cube, 1)
     warning = concern.message

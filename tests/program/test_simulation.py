@@ -113,7 +113,7 @@ def test_where_newton_fails_the_load_is_applied_in_steps():
         equilibrium(cube, soft, solver=NewtonSolver(cube, replace(hurried, max_halvings=0)))
 
 
-def test_without_load_the_body_rests_where_the_grasp_carries_it():
+def test_an_unloaded_body_rests_where_the_grasp_carries_the_mesh():
     cube = hung_cube(gravity_m_s2=np.zeros(3))
     x = equilibrium(cube, THETA, time_s=0.07)
     np.testing.assert_allclose(x, cube.rigid_positions([0.07]).ravel(), atol=1e-12)

@@ -106,7 +106,7 @@ def test_the_verdict_names_equilibria_of_another_branch():
 
 
 @pytest.mark.long
-def test_a_smooth_path_is_stable_however_far_it_bends():
+def test_a_smooth_path_with_a_large_bend_is_stable():
     pushed = replace(column(), gravity_m_s2=(0.0, 0.0, -0.5))
     trajectory = cs.simulate(pushed, LAW)
     assert np.ptp(trajectory.positions_m[-1, :, 2]) > 0.06

@@ -82,7 +82,7 @@ def test_sticking_platens_hold_every_axis_and_let_the_side_bulge():
     assert positions[-1, middle, 0].max() > 1.05 * EDGE_M
 
 
-def test_a_body_goes_along_with_platens_that_press_it_far_at_once(monkeypatch):
+def test_a_body_follows_platens_that_press_far_in_one_step(monkeypatch):
     """Moved alone, the platen's nodes would crush the elements below them."""
     tried = []
     newton = NewtonSolver.solve_equilibrium

@@ -140,7 +140,7 @@ def test_an_unstable_equilibrium_is_found_out_by_its_own_factor(checks_stability
         assert np.abs(x - start).max() < 1e-12
 
 
-def test_a_sweep_along_unstable_equilibria_searches_stable_ones(monkeypatch):
+def test_a_sweep_along_unstable_equilibria_searches_stable_equilibria(monkeypatch):
     sought: list[bool] = []
     swept: list[float] = []
 

@@ -110,7 +110,7 @@ def test_steps_that_cannot_be_are_refused(substeps):
 # Intervals
 
 
-def test_the_interval_holds_the_truth_where_the_noises_alone_misses_it():
+def test_the_interval_with_the_step_error_holds_the_truth():
     coarse = found(3e-4, 1)
     noise = coarse.optimum["mu_pa"]
     assert not holds(noise.statistical95, TRUTH["mu_pa"])
@@ -172,7 +172,7 @@ def test_the_chosen_substeps_are_reported_with_the_reason():
     assert finer.result.iterations > found(3e-4, many).solution.iterations
 
 
-def test_the_guess_and_the_way_from_it_are_kept():
+def test_the_guess_and_the_history_are_kept():
     finer = found(3e-4)
     assert finer.solution.collocation.parameters.guesses["mu_pa"] == pytest.approx(400.0)
     numbers = [line.number for line in finer.solution.history]
@@ -202,7 +202,7 @@ def test_a_number_that_is_stated_is_kept():
     assert solved == [2]
 
 
-def test_there_are_no_more_than_the_most():
+def test_substeps_have_an_upper_limit():
     estimates = {"mu_pa": Estimate(100.0, 0.1, (99.8, 100.2))}
     for half, order, needed in ((100.01, 2, 1), (100.14, 2, 2), (100.14, 1, 6), (110.0, 2, 8)):
         error = discretisation_error("mu_pa", estimates["mu_pa"], [half], [], order)

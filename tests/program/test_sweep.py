@@ -147,7 +147,7 @@ def test_chunks_do_not_show(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_the_first_rows_do_not_depend_on_later_ones(scheme: str):
+def test_the_first_rows_do_not_depend_on_later_rows(scheme: str):
     collocation = Collocation([hung_cube(8)], GUESS, scheme)
     _, (x,) = disturbed(collocation)
     (whole,) = forward(collocation, [x])

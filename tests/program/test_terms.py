@@ -66,7 +66,7 @@ def test_a_tied_parameter_is_no_unknown_of_its_own():
     assert solution.parameters["stiff.mu_pa"] == pytest.approx(900.0, rel=1e-5)
 
 
-def test_another_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypatch):
+def test_a_further_parameter_costs_a_right_hand_side_and_no_factorisation(monkeypatch):
     """A sweep factorises every timestep once, whatever the number of parameters."""
     body, truth, guesses = MODELS["two stiffnesses"]
     experiment = measured_with(waved_bar(**body), truth)

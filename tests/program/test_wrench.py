@@ -127,7 +127,7 @@ def test_the_frame_of_the_grasp_moves_along():
     np.testing.assert_allclose(about, in_world[:, 3:], atol=1e-12)
 
 
-def test_a_grasp_that_lets_go_has_a_wrench_while_it_holds():
+def test_a_grasp_that_lets_go_has_a_wrench_while_holding():
     part = at_truth(sensing(bar_let_go(12)))
     still, moving = part.transcription.residuals_of(WrenchResidual)
     assert still.observable.known_rows[-1] == 11

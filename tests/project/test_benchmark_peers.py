@@ -69,7 +69,7 @@ def test_the_table_shows_reached_and_missing_solvers():
     assert len({len(line) for line in cells}) == 1
 
 
-def test_candidates_that_are_missing_or_fail_do_not_stop_the_others(monkeypatch, capsys, tmp_path):
+def test_missing_or_failing_candidates_do_not_stop_a_benchmark(monkeypatch, capsys, tmp_path):
     def measure(name: str) -> Track:
         if name == "mujoco-sysid":
             raise subprocess.CalledProcessError(3, "python")

@@ -164,7 +164,7 @@ def test_the_problem_file_in_the_readme_is_complete():
     assert {key: each for key, each in shown.items() if key != "title"} == stated
 
 
-def test_the_glossary_is_in_order_and_its_words_stand_on_the_pages_they_lead_to():
+def test_words_of_the_glossary_are_in_order_and_on_their_pages():
     glossary = ROOT / "docs" / "glossary.md"
     rows = re.findall(
         r"^\| (.+?) \| .+ \| \[.+?\]\((.+?)\) \|$", glossary.read_text(), re.MULTILINE

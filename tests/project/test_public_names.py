@@ -32,7 +32,7 @@ def test_every_public_name_is_imported_for_type_checkers_and_has_a_value():
     assert set(cs.__all__) <= set(dir(cs))
 
 
-def test_there_is_no_stub_beside_the_modules():
+def test_the_package_has_no_stub_files():
     """Type checkers would read it in place of the module."""
     assert not list(FILE.parent.rglob("*.pyi"))
 
@@ -60,7 +60,7 @@ def test_pictures_do_not_import_scipys_signal_processing():
 
 
 @pytest.mark.long
-def test_pyright_knows_the_types_of_public_names_and_reports_misspelt_ones(tmp_path):
+def test_pyright_knows_public_names_and_reports_misspelt_names(tmp_path):
     if find_spec("pyright") is None:
         pytest.skip("pyright is not installed")
     program = tmp_path / "program.py"

@@ -134,7 +134,7 @@ def test_every_dependency_states_its_licence():
         assert re.match(r"[\w-]+", requirement)[0] in page, requirement
 
 
-def test_all_data_of_others_state_their_licence():
+def test_all_foreign_data_state_a_licence():
     page = (ROOT / "docs" / "licences.md").read_text()
     scripts = [file.stem.removeprefix("get_") for file in (ROOT / "scripts").rglob("get_*.py")]
     assert len(scripts) >= 4

@@ -278,7 +278,7 @@ def test_shifted_poses_are_not_taken_for_matching():
     assert "interpolated (linear)" in interpolated
 
 
-def test_printed_times_of_poses_are_evened_before_they_are_interpolated():
+def test_printed_times_of_poses_are_evened_before_interpolation():
     printed = np.round(np.arange(61) / 30, 3)
     t = 0.01 * np.arange(200)
     true = np.arange(61) / 30
@@ -288,7 +288,7 @@ def test_printed_times_of_poses_are_evened_before_they_are_interpolated():
     np.testing.assert_array_equal(unrounded_s(t**2), t**2)
 
 
-def test_poses_and_markers_are_cut_to_the_time_they_share():
+def test_poses_and_markers_are_cut_to_the_shared_time():
     t = 0.01 * np.arange(100)
     table = moving_table(t)
     found = align([moving_poses(t[20:60])], table)
@@ -303,7 +303,7 @@ def test_poses_and_markers_are_cut_to_the_time_they_share():
     np.testing.assert_allclose(resampled.t_s, np.arange(0.2, 0.581, 0.02))
 
 
-def test_several_grasps_are_cut_to_the_time_they_share():
+def test_several_grasps_are_cut_to_the_shared_time():
     t = 0.01 * np.arange(100)
     found = align(
         [moving_poses(t[:70]), PoseSequence.fixed(), moving_poses(t[30:] + 0.004)], moving_table(t)

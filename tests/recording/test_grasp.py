@@ -129,7 +129,7 @@ def test_smooth_is_the_same_motion_in_any_frame():
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_few_poses_are_interpolated_as_far_as_they_allow(count):
+def test_few_poses_are_interpolated_by_a_lower_order(count):
     poses = turning_poses("smooth", m=count)
     asked = np.linspace(0.0, poses.t_s[-1], 11)
     rotations, positions_m = poses.at(asked)

@@ -55,7 +55,7 @@ def test_lost_markers_do_not_count():
     assert impact_steps(replace(fall, markers=replace(fall.markers, positions_m=tracks_m))) == 10
 
 
-def test_a_problem_uses_these_steps_unless_it_states_others():
+def test_a_problem_uses_the_steps_of_impacts_by_default():
     fall = passing(0.975 * DOWN_M_S)
     law = {"young_pa": cs.Unknown(1e5), "poisson": 0.3, "gamma_r_s": 0.01, "gamma_m_1_s": 0.1}
     assert cs.Problem([fall], law).collocation().substeps == 10

@@ -102,7 +102,7 @@ def test_the_scheme_keeps_its_order_where_a_mass_joins():
     assert (orders > 1.7).all()
 
 
-def test_the_estimated_time_acts_as_if_it_were_stated():
+def test_the_estimated_time_acts_as_a_stated_one():
     bar = bar_loaded(8)
     (transcription,) = Collocation([bar], GUESS).transcriptions
     phi = np.array([0.3, -0.5, 1.3, -0.7, 0.4, 0.9])

@@ -278,7 +278,7 @@ def test_the_frame_of_the_markers_is_listed_and_begins_chains(tmp_path: Path) ->
     assert any("/tags" in line and " camera " in line for line in lines)
 
 
-def test_markers_of_several_namespaces_have_these_in_their_names(tmp_path: Path) -> None:
+def test_markers_of_several_namespaces_are_named_with_the_namespace(tmp_path: Path) -> None:
     def array(t: float, spaces: tuple[str, ...]) -> tuple[float, dict[str, Any]]:
         places = [(space, k) for space in spaces for k in range(2)]
         markers = [
@@ -565,7 +565,7 @@ def test_a_camera_without_lens_model_is_refused(tmp_path: Path) -> None:
     assert "camera" not in told["/camera_info"]
 
 
-def test_of_messages_of_one_time_the_first_counts(tmp_path: Path) -> None:
+def test_the_first_of_several_messages_of_one_time_counts(tmp_path: Path) -> None:
     of = Messages()
     images = [of.image(0.0, "16UC1", each * PIXELS, "/depth") for each in np.array([1, 2], "<u2")]
     log = bag(tmp_path / "trial", images)
@@ -650,7 +650,7 @@ def test_a_file_whose_name_has_a_mark_is_a_file(tmp_path: Path) -> None:
     assert stored_files(file) == [file]
 
 
-def test_frames_without_a_chain_between_them_are_refused(tmp_path: Path) -> None:
+def test_unconnected_frames_are_refused(tmp_path: Path) -> None:
     of = Messages()
     trees = [
         of.tree(

@@ -77,7 +77,7 @@ def body(request):
 
 
 @pytest.mark.parametrize("deform", [np.asarray, bend])
-def test_inside_points_are_embedded_where_they_are(body, deform):
+def test_inside_points_are_embedded_at_their_place(body, deform):
     nodes = deform(body.nodes_m)
     points = deform(np.random.default_rng(2).uniform([0.02] * 3, [0.18, 0.18, 0.28], (20, 3)))
     placement = place_markers(points, nodes, body, attach="embedded")

@@ -66,7 +66,7 @@ def assert_same_poses(found, expected):
     np.testing.assert_allclose(turn.magnitude(), 0.0, atol=1e-7)
 
 
-def test_columns_may_be_called_and_measured_as_robots_write_them(file):
+def test_columns_have_the_names_and_units_that_robots_write(file):
     exported = (
         "Controller;KR 6\n\nTime (ms);X [mm];Y (mm);Z / mm;qx;qy;qz;qw\n"
         "0;0;0;1000;0;0;0;1\n100;500;0;1000;0;0;0,6;0,8\n"

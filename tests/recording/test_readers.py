@@ -204,7 +204,7 @@ def test_a_bad_marker_file_is_named_by_its_line(file, found, replacement, words)
     assert all(word in message for word in words), message
 
 
-def test_lines_are_counted_over_blank_ones(file):
+def test_blank_lines_are_counted(file):
     message = refusal(read_markers, file(MARKERS.replace("0.1,1.5", "\n\n0.1,x")))
     assert "line 5" in message
 
@@ -250,7 +250,7 @@ def test_markers_survive_writing_and_reading(tmp_path):
     assert ",,,," in (tmp_path / "markers.csv").read_text().splitlines()[3]
 
 
-def test_writing_replaces_a_file_and_leaves_nothing_beside_it(tmp_path):
+def test_writing_replaces_a_file_and_leaves_no_other_file(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_text("old")
     write_poses_csv(path, PoseSequence.fixed())

@@ -208,7 +208,7 @@ def test_tables_of_machines_are_read(tmp_path, header, factors, keys):
     )
 
 
-def test_true_stress_is_converted_if_it_is_declared(tmp_path):
+def test_declared_true_stress_is_converted(tmp_path):
     strain = np.linspace(0.05, 0.8, 12)
     read = simulated("uniaxial", strain)
     across = read["lateral stretch"]
@@ -579,7 +579,7 @@ def test_compare_ranks_laws_by_held_out_specimens(tmp_path):
     assert "held out kPa" in outcome.out
 
 
-def test_refinement_leaves_specimens_as_they_are(tmp_path):
+def test_refinement_does_not_change_specimens(tmp_path):
     run = cs.run(cs.Problem.read(written(tmp_path)))
     with pytest.raises(cs.InputError, match="homogeneous and exact"):
         cs.refine(run)

@@ -79,9 +79,7 @@ def test_tables_of_deeplabcut_are_read(tmp_path: Path) -> None:
     require_same(read_tracks(tmp_path / "dlc.csv"))
 
 
-def test_hdf5_files_of_deeplabcut_are_read_without_executing_what_they_contain(
-    tmp_path: Path,
-) -> None:
+def test_hdf5_files_of_deeplabcut_are_read_without_executing_their_contents(tmp_path: Path) -> None:
     pytest.importorskip("tables")
     pytest.importorskip("h5py")
     deeplabcut().to_hdf(tmp_path / "dlc.h5", key="df_with_missing", format="table", mode="w")

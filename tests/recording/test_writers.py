@@ -184,7 +184,7 @@ def test_an_empty_folder_is_used(tmp_path):
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
-def test_a_failure_leaves_everything_as_it_was(tmp_path, failure):
+def test_a_failure_changes_nothing(tmp_path, failure):
     target = earlier_run(tmp_path / "run")
     before = listing(tmp_path)
 
@@ -240,7 +240,7 @@ def test_an_edited_file_keeps_an_earlier_run_from_being_replaced(tmp_path):
         pytest.fail("the work was started")
 
 
-def test_files_added_to_a_run_are_replaced_with_it(tmp_path):
+def test_files_added_to_a_run_are_replaced_with_the_run(tmp_path):
     target = earlier_run(tmp_path / "run")
     write_text_file(target / "report.html", "a page")
     write_text_file(target / "old.png", "drawn again")
@@ -268,7 +268,7 @@ def test_nothing_is_written_through_a_link(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links of POSIX")
-def test_a_link_in_an_earlier_run_keeps_it_from_being_replaced(tmp_path):
+def test_an_earlier_run_with_a_link_is_not_replaced(tmp_path):
     target = earlier_run(tmp_path / "run")
     (target / "old.png").rename(tmp_path / "old.png")
     (target / "old.png").symlink_to(tmp_path / "old.png")
@@ -279,7 +279,7 @@ def test_a_link_in_an_earlier_run_keeps_it_from_being_replaced(tmp_path):
         pytest.fail("the work was started")
 
 
-def test_a_run_may_be_moved_and_copied_before_it_is_replaced(tmp_path):
+def test_a_moved_or_copied_run_may_be_replaced(tmp_path):
     earlier_run(tmp_path / "run").rename(tmp_path / "moved")
     shutil.copytree(tmp_path / "moved", tmp_path / "copied")
     for name in ("moved", "copied"):

@@ -242,7 +242,7 @@ def found():
 
 
 @pytest.mark.long
-def test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart(found):
+def test_the_fitted_surface_is_drawn_over_the_image_with_distances(found):
     (part,) = found.collocation.iterates(found.z)
     (reading,) = camera_residuals(part.transcription)
     surface = reading.fitted(part.motion_for(reading.observable), part.phi)

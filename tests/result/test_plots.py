@@ -146,7 +146,7 @@ def test_parameters_are_drawn_relative_to_their_final_values():
     assert "200 Pa" in str(first.get_label())
 
 
-def test_parameters_are_drawn_relative_to_the_truth_where_it_is_known():
+def test_parameters_are_drawn_relative_to_a_known_truth():
     axes = convergence(history(), truth={**TRUTH, "lambda_pa": 100.0}).axes[3]
     np.testing.assert_allclose(axes.lines[1].get_ydata(), [32, 16, 8, 4, 2])
     assert "truth" in axes.get_ylabel()
@@ -196,7 +196,7 @@ def test_missing_samples_leave_gaps():
     assert np.flatnonzero(np.isnan(side)).tolist() == [5, 6, 7]
 
 
-def test_tracks_keep_to_a_page_on_which_they_are_legible():
+def test_tracks_fit_legibly_on_a_page():
     measured_m, fitted = noisy_tracks(markers=9)
     figure = marker_tracks(TIMES, [f"m{k}" for k in range(9)], measured_m, fitted)
     assert len(figure.axes) == 2 * 3 * 3
@@ -219,7 +219,7 @@ def test_a_budget_has_its_whole_legend_and_colours_that_differ():
     assert ends[-1] == pytest.approx(1.0)
 
 
-def test_of_many_markers_the_worst_are_shown():
+def test_the_worst_of_many_markers_are_shown():
     measured_m, fitted = noisy_tracks(markers=9)
     fitted[:, 4] += 0.1
     fitted[:, 7] += 0.1
@@ -256,7 +256,7 @@ def test_components_that_vanish_have_no_panel(friction, titles):
     assert [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()] == titles
 
 
-def test_measurements_about_a_prediction_of_zero_are_drawn_if_they_are_no_noise():
+def test_significant_measurements_about_a_prediction_of_zero_are_drawn():
     t_s = np.linspace(0.0, 1.0, 50)
     measured = np.outer(t_s, [0.2, 1.0])
     fitted = np.outer(t_s, [0.0, 1.0])
@@ -267,7 +267,7 @@ def test_measurements_about_a_prediction_of_zero_are_drawn_if_they_are_no_noise(
     assert len(alone.axes) == 1  # nothing else could be drawn
 
 
-def test_of_many_numbers_those_with_the_largest_errors_are_drawn():
+def test_numbers_with_the_largest_errors_are_drawn():
     t_s = np.linspace(0.0, 1.0, 10)
     measured = np.outer(t_s, np.ones(20))
     fitted = measured + 0.01 * np.arange(20)
@@ -373,7 +373,7 @@ def replay(make=hung_cube) -> MotionRecord:
     return MotionRecord.from_experiment(experiment, seen, seen, np.array([3.0, 7.0]))
 
 
-def test_a_camera_sees_right_and_up_as_they_are():
+def test_a_picture_has_the_right_and_up_of_its_camera():
     camera = ParallelCamera.from_direction((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
     np.testing.assert_allclose(camera.project(np.eye(3)), [[1, 0], [0, 0], [0, 1]], atol=1e-15)
     np.testing.assert_allclose(camera.coordinates_to_viewer_m(np.eye(3)), [0, -1, 0], atol=1e-15)
@@ -560,7 +560,7 @@ def test_gaps_hardly_change_a_spectrum_and_unseen_markers_do_not_count():
     assert np.nanmax(seen) == pytest.approx(np.nanmax(whole), rel=0.02)
 
 
-def test_modes_are_numbered_and_near_ones_together():
+def test_modes_are_numbered_and_near_modes_share_a_label():
     t = 0.01 * np.arange(100)
     track = np.random.default_rng(0).normal(size=(100, 2, 3))
     figure = spectrum_picture(t, track, None, np.array([3.0, 3.1, 20.0, 80.0]))
@@ -570,7 +570,6 @@ def test_modes_are_numbered_and_near_ones_together():
 # Files
 
 
-@pytest.mark.long
 def bench(measured_axes: tuple[int, ...] = (2,)) -> MotionRecord:
     """A record of a bench that presses down by 4 mm and back, with a stiffness of 1000 N/m."""
     seen = replay()

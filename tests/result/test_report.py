@@ -130,7 +130,7 @@ def test_the_page_contains_the_output_of_the_terminal(page: str, run_folder: Pat
             assert all(word in text for word in line.split())
 
 
-def test_a_result_read_back_is_shown_as_it_was(run_folder: Path):
+def test_a_result_read_back_is_shown_unchanged(run_folder: Path):
     """Nothing but the file is needed for what the terminal showed after the solve."""
     printed = (run_folder.parent / "printed.txt").read_text()
     shown = plain_text(run_summary(Result.read(run_folder), run_folder)).split()

@@ -90,7 +90,7 @@ def test_everything_else_is_in_the_details():
         assert note in told
 
 
-def test_of_many_reasons_the_gravest_are_shown_and_the_others_counted():
+def test_the_gravest_of_many_reasons_are_shown_and_the_others_counted():
     concerns = [
         Concern(
             "specimen/outlier",
@@ -106,7 +106,7 @@ def test_of_many_reasons_the_gravest_are_shown_and_the_others_counted():
     assert sum("of the sum of squared" in line for line in lines(result, details=True)) == 7
 
 
-def test_tests_of_causes_state_that_they_found_none():
+def test_tests_of_causes_without_a_finding_are_stated():
     tested = replace(solved(), notes=(*solved().notes, NO_CAUSE))
     assert NO_CAUSE in lines(tested)
 

@@ -101,7 +101,7 @@ def test_check_reports_chosen_substeps(tiny: Path):
     assert not any("up to 8" in note for note in checked(tiny, "transcription.substeps=2").notes)
 
 
-def test_backward_euler_at_ten_milliseconds_is_warned_of_with_the_substeps_that_cure_it(tiny: Path):
+def test_a_warning_of_backward_eulers_damping_names_sufficient_substeps(tiny: Path):
     euler = (*SILICONE, "transcription.scheme=backward-euler")
     findings = checked(tiny, *euler)
     first = findings.motions[0].modes[0]
@@ -423,7 +423,7 @@ def test_a_glance_needs_no_simulation_and_no_guess(tiny: Path, monkeypatch):
     assert seen.recordings[0].markers[0].start_miss_m is None
 
 
-def test_the_command_shows_it_before_anything_is_simulated(tiny: Path, monkeypatch):
+def test_the_command_shows_a_glance_before_anything_is_simulated(tiny: Path, monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.initial_variables", no_simulation)
     shown = []
     show = "collocation_sysid.cli.problem_commands.print_result"
@@ -467,7 +467,7 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
     assert short.jacobian_nonzeros == whole.jacobian_nonzeros
 
 
-def test_of_equilibria_three_samples_have_all_kinds_of_rows():
+def test_three_samples_of_equilibria_have_all_kinds_of_rows():
     static = shortened_problem(Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH))
     assert len(static.experiments[0].t_s) == 3
     moving = shortened_problem(Problem([hung_cube(30)], TRUTH))

@@ -231,7 +231,7 @@ def finely_sampled() -> Problem:
     return problem_of(noisy(hung_cube(60)))
 
 
-def test_a_search_with_many_samples_starts_with_some_of_them(monkeypatch):
+def test_a_search_with_many_samples_starts_with_a_part(monkeypatch):
     problem = finely_sampled()
     direct = solve(problem, DIRECT)
     assert coarse_note(direct) == ""

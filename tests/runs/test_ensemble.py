@@ -72,7 +72,7 @@ def test_residuals_and_predictions_sum_to_the_measurements(run):
 
 
 @pytest.mark.slow
-def test_draws_contain_the_truth_as_often_as_they_state():
+def test_draws_contain_the_truth_at_the_stated_rate():
     """E of 40 twins with their own noise, in the middle 80 % of the draws of their runs."""
     strain = np.linspace(0.01, 0.2, 15)
     truth = {"young_pa": 1e5, "poisson": 0.45}

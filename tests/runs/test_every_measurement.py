@@ -115,7 +115,7 @@ def test_a_prediction_is_judged_by_the_measurement(case):
     assert residuals.is_counted.any()
 
 
-def test_a_copy_of_the_recording_predicts_it(case):
+def test_a_copy_of_the_recording_is_predicted(case):
     experiment, values, k = case
     assert reason_against_copy(experiment, experiment) == ""
     np.testing.assert_array_equal(copied(experiment, experiment)[k], values[k])
@@ -407,7 +407,7 @@ def elsewhere(**places):
     return check
 
 
-PROBED = "statistics/test_routine_probes.py::test_a_probe_alarms_if_it_is_significant_and_relevant"
+PROBED = "statistics/test_routine_probes.py::test_a_significant_and_relevant_probe_alarms"
 CHECKS = {
     "loss of samples": loss_of_samples,
     "the same values twice": same_values_twice,
@@ -452,10 +452,10 @@ CHECKS = {
     "picture with measurement": elsewhere(
         markers="result/test_plots.py::test_a_run_has_all_its_pictures",
         wrench="statistics/test_wrench_fit.py::test_a_run_reports_the_wrench",
-        custom="program/test_gauge.py::test_error_bars_and_verdict_know_them",
+        custom="program/test_gauge.py::test_error_bars_and_verdict_contain_unknowns_of_sensors",
         specimen="result/test_specimen_output.py::test_an_undetermined_parameter_is_stated_once",
         depth="result/test_depth_pictures.py::"
-        "test_the_fitted_surface_is_drawn_over_the_image_and_how_far_they_are_apart",
+        "test_the_fitted_surface_is_drawn_over_the_image_with_distances",
         image="problem/test_image_tracks_table.py::test_tracks_are_simulated_and_identified_from",
         harmonic="recording/test_harmonic.py::"
         "test_the_picture_of_a_harmonic_test_has_its_moduli_over_frequency",

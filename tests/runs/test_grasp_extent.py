@@ -67,7 +67,7 @@ def test_planes_of_symmetry_and_platens_are_no_grippers():
     assert grasp_extent_concerns(free_along_y) == []
 
 
-def test_of_recordings_that_are_declared_simulated_it_is_a_note():
+def test_the_extent_of_a_simulated_grasp_is_a_note():
     problem = held_above(0.075)
     assert grasp_extent_notes(problem) == []
     simulated = replace(

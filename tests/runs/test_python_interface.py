@@ -233,7 +233,7 @@ def test_a_drawn_body_is_coloured_by_strain(field):
     assert low == pytest.approx(outer.min(), rel=1e-6) or low == 0 < outer.min() < high / 5
 
 
-def test_an_unknown_picture_is_refused_with_the_known_ones():
+def test_an_unknown_picture_is_refused_with_the_known_names():
     with pytest.raises(cs.InputError, match=r"'det'; expected .* did you mean 'det_f'\?"):
         identified().plot(field="det")
     with pytest.raises(cs.InputError, match=r"found 'sway'; expected one of hung cube"):
@@ -309,7 +309,7 @@ THETA_RULE = cs.Scheme(
 )
 
 
-def test_a_scheme_of_ones_own_runs(tmp_path):
+def test_a_scheme_of_a_user_runs(tmp_path):
     cube = hung_cube()
     cube = cs.with_markers(cube, cs.simulate(cube, TRUTH, THETA_RULE, substeps=1).markers_m)
     rollout = cs.RolloutOptions("scheme")
@@ -333,7 +333,7 @@ def test_a_function_is_a_method():
     assert cs.solve(replace(problem, methods={"mine": halving}), "mine").method == "mine"
 
 
-def test_options_of_ones_own_are_a_method():
+def test_options_of_a_user_are_a_method():
     @validated
     class Polished(MethodOptions):
         name: ClassVar[str] = "polished"

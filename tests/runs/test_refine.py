@@ -198,7 +198,7 @@ def test_other_numbers_of_levels_are_refused(answer):
         refine(answer, levels=1)
 
 
-def test_without_an_estimated_parameter_it_is_refused_with_the_reason(answer):
+def test_refinement_without_an_estimated_parameter_is_refused(answer):
     fixed = Parameters(
         tuple(replace(each, is_fixed=True) for each in answer.problem.parameters.items)
     )
@@ -296,7 +296,7 @@ def test_an_interrupted_refinement_keeps_finished_levels(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_a_problem_may_ask_for_it(tmp_path):
+def test_a_problem_may_ask_for_refinement(tmp_path):
     problem = write_problem(tmp_path, {"swing": 8})
     folder = tmp_path / "run"
     numerical = ("--set", "uncertainty.numerical=true")

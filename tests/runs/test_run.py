@@ -103,7 +103,7 @@ def test_the_result_states_the_basis_of_its_uncertainties(finished):
     assert any("mu_pa" in sentence for sentence in found["verdicts"])
 
 
-def test_a_result_is_read_as_it_was_written(finished):
+def test_a_written_result_is_read_back_unchanged(finished):
     written = finished.result
     text = as_json(written)
     assert as_json(read(Result, json.loads(text))) == text

@@ -72,7 +72,7 @@ def standard_error(solution: cs.Solution) -> float:
     return float(fit.standard_errors[0])
 
 
-def test_thinned_points_are_measured_ones_and_few(many):
+def test_thinned_points_are_a_few_of_the_measured_points(many):
     few = depth().thinned(400)
     (cloud,) = few.clouds
     (given,) = depth().clouds

@@ -165,7 +165,7 @@ def test_a_gripper_that_holds_less_of_the_body_leaves_a_longer_bar():
     assert expected == pytest.approx(simulated, rel=0.2)
 
 
-def test_the_edge_of_a_gripper_that_surrounds_a_part_of_the_body_is_where_it_ends():
+def test_the_edge_of_a_gripper_around_a_part_of_the_body_is_its_end():
     short, long = hanging_bar(15), hanging_bar(16)
     held = np.flatnonzero(long.body.nodes_m[:, 2] > 0.075 - 1e-9)
     surrounded = replace(long, grasps=[Grasp(held, PoseSequence.fixed())])
@@ -289,7 +289,7 @@ def test_without_damping_its_law_is_no_matter(changes):
         assert all(row.effect(at, axis) is None for axis in range(len(row.components)))
 
 
-def test_a_law_of_a_users_own_stays_as_it_is():
+def test_a_law_of_a_user_is_not_changed():
     def stress(psi, F, rate, gamma_r_s):
         return DAMPINGS["material"].stress(psi, F, rate, gamma_r_s)
 

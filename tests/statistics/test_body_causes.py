@@ -76,7 +76,7 @@ def test_white_noise_with_a_wrong_model_is_not_filtered(noise: float):
     assert _cutoff(_amplitudes(residuals(np.random.default_rng(2), noise), STEP_S)[1]) is None
 
 
-def test_a_cause_is_named_alone_only_if_it_suffices_and_no_other_does():
+def test_a_cause_is_named_alone_only_if_no_other_suffices():
     lag = Hypothesis("gripper-frame", "'a'", corrected=1, strength=1.8, remaining=1.4)
     law = Hypothesis("poses-inverted", "'a'", corrected=2, strength=3.0, remaining=0.9)
     other = Hypothesis("camera-frame", "'a'", corrected=3, strength=2.9, remaining=0.95)
@@ -91,7 +91,7 @@ def test_a_cause_is_named_alone_only_if_it_suffices_and_no_other_does():
     assert _named_alone_or_together([law, other], {2: 100.0, 3: 150.0}.__getitem__) == [law]
 
 
-def test_of_laws_that_fit_equally_well_the_smaller_change_is_named():
+def test_the_smaller_change_among_laws_of_equal_fit_is_named():
     both = Hypothesis("law/both", "'a'", corrected=1, strength=3.1, remaining=0.9)
     material = Hypothesis("law", "'a'", corrected=2, strength=3.0, remaining=0.9)
     assert _named_alone_or_together([both, material], {1: 100.0, 2: 103.0}.get) == [material]

@@ -143,7 +143,7 @@ def test_the_remedy_of_poissons_ratio_names_the_table_of_its_deviation():
 
 @pytest.mark.long
 @pytest.mark.parametrize("huber", [None, 1.0])
-def test_a_considered_nuisance_moves_estimates_as_a_recording_that_is_off_by_it(huber):
+def test_a_considered_nuisance_moves_estimates_as_a_recording_with_the_error(huber):
     experiment = measured(hung_cube(20))
     if huber:  # under which most samples count less than they are
         noise_m = 5e-3 * np.random.default_rng(1).standard_normal((21, 9, 3))

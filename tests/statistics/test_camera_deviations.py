@@ -137,7 +137,9 @@ def test_an_error_of_a_camera_is_estimated(name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SEEN)
-def test_a_considered_error_of_a_camera_moves_the_estimate_as_such_a_camera(name: str) -> None:
+def test_a_considered_error_of_a_camera_moves_the_estimate_as_a_camera_with_the_error(
+    name: str,
+) -> None:
     film, size, _ = SEEN[name]
     first = faultless()
     changes = changes_of_nuisances(first.collocation, first.z, {name: size})

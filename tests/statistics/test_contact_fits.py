@@ -63,7 +63,7 @@ def test_a_ball_that_rubs_may_come_deep_into_a_block_from_one_sample_to_the_next
 
 
 @pytest.mark.parametrize("off_m", [0.0, 3e-4])
-def test_stiffness_is_found_though_nobody_knows_where_the_surface_begins(off_m: float):
+def test_stiffness_is_found_with_an_unknown_place_of_the_surface(off_m: float):
     finished = answer(poked(off_m))
     low, high = finished.result.parameters["young_pa"].statistical95
     assert low < TRUTH["young_pa"] < high
@@ -89,7 +89,7 @@ def test_intervals_contain_the_truth_at_their_nominal_rate():
 @pytest.mark.parametrize(
     ("off_m", "prior_m", "verdict"), [(2.5e-3, 5e-4, "check"), (1e-3, 1e-4, "doubtful")]
 )
-def test_an_obstacle_far_from_where_it_is_stated_is_reported(
+def test_an_obstacle_far_from_its_stated_place_is_reported(
     off_m: float, prior_m: float, verdict: str
 ):
     run = answer(poked(off_m, prior_m))

@@ -36,7 +36,7 @@ def diagnosis(residual: np.ndarray, missing: float = 0.0) -> MarkerDiagnosis:
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.3])
-def test_white_residuals_are_as_they_should_be(missing):
+def test_white_residuals_are_consistent_with_noise(missing):
     said = [diagnosis(noise(seed), missing) for seed in range(20)]
     assert sum("uncorrelated, consistent with noise" in d.sentence for d in said) >= 18
     assert np.mean([d.rms_m for d in said]) == pytest.approx(np.sqrt(3) * SIGMA_M, rel=0.03)

@@ -555,7 +555,7 @@ def test_check_reports_the_fields_that_the_shapes_can_determine(length_m: float,
     assert "field_1" not in seen.guess
 
 
-def test_the_line_about_a_field_says_that_it_is_smoothed():
+def test_the_line_about_a_field_states_its_smoothing():
     shapes = FieldResolution(modes=40, length_m=0.04, amplitude=0.5, share=0.95, detail_m=0.021)
     line = FieldResult(shapes, (2e4, 7e4), 1.0, 28, {}).sentence("young_pa")
     assert "above 21 mm; values are those of a field smoothed over 40 mm" in line

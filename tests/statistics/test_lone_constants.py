@@ -39,7 +39,7 @@ def test_a_constant_that_is_confounded_with_none_is_stated_alone():
     assert not lone_constants(NAMES, VALUES, hopeless, 0.1 * hopeless, {"gamma_m_1_s"}, ())
 
 
-def test_repetitions_reduce_noise_and_a_known_value_what_depends_on_it():
+def test_repetitions_reduce_noise_and_known_values_their_share():
     covariance = np.array([[0.09, 0.1], [0.1, 0.16]])
     noise = 0.9 * covariance
     (found,) = lone_constants(NAMES, VALUES, covariance, noise, {"gamma_m_1_s"}, ())
@@ -145,7 +145,7 @@ def test_other_assumptions_do_not_count_where_the_dominant_one_leaves_all_undete
 
 
 @pytest.mark.long
-def test_some_samples_of_a_smooth_motion_promise_what_all_of_them_do(monkeypatch):
+def test_a_part_of_the_samples_of_a_smooth_motion_predicts_as_all(monkeypatch):
     swing = short_swing("swing", np.random.default_rng(0), count=4)
     t_s = np.linspace(0.0, 0.9, 240)
     grasp = cs.Grasp(swing.grasps[0].nodes, smooth_poses(t_s, turn_rad=(0.2, -0.15, 0.3)))
@@ -168,7 +168,7 @@ def test_some_samples_of_a_smooth_motion_promise_what_all_of_them_do(monkeypatch
 
 
 @pytest.mark.long
-def test_a_longer_recording_determines_what_it_promises(monkeypatch):
+def test_a_longer_recording_determines_as_predicted(monkeypatch):
     rng = np.random.default_rng(2)
     run = run_of([short_swing("first", rng)])
     (found,), solution = run.combinations, run.solution
@@ -191,7 +191,7 @@ def test_a_longer_recording_determines_what_it_promises(monkeypatch):
 
 
 @pytest.mark.long
-def test_a_known_value_determines_what_it_promises():
+def test_a_known_value_determines_as_predicted():
     truth = {"lambda_pa": 1e5, "mu_pa": 1e5}
     strain = np.linspace(0.02, 0.2, 9)
     blank = cs.Specimen("uniaxial", strain, 0 * strain, 1.0, area_error=0.0, strain_zero=0.0)
@@ -234,7 +234,7 @@ def test_an_assumption_that_is_known_has_the_stated_effect():
 
 
 @pytest.mark.long
-def test_what_would_determine_a_constant_does():
+def test_a_predicted_remedy_determines_a_constant():
     rng = np.random.default_rng(1)
     first = short_swing("first", rng)
     run = run_of([first])
@@ -250,7 +250,7 @@ def test_what_would_determine_a_constant_does():
         assert half_width(run_of(experiments)) == pytest.approx(np.log(fix.factor), rel=0.3)
 
 
-def test_the_effect_of_a_remedy_is_stated_for_what_it_would_determine():
+def test_the_effect_of_a_remedy_is_stated_for_the_determined_constant():
     estimate = SimpleNamespace(is_determined=False, combined95=(1.0, 16.0))
     result: Any = SimpleNamespace(
         estimates={"lambda_pa": estimate}, budget={"lambda_pa": {"scale": 0.75, "noise": 0.25}}

@@ -135,7 +135,7 @@ def test_a_recording_shows_times_between_its_sampling_and_its_duration(tau_s, is
     assert is_distinguishable(tau_s, 0.01, 0.8) is is_shown
 
 
-def test_memory_is_in_the_budget_only_where_it_is_stated():
+def test_memory_is_in_the_budget_only_if_stated():
     assert Assumptions().memory_share == "none"
     assert source_label(NAME) == "memory share (τ = 0.1 s)"
 

@@ -229,7 +229,7 @@ def test_moduli_that_would_change_sign_are_a_note(monkeypatch):
     assert "`refine`" in note
 
 
-def test_intervals_of_a_body_that_obstacles_touch_say_that_they_contain_no_error_of_the_mesh():
+def test_intervals_in_contact_are_stated_to_contain_no_error_of_the_mesh():
     problem = cs.Problem([measured(pressed_cube(2))], GUESS | {"gamma_r_s": 0.01})
     collocation = problem.collocation()
     z, _ = initial_variables(collocation)
@@ -243,7 +243,7 @@ def test_intervals_of_a_body_that_obstacles_touch_say_that_they_contain_no_error
 
 
 @pytest.mark.long
-def test_a_motion_between_whose_samples_little_changes_has_the_error_of_a_part_of_them(monkeypatch):
+def test_a_motion_of_close_samples_has_the_error_of_a_part_of_the_samples(monkeypatch):
     body = cs.Body(cs.box_mesh((0.02, 0.02, 0.08), (1, 1, 3)), density_kg_m3=1000.0)
     t_s = np.arange(101) / 1000.0
     sway_m = 0.02 * (1 - np.cos(20 * t_s))

@@ -110,7 +110,7 @@ def test_variances_of_the_markers_are_found_without_bias():
 
 
 @pytest.mark.long
-def test_a_common_variance_would_not_do_where_markers_differ():
+def test_markers_of_different_noise_need_their_own_variance():
     """Parameters that a noisy marker alone tells."""
     of = problem((60,), markers=2, offsets=False)
     slopes = of.slopes[0].copy()

@@ -54,7 +54,7 @@ def test_a_drawing_cannot_hang():
         body(mesh_from="cad", rest_shape=hung)
 
 
-def test_a_density_that_such_bodies_do_not_have_is_a_concern():
+def test_an_implausible_density_is_a_concern():
     assert not density_concerns(body(1070.0, made="cast"))
     (concern,) = density_concerns(body(1.2 * 1070.0, made="cast"))
     assert concern.grade == "check"

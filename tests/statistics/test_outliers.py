@@ -52,7 +52,7 @@ def test_a_sample_that_spoils_the_rest_is_named():
     )
 
 
-def test_noise_has_no_such_sample_be_it_white_or_not():
+def test_white_and_coloured_noise_have_no_outlier():
     for seed in range(100):
         for errors in (RNG(seed).normal(size=(60, 3, 3)), autoregressive(RNG(seed), 60, 3, 0.95)):
             fit, _ = fit_to(errors)
@@ -86,7 +86,7 @@ def test_several_are_set_apart_but_no_more_than_exceptions():
     assert [outlier.sample for outlier in remove_outliers(spoiled)[1]] == [0, 1, 2, 3, 4, 5]
 
 
-def test_the_diagnosis_of_its_marker_names_it_in_place_of_a_pattern():
+def test_the_diagnosis_of_a_marker_names_an_outlier_instead_of_a_pattern():
     fit, _ = fit_to(with_outlier(RNG(0).normal(size=(60, 3, 3))))
     (said,) = (each.sentence for each in diagnose_markers(fit) if each.marker == "m1")
     assert "mm RMS; the sample at t = 0.2 s deviates by 1.5e+02 sigma and contributes 94 %" in said

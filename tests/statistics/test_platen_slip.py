@@ -174,7 +174,7 @@ def test_the_problem_file_states_that_faces_are_glued(tmp_path, monkeypatch):
     assert problem.uncertainty.assumptions.platen_slip == "none"
 
 
-def test_sticking_faces_change_the_load_of_sliding_ones_as_in_a_simulation():
+def test_sticking_faces_change_the_load_of_sliding_faces_as_in_a_simulation():
     program, z = at_answer(small("z"))
     (stick,) = (row for row in ASSUMPTIONS if row.name == "platen_stick")
     changes = changed_residuals(program, z, [(stick, 1.0)])
@@ -183,7 +183,7 @@ def test_sticking_faces_change_the_load_of_sliding_ones_as_in_a_simulation():
     np.testing.assert_allclose(change_n[1:], expected_n[1:], rtol=0.02)
 
 
-def test_an_answer_with_sliding_platens_states_the_modulus_with_sticking_ones():
+def test_an_answer_with_sliding_platens_states_the_modulus_with_sticking_platens():
     """Faces that stuck, described as sliding: the residuals are small, and E is too large."""
     stuck = with_loads(bench(block("z")), bench(block("xyz")))
     fitted = solved(stuck)

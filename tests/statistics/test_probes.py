@@ -110,7 +110,7 @@ def test_nothing_is_reported_for_a_correct_description():
         ("clock_rate", 1e-3, "gamma_m_1_s"),
     ],
 )
-def test_a_probe_finds_a_wrong_value_by_freeing_it(name, off, of):
+def test_a_probe_finds_a_wrong_value(name, off, of):
     solved = probed(name, off)
     assert told(solved)[0] == name
     probe = named(solved, name)
@@ -170,7 +170,7 @@ def test_terminal_page_and_file_have_the_probes(tmp_path):
 
 
 @pytest.mark.long
-def test_a_solve_makes_the_routine_probes_and_all_of_them_where_asked_to(tmp_path):
+def test_a_solve_makes_the_routine_probes_and_all_probes_on_request(tmp_path):
     file = write_problem(tmp_path, {"swing": 12})
     plain = run_command("solve", file, "--out", tmp_path / "plain", "--quiet")
     routine = Result.read(tmp_path / "plain").probes

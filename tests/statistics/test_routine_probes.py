@@ -145,7 +145,7 @@ def test_a_drift_and_a_wrong_clock_rate_mean_check_with_corrected_estimates(faul
 
 
 @pytest.mark.long
-def test_fibres_along_an_axis_give_check_with_the_moduli_along_and_across_them():
+def test_fibres_along_an_axis_give_check_with_both_moduli():
     fibrous = solved("anisotropy z", 0.3, noise_m=NOISE_M / 4)
     truth_pa = TRUTH["young_pa"]
     assert fibrous.interval("young_pa")[0] > truth_pa
@@ -216,7 +216,7 @@ def with_residuals(at: SolvedFit, residuals: list[np.ndarray]) -> SolvedFit:
     return replace(at, fit=fit, statistical={**known.estimates, **known.derived})
 
 
-def test_an_assumption_must_explain_the_residuals_and_not_only_a_part_of_them():
+def test_an_assumption_must_explain_all_of_the_residuals():
     at = answered(swung(samples=24))
     name = f"{MEMORY} τ=0.1s"
     column = at.changes.names.index(name)
@@ -288,7 +288,7 @@ def probe(
     return Probe("assumption", name, fall, moves, -0.05, 0.01, own, True, relevance)
 
 
-def test_a_probe_alarms_if_it_is_significant_and_relevant():
+def test_a_significant_and_relevant_probe_alarms():
     assert is_alarming(probe(2 * RELEVANT))
     assert not is_alarming(probe(0.5 * RELEVANT))
     assert not is_alarming(probe(2 * RELEVANT, is_significant=False))

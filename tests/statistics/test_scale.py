@@ -71,11 +71,11 @@ def test_the_scale_is_open_however_moduli_and_densities_are_given(given):
         OPEN | {"density_kg_m3": Unknown(40.0, prior=(30.0, 0.1))},
     ],
 )
-def test_a_known_modulus_or_density_closes_it(given):
+def test_a_known_modulus_or_density_closes_the_scale(given):
     assert names_of(problem(given)) == ()
 
 
-def test_a_known_mass_or_force_on_free_nodes_closes_it():
+def test_a_known_mass_or_force_on_free_nodes_closes_the_scale():
     cube = hung_cube()
     mass = PointMass(tip(cube), 0.01)
     force = Force(tip(cube), [[0.0, 0.0, 0.1]])
@@ -164,7 +164,7 @@ def test_a_density_may_be_a_parameter_instead_of_stated(tiny):
     assert found.parameters.guesses["density_kg_m3"] == pytest.approx(45.0)
 
 
-def test_a_density_without_a_guess_starts_where_it_is_stated(tiny):
+def test_a_density_without_a_guess_starts_at_the_stated_value(tiny):
     found = read(tiny, ("\n[parameters]\n", "\n[parameters]\ndensity_kg_m3 = {}\n"))
     assert found.parameters.guesses["density_kg_m3"] == pytest.approx(30.0)
 

@@ -56,7 +56,7 @@ MISTAKES = {
 }
 
 
-def test_likely_mistakes_of_a_sensor_are_deviations_that_correct_it():
+def test_likely_mistakes_of_a_sensor_are_deviations_that_correct_the_readings():
     experiment = sensed(MISTAKES["sensor-unit"])
     probe, other = experiment.readings
     predicted = 1e-3 * probe.measured_values

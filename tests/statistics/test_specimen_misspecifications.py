@@ -59,7 +59,7 @@ def causes_of(strain, stress_pa, sigma_pa, law):
     return run, [each.cause for each in run.causes]
 
 
-def test_likely_mistakes_of_a_specimen_are_deviations_that_correct_it():
+def test_likely_mistakes_of_a_specimen_are_deviations_that_correct_the_data():
     pull = cs.Specimen("uniaxial", 10 * STRAIN, neo_hookean_pa(STRAIN), SIGMA_PA).experiment()
     rows = {row.name: row for row in likely_mistakes(pull, ())}
     assert all("test" in row.modes for row in rows.values())
@@ -139,7 +139,7 @@ def test_another_kind_of_test_is_named(declared, true, stress_pa):
 
 
 @pytest.mark.long
-def test_a_hypothesis_keeps_the_lateral_stretches_that_refute_it():
+def test_a_hypothesis_keeps_contradicting_lateral_stretches():
     """An auxetic foam in tension, with a stated positive Poisson's ratio, is no compression test."""
     rng = np.random.default_rng(5)
     young_pa, poisson = 1e5, -0.4
@@ -161,7 +161,6 @@ def test_a_hypothesis_keeps_the_lateral_stretches_that_refute_it():
     assert "specimen-compression" not in causes
 
 
-@pytest.mark.long
 @pytest.mark.long
 def test_magnitudes_of_a_compression_test_are_named():
     """Strain, stress and lateral strain are all positive in the file."""

@@ -46,5 +46,5 @@ def test_an_offset_that_explains_the_residuals_is_suggested():
         pytest.param(-2e4, {}, id="gross misfit"),
     ],
 )
-def test_no_offset_is_suggested_otherwise(offset_pa, keys):
+def test_no_offset_is_suggested_without_a_cause(offset_pa, keys):
     assert notes(offset_pa, **keys) == []

@@ -144,7 +144,7 @@ def test_an_outlier_in_a_table_of_moduli_has_a_modulus_and_comes_first():
 
 
 @pytest.mark.parametrize(("tests", "key"), [("dma", "relative_sigma"), ("pull", "sigma_pa")])
-def test_too_large_noise_is_named_by_the_key_of_the_test(tests, key):
+def test_too_large_noise_is_named_by_the_key_of_its_test(tests, key):
     by_name = {
         "dma": cs.Specimen.harmonic([0.1, 1.0], [1e5, 1.1e5], [1e3, 2e3], 0.01),
         "pull": cs.Specimen("uniaxial", [0.1, 0.2], [1e3, 2e3], 10.0),

@@ -298,7 +298,7 @@ def test_a_prior_adds_its_information():
 # Bounds, and what the data do not say
 
 
-def test_a_parameter_at_its_bound_has_no_error_bar_and_leaves_the_others_theirs():
+def test_a_parameter_at_its_bound_has_no_error_bar_and_the_others_keep_theirs():
     experiment = measured(hung_cube())
     bound = changed(AT_TRUTH, lambda_pa={"upper": 200.0 * (1 + 1e-8)})
     uncertainty = uncertainty_at(*simulated([experiment], bound))

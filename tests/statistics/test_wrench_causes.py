@@ -138,7 +138,7 @@ def test_a_right_wrench_is_not_doubted_before_solving(seed: int):
 
 
 @pytest.mark.long
-def test_a_large_tare_is_named_although_its_prior_can_follow_it():
+def test_a_large_tare_is_named_within_its_prior():
     experiment = swung(nuisance=Nuisance())
     (grasp,) = experiment.grasps
     assert grasp.wrench is not None

@@ -100,7 +100,7 @@ def test_a_flip_and_the_principal_point_are_stated():
 
 
 @pytest.mark.parametrize("fault", OF_POSE)
-def test_a_wrong_frame_is_among_the_likely_ones(fault: str):
+def test_a_wrong_frame_is_among_the_likely_mistakes(fault: str):
     (cause,) = misspecification_hypotheses(hanging(fault))
     assert cause.code == "camera/likely"
     assert OF_POSE[fault] in cause.data["mistakes"]

@@ -160,7 +160,7 @@ def test_a_missing_sample_of_a_fast_motion_is_no_jump():
 
 
 @pytest.mark.long
-def test_a_body_held_still_after_it_is_let_go_undeformed_may_swing():
+def test_a_body_released_undeformed_in_a_still_grasp_may_swing():
     tracks = simulate(released_cube(20), TRUTH, "newmark").markers_m
     given = Problem([with_markers(released_cube(20), tracks)], GUESS)
     assert misspecification_hypotheses(given) == ()
@@ -276,7 +276,7 @@ def test_a_short_exchange_is_left_to_hubers_loss():
 
 
 @pytest.mark.long
-def test_of_markers_that_are_exchanged_nothing_is_fitted_again(monkeypatch):
+def test_exchanged_markers_are_not_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
     monkeypatch.setattr(refits, "ReducedSpace", None)
     assert [cause.cause for cause in find_misspecifications(solution)] == ["markers-exchanged"]
@@ -383,7 +383,7 @@ def test_odd_sizes_and_densities_are_reported(edge_m, density_kg_m3, expected):
     assert [oddity.cause for oddity in size_and_density_hypotheses(body)] == expected
 
 
-def test_an_implausible_size_is_reported_with_the_key_that_states_it():
+def test_an_implausible_size_is_reported_with_its_key():
     generated = box_mesh((60.0,) * 3, (1, 1, 1))
     read = TetMesh(generated.points_m, generated.tetrahedra)
     for mesh, words in (
@@ -421,7 +421,7 @@ def test_a_metal_as_soft_as_rubber_is_odd():
 
 
 @pytest.mark.parametrize(("edge_m", "density_kg_m3"), [(2e3, 1e3), (0.1, 0.03), (0.1, 1e7)])
-def test_impossible_ones_are_refused(edge_m, density_kg_m3):
+def test_impossible_sizes_and_densities_are_refused(edge_m, density_kg_m3):
     body = Body(box_mesh((edge_m,) * 3, (1, 1, 1)), density_kg_m3=density_kg_m3)
     with pytest.raises(InputError, match="expected"):
         size_and_density_hypotheses(body)

@@ -131,7 +131,7 @@ MOVED: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("mistake", MOVED)
-def test_points_near_the_grasp_move_as_it_does(mistake: str) -> None:
+def test_points_near_the_grasp_move_with_the_grasp(mistake: str) -> None:
     places = {"one": (0.02, 0.0, 0.005), "two": (0.03, 0.0, 0.015)}
     at_m = np.array(list(places.values()))
     poses = np.tile(np.eye(4), (len(T_S), 1, 1))
