@@ -7,7 +7,6 @@ recording begins.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,14 +53,6 @@ class HandMotion:
 
     coordinates: Array
     rates: Array
-
-
-def lame_constants(values: Mapping[str, float]) -> tuple[float, float]:
-    """Return the Lamé constants λ and μ [Pa] of the values of `TRUTH`'s parameters."""
-    young = values["young_pa"]
-    poisson = values["poisson"]
-    first = young * poisson / (1 + poisson) / (1 - 2 * poisson)
-    return first, young / 2 / (1 + poisson)
 
 
 def cylinder() -> cs.TetMesh:

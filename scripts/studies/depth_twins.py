@@ -7,7 +7,6 @@ stated camera pose, drawn from the prior that the problem states.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -160,8 +159,3 @@ def _pose_with_error(rng: np.random.Generator) -> Array:
     described_pose[:3, :3] = turn @ pose[:3, :3]
     described_pose[:3, 3] = turn @ (pose[:3, 3] - TARGET_M) + TARGET_M + shift_m
     return described_pose
-
-
-def with_depth(experiment: Experiment, depth: Depth) -> Experiment:
-    """Return the experiment with another description of its only camera."""
-    return replace(experiment, depths=[depth])
