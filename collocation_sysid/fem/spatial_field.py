@@ -277,15 +277,6 @@ class FieldModes:
             detail_m=detail_m,
         )
 
-    def split_in_eight(self) -> FieldModes:
-        """Return this field on a mesh whose cells are split into eight, each in place of one; the
-        shapes have the value of the cell before, and nothing is computed again.
-        """
-        vectors = np.repeat(self.laplacian.vectors, 8, axis=1)
-        volumes_m3 = np.repeat(self.volumes_m3 / 8, 8)
-        laplacian = replace(self.laplacian, vectors=vectors)
-        return replace(self, laplacian=laplacian, volumes_m3=volumes_m3)
-
     def on_cells(self, sources: Index, volumes_m3: Array) -> FieldModes:
         """Return this field on other cells, whose shapes have the values of given cells; nothing is
         computed again.

@@ -138,7 +138,10 @@ def refine_body(body: Body) -> Body:
         tuple(
             replace(
                 part,
-                field=source.field and source.field.split_in_eight(),
+                field=source.field
+                and source.field.on_cells(
+                    np.arange(len(part.cells)) // 8, mesh.volumes_m3[part.cells]
+                ),
                 axes=None if source.axes is None else np.repeat(source.axes, 8, axis=0),
             )
             for part, source in zip(finer.parts, body.parts, strict=True)
