@@ -1,10 +1,9 @@
 """All forces on a body at some times: F(ξ, ν; u) = f(ξ, ν; θ) + Σ terms.
 
-Use `Forces.from_experiment` for an experiment and `Forces.of_body_alone` for a body alone. The sum
-includes the internal forces f of materials and damping laws (see `fem.body`), the weight, tendons,
-pressures, obstacles, air drag and custom forces; no other module adds forces. Derivatives by the
-state are on the sparsity pattern of all couplings. Columns of derivatives by θ are followed by
-those by the other inputs u, in the order of the terms, see `inputs`.
+The sum includes the internal forces f of materials and damping laws (see `fem.body`), the weight,
+tendons, pressures, obstacles, air drag and custom forces; no other module adds forces. Derivatives
+by the state are on the sparsity pattern of all couplings. Columns of derivatives by θ are followed
+by those by the other inputs u, in the order of the terms, see `inputs`.
 """
 
 from __future__ import annotations
@@ -110,17 +109,6 @@ class Forces:
             is_static=still,
         )
         return forces if theta is None else forces.with_theta(theta)
-
-    @classmethod
-    def of_body_alone(cls, body: Body, theta: Sequence[float] | Array) -> Forces:
-        """Return the forces on a body without loads, gravity, air or obstacles, at one time (0 s).
-
-        Internal forces at θ (k,) and the custom forces of the body are included.
-        """
-        custom = custom_force_terms(body, np.zeros(1))
-        known = np.asarray(theta, dtype=float)
-        weight = Weight.of_body_alone(body).with_theta(known)
-        return cls(weight, custom, joint_pattern=body.joint_pattern_with(()), theta=known)
 
     def with_theta(self, theta: Sequence[float] | Array) -> Forces:
         """Return these forces for a body with constants θ (k,), which are copied; masses follow the

@@ -109,7 +109,7 @@ class Weight(ForceTerm):
         tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
         air_kg = experiment.air_density_kg_m3 * body.sum_dof_volumes_m3()
         mass = DofMasses(
-            _own_kg(body),
+            body.mass_of_dofs(np.full(len(body.constants), np.nan)),
             _as_constant_view(tied),
             displaced_kg=air_kg,
             added_kg=ADDED_MASS_SHARE * air_kg,
@@ -122,21 +122,6 @@ class Weight(ForceTerm):
             applied_n=applied,
             has_gravity_input=False,
             **_zero_loads(applied),
-        )
-
-    @classmethod
-    def of_body_alone(cls, body: Body) -> Weight:
-        """Return the weight of a body without gravity, loads and air, at one time."""
-        nothing = np.zeros((1, body.pattern.size))
-        no_air_kg = nothing[0]
-        mass = DofMasses(_own_kg(body), nothing, displaced_kg=no_air_kg, added_kg=no_air_kg)
-        return cls(
-            body,
-            mass,
-            gravity_m_s2=np.zeros(3),
-            applied_n=nothing,
-            has_gravity_input=False,
-            **_zero_loads(nothing),
         )
 
     def with_theta(self, theta: Theta) -> Self:
@@ -299,11 +284,6 @@ class Weight(ForceTerm):
     def _load_acceleration(self, states: States) -> Array:
         """Return the acceleration g − γ_m ν (T, 3n) by which a tied mass loads the body [m/s²]."""
         return self.gravity - self.body.tied_damping_rate(states.theta) * states.nu
-
-
-def _own_kg(body: Body) -> Array:
-    """Return the masses (3n,) [kg]; NaN where a density or a density field is a parameter."""
-    return body.mass_of_dofs(np.full(len(body.constants), np.nan))
 
 
 def _zero_loads(rows: Array, count: int = 0) -> dict[str, Array]:

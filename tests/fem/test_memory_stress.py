@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from kit.checks import assert_derivative, observed_order, relative_error
+from kit.forces import forces_alone
 from kit.memories import TWO, remembering
 from kit.problems import IDEAL, point_markers, times
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,6 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.materials import Prony
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.viscoelasticity import FadingCoefficients, MemoryHistory, MemoryState
 from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.simulation import simulate
@@ -41,13 +41,11 @@ def strained(body: Body, size_m: float = 0.003, states: int = 1) -> np.ndarray:
 
 
 def total_force(body: Body, x: np.ndarray, theta: np.ndarray, memory: MemoryState) -> np.ndarray:
-    return memory.insert_at_same_time(Forces.of_body_alone(body, theta)).total(x, np.zeros_like(x))[
-        0
-    ]
+    return memory.insert_at_same_time(forces_alone(body, theta)).total(x, np.zeros_like(x))[0]
 
 
 def after(memory: MemoryState, x: np.ndarray, interval_s: float) -> MemoryState:
-    return memory.advance(Forces.of_body_alone(memory.body, memory.theta), x, 0 * x, interval_s)
+    return memory.advance(forces_alone(memory.body, memory.theta), x, 0 * x, interval_s)
 
 
 # Closed forms of the standard linear solid ------------------------------------------------------

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.modes.natural import Modes, natural_modes
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
+from kit.forces import forces_alone
 from kit.problems import EDGE_M, hung_cube, nodes_where, vertex_markers
 
 # Small enough for the cube to be linear, large enough against the tolerance of Newton's method.
@@ -27,7 +27,7 @@ def released_in_a_mode(theta: np.ndarray, mode: int, timestep_s: float = 0.01, s
     cube = hung_cube()
     body, t_s = cube.body, timestep_s * np.arange(steps + 1)
     held = nodes_where(body, 2, EDGE_M)
-    modes = natural_modes(Forces.of_body_alone(body, theta), body.nodes_m, cube.free_dofs)
+    modes = natural_modes(forces_alone(body, theta), body.nodes_m, cube.free_dofs)
     shape = modes.shapes[mode] / np.abs(modes.shapes[mode]).max()
     released = replace(
         cube,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from kit.checks import assert_derivative
 from kit.densities import parameters, with_core
-from kit.forces import breath, foundation
+from kit.forces import breath, forces_alone, foundation
 from kit.problems import GUESS, driven_bar, hung_cube, nodes_where
 
 from collocation_sysid.common.time_dependence import at_times, interpolate_in_time, scale_loads
@@ -279,7 +279,7 @@ def test_without_any_nothing_is_added():
     body = hung_cube().body
     x = body.nodes_m.ravel()[None]
     theta = np.array([1e3, 1e3, 0.0, 0.0])
-    alone = Forces.of_body_alone(body, theta)
+    alone = forces_alone(body, theta)
     np.testing.assert_array_equal(alone.total(x, 0 * x), body.force(x, 0 * x, theta))
     assert alone.linearise(x, 0 * x).by_theta.shape[2] == len(theta)
 
@@ -294,11 +294,7 @@ def test_the_force_of_a_pressure_is_the_gradient_of_the_volume(element, rng):
     body = Body(mesh, density_kg_m3=30.0, element=element, forces=[force])
     theta = np.array([1e-9, 1e-9, 0.0, 0.0, 7.0])
     x = body.nodes_m + rng.normal(scale=2e-3, size=body.nodes_m.shape)
-    total = (
-        Forces.of_body_alone(body, theta)
-        .total(x.reshape(1, -1), np.zeros((1, x.size)))
-        .reshape(-1, 3)
-    )
+    total = forces_alone(body, theta).total(x.reshape(1, -1), np.zeros((1, x.size))).reshape(-1, 3)
     np.testing.assert_allclose(total.sum(axis=0), 0.0, atol=1e-12)
     if element == "tet4":
         grown = np.einsum("ij,ij->", total, x)  # 3 p V, V being of third degree
@@ -309,9 +305,7 @@ def test_a_force_on_faces_that_are_not_there_is_refused():
     inside = Box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06))
     force = NodeForce.from_law(breath, nodes=inside, on="faces")
     with pytest.raises(InputError, match="'breath' acts on faces of the surface, but no face"):
-        Forces.of_body_alone(
-            Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1)
-        )
+        forces_alone(Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1))
     with pytest.raises(InputError, match="found on = 'edges'; expected one of nodes, faces"):
         NodeForce.from_law(breath, on="edges")  # pyright: ignore[reportArgumentType]
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+from kit.forces import forces_alone
 from kit.oscillations import oscillation, released_in_a_mode
 from kit.problems import box, nodes_where
 
@@ -14,7 +15,6 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
-from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.modes.modal_prediction import oscillator_responses
 from collocation_sysid.program.modes.natural import Modes, natural_modes
 
@@ -38,7 +38,7 @@ def all_but(body: Body, held: np.ndarray) -> np.ndarray:
 def clamped(body: Body, theta: np.ndarray = THIN, count: int = 6) -> Modes:
     """Modes of the undeformed body with its nodes at x = 0 held."""
     free = all_but(body, nodes_where(body, 0, 0.0))
-    return natural_modes(Forces.of_body_alone(body, theta), body.nodes_m, free, count)
+    return natural_modes(forces_alone(body, theta), body.nodes_m, free, count)
 
 
 def dense_frequencies(body: Body, x: np.ndarray, free: np.ndarray, theta: np.ndarray) -> np.ndarray:
@@ -50,7 +50,7 @@ def dense_frequencies(body: Body, x: np.ndarray, free: np.ndarray, theta: np.nda
 def test_a_tetrahedron_on_three_held_corners_is_a_point_on_springs():
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     body = Body(TetMesh(corners, [[0, 1, 2, 3]]), density_kg_m3=DENSITY)
-    modes = natural_modes(Forces.of_body_alone(body, ELASTIC), corners, np.array([9, 10, 11]))
+    modes = natural_modes(forces_alone(body, ELASTIC), corners, np.array([9, 10, 11]))
     # The free corner's gradient is e_z / h: it shears with μ, twice, and stretches with λ + 2μ.
     volume, height = 0.1**3 / 6, 0.1
     lambda_pa, mu_pa, *_ = ELASTIC
@@ -64,7 +64,7 @@ def test_modes_of_a_deformed_body_are_those_of_dense_algebra(divisions, rng):
     body = box((0.1, 0.12, 0.09), divisions)
     x = body.nodes_m @ np.diag([1.1, 0.97, 1.05]) + rng.normal(0, 5e-4, body.nodes_m.shape)
     free = all_but(body, nodes_where(body, 2, 0.09))
-    modes = natural_modes(Forces.of_body_alone(body, ELASTIC), x, free)
+    modes = natural_modes(forces_alone(body, ELASTIC), x, free)
     expected = dense_frequencies(body, x, free, ELASTIC)
     np.testing.assert_allclose(modes.frequencies_hz, expected[:6], rtol=1e-7)
     flat = modes.shapes.reshape(6, -1)
@@ -76,7 +76,7 @@ def test_modes_of_a_deformed_body_are_those_of_dense_algebra(divisions, rng):
 def test_rigid_motions_of_a_free_body_are_left_out(divisions):
     body = box((0.1, 0.12, 0.09), divisions)
     free = np.arange(3 * len(body.nodes_m))
-    modes = natural_modes(Forces.of_body_alone(body, ELASTIC), body.nodes_m, free)
+    modes = natural_modes(forces_alone(body, ELASTIC), body.nodes_m, free)
     assert modes.omitted_count == 6
     expected = dense_frequencies(body, body.nodes_m, free, ELASTIC)
     np.testing.assert_allclose(modes.frequencies_hz, expected[6:12], rtol=1e-7)
@@ -101,7 +101,7 @@ def test_a_point_mass_slows_a_bar_down():
     body = bar("tet10")
     free = all_but(body, nodes_where(body, 0, 0.0))
     tip = nodes_where(body, 0, LENGTH_M)
-    alone, tip_kg = Forces.of_body_alone(body, THIN), 10 * body.mass_kg
+    alone, tip_kg = forces_alone(body, THIN), 10 * body.mass_kg
     tied_kg = np.zeros((1, body.pattern.size))
     tied_kg[0, dofs_of(tip)] = tip_kg / len(tip)
     mass = replace(alone.mass, tied_kg=tied_kg)
@@ -129,7 +129,7 @@ def test_a_body_released_in_a_mode_oscillates_with_its_frequency_and_damping(
 def test_fewer_modes_than_wanted_are_no_error():
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     body = Body(TetMesh(corners, [[0, 1, 2, 3]]), density_kg_m3=DENSITY)
-    modes = natural_modes(Forces.of_body_alone(body, ELASTIC), corners, np.arange(12), count=20)
+    modes = natural_modes(forces_alone(body, ELASTIC), corners, np.arange(12), count=20)
     assert len(modes.frequencies_hz) == 6
     assert modes.shapes.shape == (6, 4, 3)
 

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from kit.forces import forces_alone
 from kit.problems import IDEAL, nodes_where, point_markers
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
@@ -85,7 +86,7 @@ def held_at_both_ends(body: Body, disturbed_m: float = 0.0, samples: int = 101) 
 
 def equilibrium(body: Body, ends: np.ndarray) -> np.ndarray:
     """Positions (n, 3) of the bar stretched between its ends, by Newton's method."""
-    x, forces = (body.nodes_m * [1, 1, STRETCH], Forces.of_body_alone(body, theta_of(body)))
+    x, forces = (body.nodes_m * [1, 1, STRETCH], forces_alone(body, theta_of(body)))
     free = free_dofs(body, ends)
     for _ in range(40):
         at = forces.linearise(x.reshape(1, -1), np.zeros((1, x.size)))
@@ -146,8 +147,8 @@ def test_growth_is_the_eigenvalue_of_dense_algebra(law, dense, monkeypatch):
     monkeypatch.setattr(stability, "DENSE", 10**6 if dense else 0)
     body = bar(law, across=2)
     x, free, theta = (equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body))
-    expected = fastest(Forces.of_body_alone(body, theta), x, free)
-    found = growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free)
+    expected = fastest(forces_alone(body, theta), x, free)
+    found = growth_rate_1_s(forces_alone(body, theta), x.ravel(), free)
     assert (expected > 0) == (law is RATE_OF_STRESS)
     assert found == pytest.approx(max(expected, 0.0), rel=1e-6)
 
@@ -160,8 +161,8 @@ def test_a_bar_pressed_beyond_buckling_is_not_stable(law, monkeypatch):
     free, theta, found = free_dofs(body, held), theta_of(body), []
     for squeezed in (0.999, 0.7):
         x = body.nodes_m * [1, 1, squeezed]
-        found.append(growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free))
-        expected = fastest(Forces.of_body_alone(body, theta), x, free)
+        found.append(growth_rate_1_s(forces_alone(body, theta), x.ravel(), free))
+        expected = fastest(forces_alone(body, theta), x, free)
         assert found[-1] == pytest.approx(max(expected, 0.0), rel=1e-6)
     assert found[0] == 0 < found[1]
 
@@ -174,10 +175,8 @@ def test_growth_is_found_where_the_search_for_directions_ends_early(monkeypatch)
     monkeypatch.setattr(stability, "eigsh", ended)
     body = bar(RATE_OF_STRESS, across=2)
     x, free, theta = (equilibrium(body, held(body)), free_dofs(body, held(body)), theta_of(body))
-    expected = fastest(Forces.of_body_alone(body, theta), x, free)
-    assert growth_rate_1_s(Forces.of_body_alone(body, theta), x.ravel(), free) == pytest.approx(
-        expected
-    )
+    expected = fastest(forces_alone(body, theta), x, free)
+    assert growth_rate_1_s(forces_alone(body, theta), x.ravel(), free) == pytest.approx(expected)
 
 
 def test_negative_directions_are_found_in_few_iterations_beside_a_bulk_modulus(monkeypatch):
@@ -190,9 +189,7 @@ def test_negative_directions_are_found_in_few_iterations_beside_a_bulk_modulus(m
 def test_a_body_that_nobody_holds_is_stable():
     body = bar()
     free = np.arange(3 * len(body.nodes_m))
-    assert (
-        growth_rate_1_s(Forces.of_body_alone(body, theta_of(body)), body.nodes_m.ravel(), free) == 0
-    )
+    assert growth_rate_1_s(forces_alone(body, theta_of(body)), body.nodes_m.ravel(), free) == 0
 
 
 @pytest.mark.parametrize(("law", "told"), [(LAWS[0], False), (LAWS[1], True)])
@@ -220,8 +217,5 @@ def test_a_body_without_damping_is_stable():
     theta = body.theta_from_values(CONSTANTS | {"gamma_r_s": 0.0})
     free = free_dofs(body, held(body))
     assert (
-        growth_rate_1_s(
-            Forces.of_body_alone(body, theta), equilibrium(body, held(body)).ravel(), free
-        )
-        == 0
+        growth_rate_1_s(forces_alone(body, theta), equilibrium(body, held(body)).ravel(), free) == 0
     )

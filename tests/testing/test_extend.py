@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from kit.forces import forces_alone
 from kit.problem_files import AT_TRUTH, both, replace_text, run_command, settings, write
 from kit.problems import GUESS, TRUTH, hung_cube
 
@@ -15,7 +16,6 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.refinement import refine_body
 from collocation_sysid.methods import METHODS
-from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Nuisance
 
@@ -120,9 +120,7 @@ def test_on_a_finer_mesh_it_is_the_same_force(element):
     of_both = []
     for each in (body, refine_body(body)):
         moving = np.tile(wind, len(each.nodes_m))[None]
-        total = Forces.of_body_alone(each, theta).total(
-            each.nodes_m.reshape(1, -1), moving.reshape(1, -1)
-        )
+        total = forces_alone(each, theta).total(each.nodes_m.reshape(1, -1), moving.reshape(1, -1))
         of_both.append(total.reshape(-1, 3).sum(axis=0))
     expected = -5.0 * DRAG * 6 * 0.1**2 * np.linalg.norm(wind) * wind
     np.testing.assert_allclose(of_both, [expected, expected], rtol=1e-6)
