@@ -54,7 +54,7 @@ class EquationsAtParameters:
 
     @property
     def _is_constant_in_time(self) -> bool:
-        """Whether ∂u/∂p is the same at all times, including later ones of a stream."""
+        """Whether ∂u/∂p is the same at all times."""
         return self.input_derivatives.strides[0] == 0
 
     @property

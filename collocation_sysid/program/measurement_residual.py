@@ -384,38 +384,6 @@ class MeasurementResidual(ABC):
         """
         return {}
 
-    def with_samples(
-        self, known_s: Array, known_x: Array, t_s: Array, measurements: Array, **changes: Any
-    ) -> Self:
-        """Return the model with other samples, sharing the generated functions.
-
-        Every measurement that is not NaN is compared.
-
-        Parameters
-        ----------
-        known_s : (n,) array
-            Times at which the observable is known [s].
-        known_x : (n, 3n') array
-            Positions of the n' nodes at these times [m].
-        t_s : (S,) array
-            Times of the samples [s].
-        measurements : (S, E m') array
-            Measurements, NaN where missing; missing numbers (m' < m) are padded with NaN.
-        **changes
-            Other attributes to replace.
-        """
-        _, each, count = self.measured.shape
-        measured = np.full((len(t_s), each, count), np.nan)
-        measurements = measurements.reshape(len(t_s), each, -1)
-        measured[..., : measurements.shape[2]] = measurements
-        is_compared = np.isfinite(measured).reshape(len(t_s), -1, GROUP)
-        changes = {"t_s": t_s, "measured": measured, "is_compared": is_compared} | changes
-        other = replace(self.at_samples(known_s, ReactionGrid.from_times(known_s)), **changes)
-        # Derivatives of the same expression are generated once.
-        vars(other)["_expressions"] = self._expressions
-        vars(other)["sigma_ratios"] = 1.0  # the noise of other samples is the usual one
-        return other
-
     def expression_for(self, vectors: int, data: int) -> ResidualExpression:
         """Return the generated functions for stencils with `vectors` vectors and `data` data; they
         are created on the first call and stored.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -141,13 +141,6 @@ class Assessment:
     def reasons(self) -> tuple[str, ...]:
         """Messages of the concerns, in the order of `concerns`."""
         return tuple(concern.message for concern in self.concerns)
-
-    def combined_with(self, other: Assessment) -> Assessment:
-        """Return the assessment with the concerns of both, by `from_concerns`; those of the graver
-        one come first within each grade, and of equal verdicts those of `self`.
-        """
-        light, grave = sorted((other, self), key=lambda t: get_args(Verdict).index(t.verdict))
-        return Assessment.from_concerns((*grave.concerns, *light.concerns))
 
 
 def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:

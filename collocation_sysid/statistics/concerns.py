@@ -263,8 +263,6 @@ TOPICS: dict[str, Topic] = {
             "find out what differs between the recordings, such as temperature or clamping",
             "wild": "{percent:.0f} % of the samples are outliers, beyond the threshold of the "
             "Huber loss: look for exchanged labels and wrong samples in the residuals over time",
-            "far": "{percent:.0f} % of the marker samples are outliers, implausibly far from the "
-            "body or from the prediction: check labels, the frame, and reflections",
         },
     ),
     "assumption": Topic(
@@ -299,8 +297,6 @@ TOPICS: dict[str, Topic] = {
             "long-term modulus; record for longer if there is one",
             "none": "the data do not determine {names}: state known values or priors, or record a "
             "motion on which these parameters have a larger influence",
-            "at-bound": "{name} is at a bound: widen the bound, or fix the parameter",
-            "not-yet": "{name} is not known yet, because {reason}: wait for more frames",
             "static": f"{{names}} {{verb}} static: {NO_DAMPING}; {FIX_DAMPING}",
             "still": f"nothing moves in {{names}}: {NO_DAMPING}, and only the deflection under "
             f"gravity determines the stiffness; {FIX_DAMPING}",
@@ -529,22 +525,11 @@ TOPICS: dict[str, Topic] = {
             "lost": "the solve did not converge: {why}",
             "jump": "the search ended where the loss jumps as measured points change to other "
             "parts of the surface: other guesses may lead to other minima",
-            "no-start": "there is no initial state yet: send a frame with a pose of the grasp",
-            "not-simulable": "the body cannot be simulated with these parameters: give stiffer "
-            "guesses, and check mass, units and grasps",
-            "grasp-lost": "the pose of the grasp has been missing for too many samples, so that "
-            "its motion is unknown: send poses, with increasing times",
-            "seeking": "initial values are still being searched for: wait for the end of the "
-            "search",
             "acceptable": "the solve converged to the acceptable tolerance, but not to the desired "
             "one: start from another guess, or raise max_iterations",
             "no-error-bars": "no error bars could be computed; the notes of the run "
             'state the reason, after "no error bars"',
             "interrupted": "interrupted: {left_out}",
-            "moves": "the estimate has not settled: it differs by more than its error bar from the "
-            "parameters of the last simulation; wait for more frames",
-            "anew": "the estimation restarted {times} after a gap in the poses, assuming that the "
-            "body was at rest at that time: check that poses arrive without gaps",
         },
     ),
 }

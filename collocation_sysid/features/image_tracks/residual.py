@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
 
 import casadi as ca
 import numpy as np
@@ -128,27 +127,6 @@ class ImageTrackResidual(CameraImagesResidual):
         """
         places = self.correspondences
         return 2 * int(np.sum(self.sensor.is_seen & places.is_placed & ~places.is_visible))
-
-    def with_samples(
-        self, known_s: Array, known_x: Array, t_s: Array, measurements: Array, **changes: Any
-    ) -> Self:
-        """Return the model with other images of the camera at rest, in which the points that are
-        visible in the shapes `known_x` (n, 3n') [m] at the times `known_s` (n,) [s] are compared.
-        """
-        other = super().with_samples(known_s, known_x, t_s, measurements, **changes)
-        places, count = self.correspondences, len(t_s)
-        rotations, translations = (
-            np.repeat(each[:1], count, axis=0) for each in (places.rotations, places.translations)
-        )
-        seen = np.all(other.is_compared[..., :2], axis=2)
-        visible = places.visible_points(
-            other._shapes(known_x), translations, np.ones_like(seen), seen
-        )
-        vars(other).update(
-            is_compared=other.is_compared & (seen & visible & places.is_placed)[..., None],
-            correspondences=replace(places, rotations=rotations, translations=translations),
-        )
-        return other
 
     # Correspondences --------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ for h and `model.nuisance_map` for φ.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -41,9 +41,7 @@ class MarkerResidual(MeasurementResidual):
     # Whether the body rests in its first state before the first time; then a marker of an earlier
     # time is predicted there, otherwise such samples are not compared.
     is_initially_at_rest: bool
-    preceding_times: int  # number of the observable's times before the first sample
     clock_samples: int  # whole samples of the clock's shift
-    delay_s: float = 0.0  # time by which samples are taken later than `t_s` [s]
 
     @classmethod
     def from_markers(
@@ -55,7 +53,6 @@ class MarkerResidual(MeasurementResidual):
         clock_samples: int = 0,
         huber: float | None = None,
         is_initially_at_rest: bool = True,
-        preceding_times: int = 0,
     ) -> MarkerResidual:
         """Build the measurement model of the markers of an experiment.
 
@@ -64,7 +61,7 @@ class MarkerResidual(MeasurementResidual):
         markers : Markers
             Measured tracks.
         rows : (T,) array
-            Grid times of the observable, one for each sample and `preceding_times` ones before.
+            Grid times of the observable, one for each sample.
         nuisance : NuisanceMap
             Nuisance parameters of the experiment.
         association : MarkerAssociation
@@ -75,12 +72,10 @@ class MarkerResidual(MeasurementResidual):
             Threshold of Huber's loss in standard deviations; None means a quadratic loss.
         is_initially_at_rest : bool
             Whether the body is at rest before the first time.
-        preceding_times : int
-            Number of `rows` before the first sample.
         """
         places = np.full((len(markers.names), association.axes.shape[2]), -1)
         places[association.estimated] = nuisance.indices_of_rows(PLACE).reshape(-1, places.shape[1])
-        shifted = preceding_times + np.arange(len(markers.t_s)) + clock_samples
+        shifted = np.arange(len(markers.t_s)) + clock_samples
         covered = (shifted < len(rows)) & ((shifted >= 0) | is_initially_at_rest)
         is_compared = markers.is_measured & covered[:, None, None]
         return cls(
@@ -95,7 +90,6 @@ class MarkerResidual(MeasurementResidual):
             own_parameters=nuisance.marker_indices(len(markers.names)),
             markers=markers,
             is_initially_at_rest=is_initially_at_rest,
-            preceding_times=preceding_times,
             clock_samples=clock_samples,
         )
 
@@ -130,11 +124,7 @@ class MarkerResidual(MeasurementResidual):
         """Index (T,) of the first of the observable's times from which each sample is interpolated;
         negative before the start, where the body rests in its first state.
         """
-        first = (
-            (self.preceding_times + np.arange(len(self.t_s)))
-            + self.clock_samples
-            - self._neighbour_count // 2
-        )
+        first = np.arange(len(self.t_s)) + self.clock_samples - self._neighbour_count // 2
         first = np.minimum(first, self.observable.count - self._neighbour_count)
         return first if self.is_initially_at_rest else np.maximum(first, 0)
 
@@ -146,15 +136,12 @@ class MarkerResidual(MeasurementResidual):
     @cached_property
     def _stencil(self) -> RowStencil:
         """Stencil of all samples; its data are the position of the frame among its neighbours, in
-        samples, and the frame's time [s], delay included.
+        samples, and the frame's time [s].
         """
         count = len(self.markers.names)
-        indices = (self.preceding_times + np.arange(len(self.t_s))) - self._first_neighbour
+        indices = np.arange(len(self.t_s)) - self._first_neighbour
         place = np.array(
-            [
-                indices + self._offsets_s / self.nuisance.interval_s,
-                self.t_s + self._offsets_s + self.delay_s,
-            ]
+            [indices + self._offsets_s / self.nuisance.interval_s, self.t_s + self._offsets_s]
         )
         places = self._neighbour_indices[:, None] * count + np.arange(count)[:, None]
         return RowStencil(places, np.repeat(place[..., None], count, axis=2))
@@ -165,17 +152,6 @@ class MarkerResidual(MeasurementResidual):
         """
         samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
-
-    def shifted(self, by_s: float) -> MarkerResidual:
-        """Return the model of samples taken `by_s` seconds later, with the same stencil and
-        measurements; self if the expression does not depend on time.
-        """
-        if not self._full_expression.residual.depends_on_datum(1):
-            return self
-        other = replace(self, delay_s=self.delay_s + by_s)
-        # Derivatives of the same expression are generated once.
-        vars(other)["_expressions"] = self._expressions
-        return other
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the prediction y (3,) of one marker.

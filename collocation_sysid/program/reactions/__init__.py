@@ -2,5 +2,4 @@
 
 - `forces`: reaction forces of nodes, with derivatives along the equations of motion.
 - `resultant`: their resultant force and torque at a sensor, as an observable.
-- `grasps`: reactions along a recording that arrives frame by frame.
 """
