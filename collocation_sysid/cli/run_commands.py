@@ -228,33 +228,26 @@ def plot(*, out: OutputFolder = None, quiet: Quiet = False, run: RunFolderOption
         typer.echo(file)
 
 
-@command(commands, "report runs/swing", "report runs/swing-sweep --to sweep.html")
+@command(commands, "report runs/swing", "report runs/swing --to swing.html")
 def report(
     *,
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER",
-            help="A run folder, or the output folder of compare-methods, compare-models or sweep.",
-        ),
-    ],
     to: Annotated[
         Path | None,
-        option("Output file, .html or .md; report.html in the folder by default.", "FILE"),
+        option("Output file, .html or .md; report.html in the run folder by default.", "FILE"),
     ] = None,
     quiet: Quiet = False,
+    run: RunFolderOptions,
 ) -> None:
-    """Write a report of a run or a study as one HTML page or a Markdown file.
+    """Write a report of a run as one HTML page or a Markdown file.
 
     The report contains all results and the pictures; a Markdown file links to the pictures.
     """
-    from ..result.report import comparison_report, report_text
+    from ..result.report import report_text
     from ..result.run_sections import run_report
 
-    file = to or folder / "report.html"
-    study = (folder / "summary.json").is_file()
+    file = to or run.run_folder / "report.html"
     with shown_progress("writing the report", quiet=quiet):
-        page = comparison_report(folder) if study else run_report(folder)
+        page = run_report(run.run_folder)
         require_possible(file.parent)
         write_text_file(file, report_text(page, file))
     typer.echo(file)

@@ -1,4 +1,4 @@
-"""Commands that run many problems: compare-methods, compare-models and sweep."""
+"""Commands that run many problems: compare-methods and compare-models."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from ..common.display import duration
+from ..common.display import Line, duration
 from ..common.files import require_possible, run_name
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..common.validated_classes import validated
@@ -25,12 +25,11 @@ from ..extras.studies import (
     Starts,
     plan_comparison,
     plan_models,
-    plan_sweep,
     run_all,
 )
-from ..extras.studies.arguments import parse_methods, parse_varied_keys, read_truth
+from ..extras.studies.arguments import parse_methods, read_truth
 from ..extras.studies.model_variants import models, parse_branches, parse_dampings, parse_materials
-from ..extras.studies.planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES, SWEEP_STUDY
+from ..extras.studies.planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES
 from ..extras.studies.rows import SuccessCriterion
 from ..fem.kernels import available_threads
 from ..problem import Problem
@@ -38,6 +37,9 @@ from .command_options import OneMethod, OutputFolder, OutputOptions, ProblemOpti
 from .common import error_console, interruption_exit, print_result, shown_progress
 
 commands = typer.Typer()
+
+# Largest number of failures on the terminal; summary.md lists all.
+SHOWN_FAILURES = 8
 
 
 @validated(kw_only=True)
@@ -197,43 +199,6 @@ def compare_models(
     _run_study(MODEL_STUDY, planned, study, source, output)
 
 
-@command(
-    commands,
-    "sweep problem.toml --over transcription.substeps=1,2,4",
-    "sweep problem.toml --over parameters.mu_pa.guess=50:5000:log:9",
-)
-def sweep(
-    *,
-    over: Annotated[
-        list[str],
-        option(
-            "Key and its values: key=a,b,c, key=first:last:count or key=first:last:log:count.",
-            "KEY=VALUES",
-        ),
-    ],
-    method: OneMethod = None,
-    study: StudyOptions,
-    source: ProblemOptions,
-    output: OutputOptions,
-) -> None:
-    """Solve the problem for every combination of the values of some keys.
-
-    Finished runs are kept in the output folder: the same command resumes an interrupted study.
-    """
-    chosen = _single_method(method)
-    planned = plan_sweep(
-        source.problem,
-        parse_varied_keys(over),
-        overrides=source.set_ or (),
-        method=chosen,
-        allow_code=source.allow_code,
-    )
-    # A missing file would fail every run.
-    with shown_progress(f"reading {source.problem}", quiet=output.quiet):
-        Problem.read(source.problem, planned[0].overrides, allow_code=source.allow_code)
-    _run_study(SWEEP_STUDY, planned, study, source, output)
-
-
 def _single_method(text: str | None) -> str | None:
     """Return the method named by --method, or None if the option is not used (`text` is None)."""
     if text is None:
@@ -252,20 +217,14 @@ def _run_study(
     output: OutputOptions,
     yardstick: SuccessCriterion | None = None,
 ) -> None:
-    """Execute the runs that are not finished, write tables and plots, and print the tables.
+    """Execute the runs that are not finished, write tables and a picture, and print the tables.
 
     The folder is `study.out`, by default runs/NAME-KIND. With `study.dry_run` the planned runs
     are only listed, with those that are finished marked, and nothing is written. Runs that fail do
     not end the study: they are in the tables. Without any record no tables are written.
     """
-    from ..extras.studies.page import (
-        load_report,
-        plan_table,
-        report_json,
-        study_tables,
-        write_report,
-    )
     from ..extras.studies.progress import StudyProgress
+    from ..extras.studies.tables import load_report, plan_table
 
     name = run_name(source.problem)
     folder = study.out or Path("runs") / f"{name}-{kind}"
@@ -293,9 +252,14 @@ def _run_study(
         f"{STUDY_TITLES[kind]}: {name}", kind, planned=planned, store=store, yardstick=yardstick
     )
     if report.records:
-        write_report(report, folder)
+        report.write(folder)
     if not is_complete:
         raise interruption_exit(
             f"{len(report.records)} of {len(planned)} runs are kept in {folder}"
         )
-    output.print_result(report_json(report), study_tables(report, folder))
+    failures = [Line(each, "doubtful") for each in report.failures]
+    if (hidden := len(failures) - SHOWN_FAILURES) > 0:
+        failures[SHOWN_FAILURES:] = [Line(f"and {hidden} more in summary.md", "doubtful")]
+    output.print_result(
+        report.as_dict(), [*report.build_parts(), *failures, f"written to {folder}"]
+    )

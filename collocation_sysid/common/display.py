@@ -1,8 +1,8 @@
 """Plain description of output (sentences, tables, pictures, sections) and its rendering.
 
-The same description is rendered for terminals, HTML and Markdown, and written as JSON by
-`serialisation.as_json`. Styles are words, separated by spaces: good, check, doubtful, strong,
-quiet, code. A word without a colour in `COLOURS` has no effect in terminals and is a class in HTML.
+The same description is rendered for terminals, HTML and Markdown. Styles are words, separated by
+spaces: good, check, doubtful, strong, quiet, code. A word without a colour in `COLOURS` has no
+effect in terminals and is a class in HTML.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from rich.text import Text
 from ..errors import printable
 from .console import PlainConsole
 from .files import is_own
-from .serialisation import optional
 
 COLOURS = {"good": "green", "check": "yellow", "doubtful": "red", "strong": "bold", "quiet": "dim"}
 # Markup of Markdown: anywhere in a text, at its beginning, and as the number of a list item.
@@ -68,13 +67,6 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Items:
-    """List of sentences, one per line."""
-
-    texts: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Table:
     """Table with columns of names (left), of numbers (right aligned) and of long texts (last).
 
@@ -87,13 +79,13 @@ class Table:
     rows : tuple of tuple of str
         Cells of each row.
     names, texts : int
-        Number of name columns at the beginning, and of text columns at the end; None means 0.
-    faint : tuple of int, optional
+        Number of name columns at the beginning, and of text columns at the end.
+    faint : tuple of int
         Indices of rows that are shown with less emphasis in HTML.
-    style : str, optional
-        Style of the cells in terminals.
-    note_column : int, optional
-        Number of columns at the end that are omitted in terminals; None means 0.
+    style : str
+        Style of the cells in terminals; "" for none.
+    note_column : int
+        Number of columns at the end that are omitted in terminals.
 
     Raises
     ------
@@ -105,10 +97,10 @@ class Table:
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     names: int = 1
-    texts: int | None = optional()
-    faint: tuple[int, ...] | None = optional()
-    style: str | None = optional()
-    note_column: int | None = optional()
+    texts: int = 0
+    faint: tuple[int, ...] = ()
+    style: str = ""
+    note_column: int = 0
 
     def __post_init__(self) -> None:
         columns = {len(row) for row in self.rows} | ({len(self.heads)} if self.heads else set())
@@ -120,7 +112,7 @@ class Table:
         nor one of the `texts`.
         """
         columns = len(self.heads) or max(map(len, self.rows), default=0)
-        return self.names <= column < columns - (self.texts or 0)
+        return self.names <= column < columns - self.texts
 
 
 @dataclass(frozen=True)
@@ -156,7 +148,7 @@ class TitledParts:
     style: str = ""  # class of the enclosing element in HTML; "" for none
 
 
-Shown = str | Line | Items | Table | Cards | Picture | Listing | TitledParts
+Shown = str | Line | Table | Cards | Picture | Listing | TitledParts
 
 
 def flattened_parts(parts: Iterable[Shown]) -> Iterator[Shown]:
@@ -289,8 +281,6 @@ def _on_terminal(part: Shown) -> RenderableType:
         case Line():
             pieces = ((span.text, _colour(span.style)) for span in part.to_spans())
             return UnbrokenWords(Text.assemble(*pieces, style=_colour(part.style)))
-        case Items():
-            return _text("\n".join(f"- {text}" for text in part.texts))
         case Table():
             return _titled(part.title, TerminalTable(part))
         case Cards():
@@ -360,7 +350,7 @@ def _rich_table(table: Table, *, parted: bool) -> RichTable:
     """Return a table as rich's, without its last `note_column` columns."""
     # Without headings, names are set close to their texts.
     shown = RichTable(box=None, pad_edge=False) if table.heads else RichTable.grid(padding=(0, 1))
-    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - (table.note_column or 0)
+    columns = (len(table.heads) or max(map(len, table.rows), default=0)) - table.note_column
     for place, head in enumerate((table.heads or ("",) * columns)[:columns]):
         number = table.is_number(place)
         cells = [row[place] for row in table.rows if place < len(row)]
@@ -370,13 +360,13 @@ def _rich_table(table: Table, *, parted: bool) -> RichTable:
             head = head.replace("-", "-\n")
         elif not number:  # dotted keys may take two lines
             head = head.replace(".", ".\n", 1)
-        fills_width = place == 0 and (table.texts or 0) > (table.note_column or 0)
+        fills_width = place == 0 and table.texts > table.note_column
         side = "right" if number else "left"
         longest_word = max(map(cell_len, " ".join((head, *cells)).split()), default=0)
         shown.add_column(head, justify=side, min_width=longest_word, no_wrap=fills_width)
     for row in table.rows:
         cells = row[:columns] if parted else (cell.replace("\n", "; ") for cell in row[:columns])
-        shown.add_row(*(Text(cell, style=_colour(table.style or "")) for cell in cells))
+        shown.add_row(*(Text(cell, style=_colour(table.style)) for cell in cells))
     return shown
 
 
@@ -397,9 +387,6 @@ def as_html(part: Shown) -> str:
         case Line():
             name = f' id="{escape(part.name)}"' if part.name else ""
             return f"<p{name}{_class(part.style)}>{''.join(map(_span, part.to_spans()))}</p>\n"
-        case Items():
-            lines = (f"<li>{escape(text)}</li>\n" for text in part.texts)
-            return f"<ul>\n{''.join(lines)}</ul>\n"
         case Table():
             title = f"<h2>{escape(part.title)}</h2>\n" if part.title else ""
             return f'{title}<div class="scroll"><table>\n{_html_rows(part)}</table></div>\n'
@@ -468,7 +455,7 @@ def _html_rows(table: Table) -> str:
             wide = "wide" if len(cell) > LONG and not table.is_number(k) else ""
             style = "n" if table.is_number(k) else wide
             cells.append(f"<{kind}{_class(style)}>{escape(cell)}</{kind}>")
-        faint = _class("quiet" if number in (table.faint or ()) else "")
+        faint = _class("quiet" if number in table.faint else "")
         rows.append(f"<tr{faint}>{''.join(cells)}</tr>\n")
     return "".join(rows)
 
@@ -478,7 +465,7 @@ def _html_rows(table: Table) -> str:
 
 def as_markdown(parts: Sequence[Shown]) -> str:
     """Return parts as Markdown, for a paper's appendix or an issue; pictures are links to their
-    file names, and cards and lists are items.
+    file names, and cards are items.
     """
     return "\n\n".join(filter(None, map(_markdown, parts))) + "\n"
 
@@ -490,8 +477,6 @@ def _markdown(part: Shown) -> str:
             return escape_markdown(part)
         case Line():
             return "".join(map(_markdown_span, part.to_spans()))
-        case Items():
-            return "\n".join(f"- {escape_markdown(text)}" for text in part.texts)
         case Table():
             columns = range(len(part.heads) or max(map(len, part.rows), default=0))
             heads = part.heads or ("",) * len(columns)

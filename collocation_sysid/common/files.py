@@ -43,7 +43,7 @@ SMALL_BYTES = 50_000_000
 # Longest reason of an error of another library in a message [characters]: about two lines.
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
-# Version of the form of result.json and summary.json.
+# Version of the form of result.json.
 SCHEMA = 5
 # Remedy for a damaged file, at the end of a message.
 AGAIN = "; run the command that wrote it again"

@@ -717,7 +717,7 @@ def test_help_imports_nothing_that_solves():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"^  report +Write a report of a run or a study", done.stdout, re.MULTILINE)
+    assert re.search(r"^  report +Write a report of a run", done.stdout, re.MULTILINE)
 
 
 def test_every_command_is_in_exactly_one_group_of_the_help():

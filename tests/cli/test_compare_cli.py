@@ -1,11 +1,9 @@
-"""`compare-methods` and `sweep` from the command line: runs, output and files."""
+"""`compare-methods` from the command line: runs, output and files."""
 
 from __future__ import annotations
 
-import csv
 import io
 import json
-import math
 import sys
 import time
 from pathlib import Path
@@ -21,7 +19,6 @@ from collocation_sysid.cli import study_commands
 from collocation_sysid.common.serialisation import as_json
 from collocation_sysid.extras.studies import progress as display
 from collocation_sysid.extras.studies import run_execution
-from collocation_sysid.extras.studies.plots import sweep_plots
 from collocation_sysid.extras.studies.progress import FIT_FACTOR, RUN_START_S, expected_study_s
 from collocation_sysid.methods.solution import Iteration
 
@@ -33,20 +30,14 @@ import json, sys
 planned, out = json.loads(sys.stdin.readline()), sys.argv[-1]
 if planned["start"] == 1:
     sys.stdin.read()
-times = [0.0, 0.01]
 record = {
     "outcome": "finished",
     "message": "Converged.",
     "result": json.loads(sys.argv[1]),
-    "tip": {
-        "experiment": "swing", "marker": "low", "max_m": 1e-3, "t_s": times,
-        "measured_m": [[0, 0, 0], [None, None, None]], "rolled_out_m": [[0, 0, 0], [1, 1, 1]],
-    },
+    "tip_max_m": 1e-3,
 }
 record["result"]["parameters"] = {
-    name: like | {
-        "value": guess, "combined_std_error": 0.1 * guess, "combined95": [0.8 * guess, 1.2 * guess]
-    }
+    name: like | {"value": guess}
     for like in record["result"]["parameters"].values() for name, guess in planned["guess"].items()
 }
 with open(out, "w") as file:
@@ -62,11 +53,6 @@ def stand_in(tmp_path, monkeypatch):
     script.write_text(STAND_IN)
     found = as_json(a_result(history=HISTORY))
     monkeypatch.setattr(run_execution, "COMMAND", (sys.executable, str(script), found))
-
-
-def table(file: Path) -> list[dict[str, str]]:
-    with open(file, newline="", encoding="utf-8") as text:
-        return list(csv.DictReader(text))
 
 
 def drawn(folder: Path) -> set[str]:
@@ -105,40 +91,39 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 @pytest.mark.long
 def test_every_method_runs_from_every_start(compared):
     assert compared.first.code == 0, compared.first.err
-    rows = table(compared.out / "runs.csv")
+    rows = json.loads(compared.again.out)["runs"]
     assert [(row["method"], row["start"]) for row in rows] == [
-        (method, str(start)) for start in range(2) for method in METHODS
+        (method, start) for start in range(2) for method in METHODS
     ]
     assert {row["status"] for row in rows} == {"converged"}
-    assert {row["success"] for row in rows} == {"True"}
+    assert {row["success"] for row in rows} == {True}
     for row in rows:
         for name, value in TRUTH.items():
-            assert float(row[f"value_{name}"]) == pytest.approx(value, rel=1e-4)
-            assert float(row[f"error_{name}"]) < 1e-4
+            assert row[f"value_{name}"] == pytest.approx(value, rel=1e-4)
+            assert row[f"error_{name}"] < 1e-4
 
 
 @pytest.mark.long
 def test_the_summary_has_a_row_for_each_method(compared):
-    rows = table(compared.out / "summary.csv")
+    rows = json.loads(compared.again.out)["methods"]
     assert [row["method"] for row in rows] == list(METHODS)
     for row in rows:
-        assert (row["runs"], row["successes"], row["success_rate"]) == ("2", "2", "1.0")
-        assert float(row["success_low"]) == pytest.approx(0.3424, abs=1e-4)
+        assert (row["runs"], row["successes"], row["success_rate"]) == (2, 2, 1.0)
+        assert row["success_low"] == pytest.approx(0.3424, abs=1e-4)
         numbers = ("violation_n", "violation_relative", "rms_m", "rollout_rms_m", "tip_max_m")
         costs = ("iterations", "build_s", "evaluations_s", "linear_algebra_s", "total_s")
-        assert all(float(row[name]) >= 0 for name in numbers + costs)
-        assert all(float(row[f"error_{name}"]) < 1e-4 for name in TRUTH)
+        assert all(row[name] >= 0 for name in numbers + costs)
+        assert all(row[f"error_{name}"] < 1e-4 for name in TRUTH)
 
 
 @pytest.mark.long
-def test_the_tables_fit_a_terminal_and_the_plots_are_drawn(compared):
+def test_the_table_fits_a_terminal_and_the_picture_is_drawn(compared):
     lines = compared.first.out.splitlines()
-    assert [line for line in lines if line in ("Success", "Quality", "Cost")]
+    assert lines[0] == "Methods"
     assert max(len(line) for line in lines if "written to" not in line) <= 90
-    assert "2/2  34–100 %" in compared.first.out
-    assert drawn(compared.out) == {"convergence", "tip", "success", "basins"}
+    assert drawn(compared.out) == {"convergence"}
     text = (compared.out / "summary.md").read_text()
-    assert "| interior-point | 2 | 2/2 | 34–100 % |" in text
+    assert "| interior-point | 2/2 |" in text
     assert "within 1 % of the truth" in text
 
 
@@ -182,15 +167,16 @@ def compare(*more: object) -> Outcome:
 
 @pytest.mark.long
 def test_a_late_run_is_a_row(tiny, stand_in):
-    outcome = compare("--starts", 3, "--time-limit", 3, "--workers", 3, *KNOWN)
+    words = ("--starts", 3, "--time-limit", 3, "--workers", 3, *KNOWN)
+    outcome = compare(*words)
     assert outcome.code == 0
-    rows = table(tiny / "out" / "runs.csv")
-    assert [row["status"] for row in rows] == ["converged", "timeout", "converged"]
     late = "reduced-space, start 1: timeout: ended at the time limit of 3 s"
     assert late in outcome.out
     assert late in (tiny / "out" / "summary.md").read_text()
-    (summary,) = table(tiny / "out" / "summary.csv")
-    assert (summary["runs"], summary["converged"], summary["rms_m"]) == ("3", "2", "0.001")
+    content = json.loads(compare(*words, "--json").out)
+    assert [row["status"] for row in content["runs"]] == ["converged", "timeout", "converged"]
+    (summary,) = content["methods"]
+    assert (summary["runs"], summary["converged"], summary["rms_m"]) == (3, 2, 0.001)
 
 
 def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
@@ -206,7 +192,6 @@ def test_an_interrupted_study_says_how_to_resume(tiny, stand_in, monkeypatch):
     assert outcome.out == ""
     assert "interrupted: 1 of 2 runs are kept in out; continue with: " in outcome.err
     assert outcome.err.endswith("--out out --starts 2 --workers 2\n")
-    assert [row["status"] for row in table(tiny / "out" / "runs.csv")] == ["converged", "missing"]
     assert "1 of 2 runs remain to be done." in (tiny / "out" / "summary.md").read_text()
 
 
@@ -258,9 +243,6 @@ def test_a_dry_run_only_lists_the_runs(tiny):
             ["compare-methods", "nowhere.toml", "--methods", "reduced-space"],
             "there is no such file",
         ),
-        (["sweep", "problem.toml", "--over", "a=1:2"], "error: --over: found 1:2 for a; expected"),
-        (["sweep", "problem.toml", "--over", "title=x", "--method", "nome"], "error: --method: "),
-        (["sweep", "problem.toml", "--over", "object.mesh=a.vtu,b.vtu"], "a.vtu"),
     ],
 )
 def test_bad_input_is_refused_before_anything_runs(tiny, arguments, message):
@@ -282,53 +264,3 @@ def test_an_old_name_ends_with_the_new_names(tiny, words, names):
     assert (outcome.code, outcome.out) == (2, "")
     assert f"No such command '{words[0]}': it was" in outcome.err
     assert all(name in outcome.err for name in names)
-
-
-# Sweeps -------------------------------------------------------------------------------------------
-
-
-def test_a_sweep_tabulates_estimates_against_the_swept_values(tiny, stand_in):
-    outcome = run_command(
-        "sweep", "problem.toml", "--method", "reduced-space", "--out", "out",
-        "--over", "parameters.mu_pa.guess=50:5000:log:3", "--over", "transcription.substeps=1,2",
-    )  # fmt: skip
-    assert outcome.code == 0
-    rows = table(tiny / "out" / "runs.csv")
-    assert [(row["parameters.mu_pa.guess"], row["transcription.substeps"]) for row in rows] == [
-        (mu, m) for mu in ("50", "500", "5000") for m in ("1", "2")
-    ]
-    assert [float(row["value_mu_pa"]) for row in rows] == [50, 50, 500, 500, 5000, 5000]
-    assert "500 2 400 ± 40 500 ± 50" in " ".join(outcome.out.split())
-    assert max(map(len, outcome.out.splitlines())) <= 80
-    assert drawn(tiny / "out") == {"sweep"}
-    content = json.loads((tiny / "out" / "summary.json").read_text())
-    assert content["varied_values"] == ["parameters.mu_pa.guess", "transcription.substeps"]
-    assert "| mu_pa.guess | substeps |" in (tiny / "out" / "summary.md").read_text()
-
-
-@pytest.mark.parametrize("half_width", [math.nan, math.inf, 10.0])
-def test_a_sweep_is_drawn_also_without_finite_intervals(half_width: float):
-    rows = [
-        {
-            "guess_mu_pa": 100.0,
-            "substeps": m,
-            "rms_m": 1e-3,
-            "converged": True,
-            "value_mu_pa": 200.0,
-        }
-        | {"low_mu_pa": 200.0 - half_width, "high_mu_pa": 200.0 + half_width}
-        for m in (1, 2)
-    ]
-    assert [*sweep_plots(rows, ["substeps"])] == ["sweep"]
-
-
-def test_words_and_lists_can_be_swept(tiny, stand_in):
-    outcome = run_command(
-        "sweep", "problem.toml", "--out", "out", "--json", "-q",
-        "--over", "solver.method=interior-point,reduced-space",
-        "--over", "experiment.swing.gravity_m_s2=[0, 0, -9.81],[0, 0, 0]",
-    )  # fmt: skip
-    assert (outcome.code, outcome.err) == (0, "")
-    rows = json.loads(outcome.out)["runs"]
-    assert [row["method"] for row in rows] == [m for m in METHODS for _ in range(2)]
-    assert rows[1]["experiment.swing.gravity_m_s2"] == "[0, 0, 0]"

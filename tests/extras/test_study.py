@@ -21,13 +21,11 @@ from collocation_sysid.extras.studies import (
     RunStore,
     Starts,
     plan_comparison,
-    plan_sweep,
     run_all,
     run_execution,
     run_worker,
 )
-from collocation_sysid.extras.studies.arguments import parse_methods, parse_varied_keys, read_truth
-from collocation_sysid.extras.studies.planning import shortened_keys
+from collocation_sysid.extras.studies.arguments import parse_methods, read_truth
 from collocation_sysid.extras.studies.progress import remaining_time_s
 from collocation_sysid.extras.studies.rows import (
     SuccessCriterion,
@@ -95,45 +93,6 @@ def planned_runs(count: int) -> list[PlannedRun]:
 
 
 # The command line's words -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("text", "values"),
-    [
-        ("a.b=1,2,4", ["1", "2", "4"]),
-        ("a.b=10:1000:log:3", ["10", "100", "1000"]),
-        ("a.b=0:1:3", ["0", "0.5", "1"]),
-        ("a.b=1:4:lin:4", ["1", "2", "3", "4"]),
-        ("a.b=0.1:0.3:3", ["0.1", "0.2", "0.3"]),
-        ('a.b=[0, 1],{c = 1, d = 2},"x,y"', ["[0, 1]", "{c = 1, d = 2}", '"x,y"']),
-        ("a.b=midpoint,bdf2", ["midpoint", "bdf2"]),
-        ("a.b=7", ["7"]),
-    ],
-)
-def test_swept_values_are_lists_or_ranges(text, values):
-    assert parse_varied_keys([text]) == {"a.b": tuple(values)}
-
-
-@pytest.mark.parametrize(
-    ("texts", "message"),
-    [
-        (["parameters.mu_pa.guess"], "expected key=values"),
-        (["=1,2"], "expected key=values"),
-        (["a="], "expected key=values"),
-        (["a=1:2"], "expected first:last:count"),
-        (["a=1:2:log:x"], "expected first:last:count"),
-        (["a=1:2:3:4:5"], "expected first:last:count"),
-        (["a=1:2:lgo:3"], "found the spacing 'lgo'"),
-        (["a=0:2:log:3"], "needs ends above 0"),
-        (["a=1:2:0"], "expected first:last:count"),
-        (["a=1", "a=2"], "given twice"),
-        ([], "at least one key"),
-    ],
-)
-def test_swept_values_that_cannot_be_read_are_quoted(texts, message):
-    with pytest.raises(InputError, match=message) as refused:
-        parse_varied_keys(texts)
-    assert refused.value.where == "--over"
 
 
 def test_methods_are_listed_once_and_misspelt_ones_recognised():
@@ -236,42 +195,6 @@ def test_other_data_are_other_runs(tiny):
     markers = tiny / "swing_markers.csv"
     markers.write_text(markers.read_text() + "\n")
     assert key() != before
-
-
-def test_a_sweep_has_every_combination(tiny):
-    over = parse_varied_keys(["parameters.mu_pa.guess=100:400:log:3", "transcription.substeps=1,2"])
-    planned = plan_sweep(Path("problem.toml"), over, method="reduced-space")
-    assert [tuple(run.varied_values.values()) for run in planned] == [
-        (mu, m) for mu in ("100", "200", "400") for m in ("1", "2")
-    ]
-    assert [run.guess["mu_pa"] for run in planned] == [100, 100, 200, 200, 400, 400]
-    assert planned[1].make_label() == "mu_pa.guess=100, substeps=2"
-    assert {run.method for run in planned} == {"reduced-space"}
-
-
-def test_a_sweep_can_be_over_methods(tiny):
-    over = parse_varied_keys(["solver.method=interior-point,reduced-space"])
-    planned = plan_sweep(Path("problem.toml"), over)
-    assert [run.method for run in planned] == ["interior-point", "reduced-space"]
-
-
-@pytest.mark.parametrize(
-    ("over", "message"),
-    [
-        ("parameters.mu_pa.gues=1,2", "did you mean 'guess'"),
-        ("transcription.substeps=1,x", "transcription.substeps: found 'x'"),
-        ("title.text=1", "--over: title.text goes beyond the value"),
-    ],
-)
-def test_swept_keys_the_problem_has_not_are_refused(tiny, over, message):
-    with pytest.raises(InputError, match=message):
-        plan_sweep(Path("problem.toml"), parse_varied_keys([over]))
-
-
-def test_keys_are_shortened_while_they_differ():
-    keys = ["parameters.mu_pa.guess", "transcription.substeps", "a.sigma_m", "b.sigma_m"]
-    shorts = ["mu_pa.guess", "substeps", "a.sigma_m", "b.sigma_m"]
-    assert list(shortened_keys(keys)) == list(zip(keys, shorts, strict=True))
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,6 @@ def test_isolated_processes_and_solver_checks_execute_nothing_of_the_working_fol
         ("check", "problem.toml"),
         ("compare-models", "problem.toml", "--materials", "neo-hookean,yeoh", "--out", "o"),
         ("compare-methods", "problem.toml", "--methods", "reduced-space", "--out", "o"),
-        ("sweep", "problem.toml", "--over", "parameters.mu_pa.guess=200,300", "--out", "o"),
         ("solve", "problem.toml", *REDUCED, "--no-pictures", "--out", "o"),
         ("doctor",),
     ],

@@ -65,7 +65,7 @@ def test_a_pipe_is_refused_rather_than_waited_for(tiny: Path, file: str):
     (tiny / file).unlink()
     os.mkfifo(tiny / file)
     assert "is a pipe; expected a regular file" in refused("check", "problem.toml")
-    assert "is a pipe" in refused("sweep", "problem.toml", "--over", "transcription.substeps=1,2")
+    assert "is a pipe" in refused("compare-models", "problem.toml", "--prony", "0,1")
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no such device here")
@@ -263,19 +263,6 @@ def test_an_override_of_depths_or_digits_without_end_is_refused(tiny: Path, valu
             "found 1,000,000 starts",
         ),
         (("compare-models", "--prony", "0,1000000"), "whole numbers up to 20"),
-        (("sweep", "--over", "solver.huber=1:2:1000000"), "found 1,000,000 values"),
-        (("sweep", "--over", f"solver.huber=1:2:1{'0' * 30}"), "found more than 10"),
-        (
-            (
-                "sweep",
-                "--over",
-                "solver.huber=1:2:900",
-                "--over",
-                "transcription.substeps=1:900:900",
-            ),
-            "found 810,000 runs",
-        ),
-        (("sweep", "--over", "solver.huber=1:1e999:3"), "expected first:last:count"),
     ],
 )
 def test_a_study_without_end_is_refused_with_a_number(tiny: Path, words: tuple, found: str):

@@ -70,7 +70,6 @@ def test_python_blocks_of_a_page_run_one_after_the_other(page: Path, checkout: P
 SHORT = {
     "compare-methods": ["--dry-run"],
     "compare-models": ["--dry-run"],
-    "sweep": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
     "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
     "plan": ["--no-film"],
@@ -266,17 +265,9 @@ def test_the_reference_lists_exactly_the_public_names():
 
 def test_the_reference_of_the_command_line_has_every_command_and_option(reference):
     page = reference.command_line()
-    for command in (
-        "solve",
-        "check",
-        "compare-methods",
-        "compare-models",
-        "sweep",
-        "report",
-        "new",
-    ):
+    for command in ("solve", "check", "compare-methods", "compare-models", "report", "new"):
         assert f"\n## {command}\n" in page
-    for option in ("--start", "--allow-code", "--time-limit", "--over"):
+    for option in ("--start", "--allow-code", "--time-limit", "--starts"):
         assert f"`{option}`" in page
     assert "collocation-sysid solve problem.toml --method interior-point" in page
 

@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from kit.problem_files import TRUTH, pictures_drawn, run_command, settings, write_problem
+from kit.problem_files import pictures_drawn, run_command, settings, write_problem
 from kit.results import ROLLOUT, a_result
 
 from collocation_sysid.common.display import plain_text
@@ -187,38 +187,6 @@ def test_a_browser_shows_the_page_whole(page: str, run_folder: Path, tmp_path: P
     assert title is not None
     count = len(list(run_folder.glob("*.png")))
     assert title.group(1) == f"broken 0 wide 0 images {count}"
-
-
-# Comparisons
-
-
-@pytest.fixture(scope="module")
-def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("compared")
-    write_problem(folder, {"swing": 6})
-    truth = ",".join(f"{name}={value}" for name, value in TRUTH.items())
-    methods = ("--methods", "reduced-space,shooting", "--truth", truth)
-    out = folder / "compare"
-    outcome = run_command("compare-methods", folder / "problem.toml", *methods, "--out", out)
-    assert outcome.code == 0, outcome.err
-    return out
-
-
-def test_a_comparison_has_a_page_too(comparison: Path):
-    outcome = run_command("report", comparison)
-    assert outcome.code == 0, outcome.err
-    found = Elements((comparison / "report.html").read_text())
-    assert len(found.images) == len(list(comparison.glob("*.png"))) > 0
-    for words in ("Success", "reduced-space", "shooting", "within 1 %", "Runs"):
-        assert words in found.text
-    assert not found.outside
-
-
-def test_a_damaged_comparison_is_refused(comparison: Path, tmp_path: Path):
-    (tmp_path / "summary.json").write_text('{"schema": 5, "kind": "compare-methods"}')
-    outcome = run_command("report", tmp_path)
-    assert outcome.code == 2
-    assert "summary.json is damaged" in outcome.err
 
 
 def test_concerns_name_their_remedy(run_folder: Path, tmp_path: Path):

@@ -2,16 +2,16 @@
 
 Studies: `arguments` parses command-line arguments,
 `planning` plans the runs, `run_execution` executes them (each in its own process, see
-`run_worker`) and stores their records, `rows` converts records to rows of numbers, and
-`page` and `plots` present them. `progress` shows progress in the terminal, also
-of the search for a motion (package `design`).
+`run_worker`) and stores their records, `rows` converts records to rows of numbers, and `tables`
+and `plots` present them. `progress` shows progress in the terminal, also of the search for a
+motion (package `design`).
 
 Model comparison: `model_variants` derives models from a problem file, `model_choice` compares their
 predictions, `model_comparison` does so in Python, and `law_disagreements` evaluates how much an
 estimate depends on the model.
 """
 
-from .planning import PlannedRun, Starts, plan_comparison, plan_models, plan_sweep
+from .planning import PlannedRun, Starts, plan_comparison, plan_models
 from .run_execution import RunOptions, RunStore, run_all
 
 __all__ = [
@@ -21,6 +21,5 @@ __all__ = [
     "Starts",
     "plan_comparison",
     "plan_models",
-    "plan_sweep",
     "run_all",
 ]

@@ -1,9 +1,8 @@
-"""Command-line arguments of studies: methods, true values, and the values of swept keys."""
+"""Command-line arguments of studies: methods and true values."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,6 @@ from ...errors import InputError, require_among
 from ...methods import METHODS, require_method
 from ...problem.reading import parse_toml
 from ...problem.validation_messages import shortened
-
-# Largest number of runs of a study: more would be a mistake in a list of values.
-MOST_RUNS = 10_000
-RANGE = "such as 50:5000:log:9 or 0:1:5"
 
 
 def unique_items(text: str) -> tuple[str, ...]:
@@ -44,9 +39,6 @@ def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
     for name in names:
         require_method(name, option)
     return names
-
-
-# The truth ----------------------------------------------------------------------------------------
 
 
 def read_truth(
@@ -124,116 +116,3 @@ def _positive_value(name: str, value: Any, source: Path | None) -> float:
             f"found {name} = {quoted}; expected a positive number", source, where="--truth"
         )
     return number
-
-
-# Swept keys ---------------------------------------------------------------------------------------
-
-
-def parse_varied_keys(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Return the values of each swept key, as text for `--set`.
-
-    Parameters
-    ----------
-    texts : sequence of str
-        "key=a,b,c", "key=first:last:count" or "key=first:last:log:count" (evenly spaced, ends
-        included). Commas within brackets, braces and quotes do not separate values.
-
-    Raises
-    ------
-    InputError
-        For a text that cannot be read, which is quoted; for a key that is given twice; without any
-        key; and for more than `MOST_RUNS` combinations.
-    """
-    over: dict[str, tuple[str, ...]] = {}
-    for text in texts:
-        key, equals, values = (part.strip() for part in text.partition("="))
-        if not (equals and key and values):
-            raise InputError(
-                f"found {text!r}; expected key=values such as parameters.mu_pa.guess="
-                "50:5000:log:9 or transcription.substeps=1,2,4",
-                None,
-                where="--over",
-            )
-        if key in over:
-            raise InputError(
-                f"{key} is given twice; put its values in one list", None, where="--over"
-            )
-        ranged = ":" in values and not values.startswith(('"', "'", "[", "{"))
-        over[key] = tuple(_range_values(key, values) if ranged else _split_values(values))
-    if not over:
-        raise InputError("missing; expected at least one key to sweep over", None, where="--over")
-    require_few(math.prod(map(len, over.values())), "--over", noun="runs")
-    return over
-
-
-def require_few(count: int, option: str, noun: str) -> None:
-    """Raise `InputError` if `count` exceeds `MOST_RUNS`.
-
-    Parameters
-    ----------
-    count : int
-        Number of runs, or of anything that makes runs.
-    option : str
-        Command-line option that the message refers to.
-    noun : str
-        Plural noun for what is counted, for the message.
-    """
-    if count > MOST_RUNS:
-        number = f"{count:,}" if count < 10**15 else "more than 10¹⁵"
-        raise InputError(
-            f"found {number} {noun}; expected at most {MOST_RUNS:,}: give fewer values",
-            None,
-            where=option,
-        )
-
-
-def _range_values(key: str, text: str) -> Iterable[str]:
-    """Return the values of a range "first:last:count" or "first:last:log:count", ends included,
-    evenly spaced, or so in the logarithm, as text with 12 digits.
-    """
-    first, *middle, count = text.split(":")
-    try:
-        low = float(first)
-        high = float(middle[0])
-        number = int(count)
-        spacing = middle[1] if len(middle) == 2 else "linear"
-        if len(middle) > 2 or number < 1 or not np.isfinite([low, high, high - low]).all():
-            raise ValueError
-    except (ValueError, IndexError):
-        raise InputError(
-            f"found {text} for {key}; expected first:last:count or first:last:log:count, {RANGE}",
-            None,
-            where="--over",
-        ) from None
-    require_few(number, "--over", noun=f"values of {key}")
-    if spacing not in ("log", "lin", "linear"):
-        raise InputError(
-            f"found the spacing {spacing!r} for {key}; expected log or linear, {RANGE}",
-            None,
-            where="--over",
-        )
-    if spacing == "log" and not (low > 0 and high > 0):
-        raise InputError(
-            f"found {text} for {key}; a logarithmic range needs ends above 0", None, where="--over"
-        )
-    spaced = np.geomspace if spacing == "log" else np.linspace
-    # Without the rounding errors of their computation.
-    return [f"{value:.12g}" for value in spaced(low, high, number)]
-
-
-def _split_values(text: str) -> list[str]:
-    """Split at commas outside of brackets, braces and quotes."""
-    items = [""]
-    open_brackets = 0
-    quote = ""
-    for letter in text:
-        if quote:
-            quote = "" if letter == quote else quote
-        elif letter in "\"'":
-            quote = letter
-        open_brackets += (letter in "[{") - (letter in "]}") if not quote else 0
-        if letter == "," and not open_brackets and not quote:
-            items.append("")
-        else:
-            items[-1] += letter
-    return [item.strip() for item in items if item.strip()]

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...common.display import Table
 from ...fem.laws.constants import is_damping, symbol_of, symbol_with_unit, without_region
 from ...statistics.budget.variance_sources import BudgetLine
 from ...statistics.estimates import IntervalCoordinate
@@ -114,30 +113,3 @@ def _disagreement(
     return Disagreement(
         name, values, chosen_budget=line, combined95=with_law.combined95, share=with_law.shares[LAW]
     )
-
-
-def law_table(differences: Sequence[Disagreement]) -> Table:
-    """Return a table with a line for each parameter: its estimate by law, the spread (largest over
-    smallest estimate, less one, in percent), and the chosen law's combined intervals without and
-    with the choice of the law; intervals that are unknown are empty.
-
-    Parameters
-    ----------
-    differences : sequence of Disagreement
-        Parameters, all with estimates of the same models.
-    """
-    laws = dict.fromkeys(model for each in differences for model in each.values)
-    rows = []
-    for each in differences:
-        values = [each.values[law] for law in laws]
-        spread = 100 * (max(values) / min(values) - 1)
-        intervals = (
-            w and "{:.3g} … {:.3g}".format(*w)
-            for w in (each.chosen_budget and each.chosen_budget.combined95, each.combined95)
-        )
-        cells = (f"{value:.4g}" for value in values)
-        rows.append(
-            (symbol_with_unit(each.name), *cells, f"{spread:.0f} %", *(w or "" for w in intervals))
-        )
-    heads = ("", *laws, "spread", "combined interval", "including the law")
-    return Table("Estimates by material law", heads, rows=tuple(rows))

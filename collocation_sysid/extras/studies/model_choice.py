@@ -90,7 +90,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
         fit = (records.get(run.key) or {}).get("model") or {}
-        of_model.setdefault(run.varied_values["model"], {})[run.test_name or ""] = fit
+        of_model.setdefault(run.model_name, {})[run.test_name or ""] = fit
     rows = [_model_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
     _add_ratios(rows)

@@ -12,10 +12,10 @@ from ...errors import InputError
 from ...problem import Problem
 from ...recording.measurement_selection import measured_count
 from .model_choice import advice, fit_record, model_notes, model_rows
-from .page import comparable_names, model_views
 from .planning import PlannedRun, fitted_recordings, require_predictable
-from .plots import model_plots
+from .plots import model_figure
 from .rows import Row
+from .tables import model_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import
@@ -29,7 +29,7 @@ class ModelComparison:
     ----------
     rows : tuple of dict
         One row for each model, with "model", "chosen", "held_out_rms", "delta_aic", "parameters"
-        and the other columns of ``runs.csv``.
+        and other numbers.
     """
 
     rows: tuple[Row, ...]
@@ -46,8 +46,8 @@ class ModelComparison:
 
     @cached_property
     def tables(self) -> list[Table]:
-        """Tables of fit and prediction, of the parameters, and of the combined intervals."""
-        return model_views(self.rows)
+        """Tables of fit and prediction, and of the parameters."""
+        return model_tables(self.rows)
 
     def __str__(self) -> str:
         return plain_text([self.advice, "", *self.tables, *model_notes(self.rows)])
@@ -60,10 +60,10 @@ class ModelComparison:
         InputError
             If no model has a prediction or an interval.
         """
-        figures = model_plots(self.rows, comparable_names(self.rows))
-        if not figures:
+        figure = model_figure(self.rows)
+        if figure is None:
             raise InputError("no model could be fitted; expected at least one to draw")
-        return figures["models"]
+        return figure
 
 
 def compare_models(
@@ -118,7 +118,7 @@ def compare_models(
                 f"{name} without {test_name}",
                 problem=name,
                 method=by,
-                varied_values={"model": name},
+                model_name=name,
                 test_name=test_name,
             )
             if log is not None:

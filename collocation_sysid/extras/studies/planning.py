@@ -1,8 +1,7 @@
 """Planning of studies: every run is a problem file with overrides and a method.
 
 Each run can therefore be repeated with ``collocation-sysid solve PROBLEM --method M --set …``. Use
-`plan_comparison` for methods and starts, `plan_sweep` for values of keys, and `plan_models` for
-models.
+`plan_comparison` for methods and starts, and `plan_models` for models.
 """
 
 from __future__ import annotations
@@ -26,18 +25,14 @@ from ...problem import Problem
 from ...problem.reading import read_problem_file
 from ...problem.schema import ParameterSection, ProblemFile
 from ...recording.sources.logs import stored_files
-from .arguments import require_few
 from .model_variants import ModelVariant
 
-# Kinds of studies: the names of their commands, which are in summary.json and in folder names.
+# Kinds of studies: the names of their commands, which are in JSON and in folder names.
 METHOD_STUDY = "compare-methods"
 MODEL_STUDY = "compare-models"
-SWEEP_STUDY = "sweep"
-STUDY_TITLES = {
-    METHOD_STUDY: "Comparison of methods",
-    MODEL_STUDY: "Comparison of models",
-    SWEEP_STUDY: "Sweep",
-}
+STUDY_TITLES = {METHOD_STUDY: "Comparison of methods", MODEL_STUDY: "Comparison of models"}
+# Largest number of starts: more would be a mistake.
+MOST_STARTS = 10_000
 # Hexadecimal digits of a run's key: 80 bits, so that two of 10,000 runs never agree.
 KEY_LENGTH = 20
 
@@ -56,44 +51,23 @@ class PlannedRun:
     # mapping of str to float or None: guesses of the estimated parameters; None where there is
     # none.
     guess: Mapping[str, float | None] = field(default_factory=dict)
-    # mapping of str to str: values of the swept keys as text; for a comparison of models, "model"
-    # and its label.
-    varied_values: Mapping[str, str] = field(default_factory=dict)
+    model_name: str = ""  # label of the model, in a comparison of models
     allow_code: bool = False  # whether to run the Python files that the problem names
-    # For a comparison of models, the recording that is predicted; "" if all are fitted. None for
-    # other studies.
+    # In a comparison of models, the recording that is predicted; "" if all are fitted. None in one
+    # of methods.
     test_name: str | None = None
 
     def make_label(self) -> str:
-        """Return the short description of the run for the user: model and held-out recording, swept
-        values, or method and start.
+        """Return the short description of the run for the user: model and held-out recording, or
+        method and start.
         """
-        if self.test_name is not None:
-            what = f" without '{self.test_name}'" if self.test_name else ""
-            return f"{self.varied_values['model']}{what}"
-        if not self.varied_values:
+        if self.test_name is None:
             return f"{self.method}, start {self.start}"
-        return ", ".join(
-            f"{short}={self.varied_values[key]}"
-            for key, short in shortened_keys(self.varied_values)
-        )
+        return self.model_name + (f" without '{self.test_name}'" if self.test_name else "")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields of the run as a dictionary, which JSON can represent."""
         return asdict(self)
-
-
-def shortened_keys(keys: Sequence[str] | Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield each dotted key with the shortest ending that distinguishes it from the others, in
-    order; of parameters at least two parts, name and key: "parameters.mu_pa.guess" with
-    "mu_pa.guess". If no ending does, it is the complete key. Of a mapping the keys are used.
-    """
-    for key in keys:
-        parts = key.split(".")
-        fewest_parts = 2 if parts[0] == "parameters" else 1
-        ends = [".".join(parts[-count:]) for count in range(fewest_parts, len(parts) + 1)]
-        unique_ends = (e for e in ends if sum(f".{other}".endswith(f".{e}") for other in keys) == 1)
-        yield key, next(unique_ends, key)
 
 
 @validated
@@ -119,7 +93,12 @@ class Starts:
     seed: Count = 0
 
     def __post_init__(self) -> None:
-        require_few(self.starts, "starts", noun="starts")
+        if self.starts > MOST_STARTS:
+            raise InputError(
+                f"found {self.starts:,} starts; expected at most {MOST_STARTS:,}: give fewer values",
+                None,
+                where="starts",
+            )
 
     def overrides(self, problem: Problem, truth: Mapping[str, float], start: int) -> Iterator[str]:
         """Yield the overrides "parameters.NAME.guess=VALUE" of one start: guesses of the estimated
@@ -208,48 +187,6 @@ def plan_comparison(
     return planned
 
 
-def plan_sweep(
-    path: Path,
-    over: Mapping[str, Sequence[str]],
-    overrides: Sequence[str] = (),
-    method: str | None = None,
-    allow_code: bool = False,
-) -> list[PlannedRun]:
-    """Return a run of every combination of the swept values; the last key changes fastest.
-
-    Parameters
-    ----------
-    path : Path
-        Problem file.
-    over : mapping of str to sequence of str
-        Values as text by key.
-    overrides : sequence of str
-        Further overrides "key=value".
-    method : str, optional
-        Name of the method; the file's own by default.
-    allow_code : bool
-        Whether to run the Python files that the problem names.
-
-    Raises
-    ------
-    InputError
-        For a key or value that the problem file does not accept.
-    """
-    read_problem_file(path, overrides)
-    planned = []
-    for values in itertools.product(*over.values()):
-        varied_values = dict(zip(over, values, strict=True))
-        run_overrides = [*overrides, *(f"{key}={value}" for key, value in varied_values.items())]
-        try:
-            file, _ = read_problem_file(path, run_overrides)
-        except InputError as error:
-            where = "--over" if error.source == "--set" else error.source
-            raise InputError(error.message, where, where=error.where) from error
-        details = {"varied_values": varied_values, "allow_code": allow_code}
-        planned.append(_planned_run(path, file, method=method, overrides=run_overrides, **details))
-    return planned
-
-
 def plan_models(
     problem: Problem,
     variants: Sequence[ModelVariant],
@@ -282,8 +219,11 @@ def plan_models(
     for test_name in ("", *fitted_recordings(problem)):
         for variant in variants:
             file, _ = read_problem_file(variant.path, variant.overrides)
-            details = {"varied_values": {"model": variant.label}, "test_name": test_name}
-            details |= {"allow_code": allow_code}
+            details = {
+                "model_name": variant.label,
+                "test_name": test_name,
+                "allow_code": allow_code,
+            }
             planned.append(
                 _planned_run(
                     variant.path, file, method=method, overrides=variant.overrides, **details

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from math import inf, nan, sqrt
+from dataclasses import field
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -19,74 +19,23 @@ from .run_execution import TIMEOUT, Record
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class NumberColumn:
-    """Number of a run, with its heading and format."""
-
-    head: str = ""  # short heading in the terminal; empty if the column is not shown
-    words: str = ""  # heading on pages
-    factor: float = 1.0  # factor before display, for example 1000 for millimetres
-    form: str = ".2g"  # format specification
-    # Function that returns the number from a result; None if it comes from elsewhere.
-    from_result: Callable[[Result], float | None] | None = None
-    has_median: bool = True  # whether the summary of a method contains the median over its runs
-
-    def format(self, value: float | None) -> str:
-        """Return `value` times the factor as text in the format of the column; a dash "–" for None.
-
-        With the default format ".2g", magnitudes from 100 on are rounded to whole numbers.
-        """
-        if value is None:
-            return "–"
-        value *= self.factor
-        return format(value, ".0f" if self.form == ".2g" and abs(value) >= 100 else self.form)
-
-
-# Quality and cost of a run.
-COLUMNS = {
-    "loss": NumberColumn(
-        from_result=lambda r: r.history[-1].loss if r.history else None, has_median=False
-    ),
-    "rms_m": NumberColumn(
-        "markers mm", "markers, RMS [mm]", factor=1e3, from_result=lambda r: r.fit.rms_m
-    ),
-    "violation_n": NumberColumn(
-        "violation N",
-        "equations of motion violated by [N]",
-        factor=1,
-        form=".1e",
-        from_result=lambda r: r.dynamics.max_violation_n,
-    ),
-    "violation_relative": NumberColumn(
-        "relative",
-        "of the largest force",
-        factor=1,
-        form=".1e",
-        from_result=lambda r: r.dynamics.max_violation_relative,
-    ),
-    "rollout_rms_m": NumberColumn(
-        "forward mm",
-        "forward simulation, RMS [mm]",
-        factor=1e3,
-        from_result=lambda r: r.rollout.rms_m,
-    ),
-    "rollout_max_m": NumberColumn(from_result=lambda r: r.rollout.max_m, has_median=False),
-    "tip_max_m": NumberColumn("tip mm", "tip, at most [mm]", factor=1e3),
-    "iterations": NumberColumn(
-        "iter.", "iterations", factor=1, form=".4g", from_result=lambda r: r.iterations
-    ),
-    "evaluations": NumberColumn(
-        "evals", "evaluations", factor=1, form=".4g", from_result=lambda r: r.evaluations
-    ),
-    "build_s": NumberColumn("build s", "set-up [s]", from_result=lambda r: r.timing_s.build),
-    "evaluations_s": NumberColumn(
-        "evaluate s", "evaluations [s]", from_result=lambda r: r.timing_s.evaluations
-    ),
-    "linear_algebra_s": NumberColumn(
-        "solve s", "linear algebra [s]", from_result=lambda r: r.timing_s.linear_algebra
-    ),
-    "total_s": NumberColumn("total s", "in all [s]", from_result=lambda r: r.timing_s.total),
+# Quality and cost of a run, from its result.
+NUMBERS: dict[str, Callable[[Result], float | None]] = {
+    "loss": lambda r: r.history[-1].loss if r.history else None,
+    "rms_m": lambda r: r.fit.rms_m,
+    "violation_n": lambda r: r.dynamics.max_violation_n,
+    "violation_relative": lambda r: r.dynamics.max_violation_relative,
+    "rollout_rms_m": lambda r: r.rollout.rms_m,
+    "rollout_max_m": lambda r: r.rollout.max_m,
+    "iterations": lambda r: r.iterations,
+    "evaluations": lambda r: r.evaluations,
+    "build_s": lambda r: r.timing_s.build,
+    "evaluations_s": lambda r: r.timing_s.evaluations,
+    "linear_algebra_s": lambda r: r.timing_s.linear_algebra,
+    "total_s": lambda r: r.timing_s.total,
 }
+# Numbers of which the summary of a method has the median over its runs.
+MEDIANS = (*(name for name in NUMBERS if name not in ("loss", "rollout_max_m")), "tip_max_m")
 # 97.5 % quantile of the standard normal distribution.
 NORMAL_975 = 1.959963984540054
 
@@ -138,16 +87,16 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion) -> Row:
     """Return one run as a flat row; values are None if they are not known or NaN.
 
-    The columns are "key", "method", "start", one for each swept key, "status", "converged",
-    "success", those of the parameters, the names in `COLUMNS` (quality and cost, such as "loss" and
-    "rms_m"), "wall_s", "attempts" and "message". The columns of the parameters are ``guess_NAME``,
-    ``value_NAME``, ``std_error_NAME``, ``low_NAME``, ``high_NAME`` (combined standard error and
-    interval) and ``error_NAME`` (relative to the truth, only for parameters whose truth is known).
+    The columns are "key", "method", "start", "status", "converged", "success", those of the
+    parameters, the names in `NUMBERS` (quality and cost, such as "loss" and "rms_m"), "tip_max_m",
+    "wall_s", "attempts" and "message". The columns of the parameters are ``guess_NAME``,
+    ``value_NAME``, and ``error_NAME`` (relative to the truth, only for parameters whose truth is
+    known).
 
     Parameters
     ----------
     run : PlannedRun
-        Run of a comparison of methods or a sweep.
+        Run of a comparison of methods.
     record : Record or None
         Its record; None if it was not executed: its "status" is then "missing".
     yardstick : SuccessCriterion
@@ -160,22 +109,17 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
     parameters = _parameter_columns(run, result, truth=yardstick.truth)
     errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
     is_accurate = all(error is not None and error <= yardstick.within for error in errors)
-    values = {
-        name: None if result is None else column.from_result(result)
-        for name, column in COLUMNS.items()
-        if column.from_result is not None
-    }
+    numbers = {name: None if result is None else number(result) for name, number in NUMBERS.items()}
     row = {
         "key": run.key,
         "method": run.method,
         "start": run.start,
-        **run.varied_values,
         "status": record["outcome"] if is_timeout or result is None else result.status,
         "converged": converged,
         "success": converged and is_accurate,
         **parameters,
-        **values,
-        "tip_max_m": (record.get("tip") or {}).get("max_m"),
+        **numbers,
+        "tip_max_m": record.get("tip_max_m"),
         "wall_s": record.get("wall_s"),
         "attempts": record.get("attempts"),
         "message": record.get("message", ""),
@@ -185,8 +129,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
 
 def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
     """Return the columns of the estimated parameters of a run: first ``guess_NAME`` of all, then
-    for each ``value_NAME``, ``std_error_NAME``, ``low_NAME`` and ``high_NAME`` (combined standard
-    error and interval), and ``error_NAME`` if its truth is known.
+    for each ``value_NAME``, and ``error_NAME`` if its truth is known.
     """
     row: Row = {}
     estimates = {} if result is None else result.parameters
@@ -197,9 +140,6 @@ def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[st
         estimate = estimates.get(name)
         value = None if estimate is None else estimate.value
         row[f"value_{name}"] = value
-        row[f"std_error_{name}"] = None if estimate is None else estimate.combined_std_error
-        interval = None if estimate is None else estimate.combined95
-        row[f"low_{name}"], row[f"high_{name}"] = interval or (None, None)
         if name in truth:
             # Methods are compared by the optimum that they find, not by its correction.
             optimum = value if estimate is None or estimate.optimum is None else estimate.optimum
@@ -207,18 +147,11 @@ def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[st
     return row
 
 
-def parameters_in(rows: Sequence[Row], kind: str = "guess_") -> list[str]:
-    """Return the names of the parameters for which there is a column with the prefix `kind`,
-    without the prefix.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        At least one row of `run_row` or `method_rows`, the first of which decides.
-    kind : str
-        Prefix of columns, such as "guess_", "value_" or "error_".
+def error_columns(rows: Sequence[Row]) -> list[str]:
+    """Return the names of the columns ``error_NAME``. `rows`, at least one, are those of `run_row`
+    or `method_rows`; the first one decides.
     """
-    return [name.removeprefix(kind) for name in rows[0] if name.startswith(kind)]
+    return [name for name in rows[0] if name.startswith("error_")]
 
 
 # Methods ------------------------------------------------------------------------------------------
@@ -247,9 +180,8 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))
-    errors = [f"error_{name}" for name in parameters_in(rows, "error_")]
-    medians = [name for name, column in COLUMNS.items() if column.has_median]
-    known = {n: [row[n] for row in done if row[n] is not None] for n in (*errors, *medians)}
+    medians = (*error_columns(rows), *MEDIANS)
+    known = {name: [row[name] for row in done if row[name] is not None] for name in medians}
     return {
         "method": method,
         "runs": len(done),
@@ -260,66 +192,3 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
         "success_high": high,
         **{name: float(np.median(each)) if each else None for name, each in known.items()},
     }
-
-
-def best_run(rows: Sequence[Row]) -> Row | None:
-    """Return the run with the lowest loss among the successes, without any among the converged
-    runs, and without these among all runs with a result.
-
-    A run has a result if its "rms_m" is not None. A loss of None counts as infinite. None if no run
-    has a result.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`; not modified.
-    """
-    completed = [row for row in rows if row["rms_m"] is not None]
-
-    def loss(row: Row) -> float:
-        """Return the loss of a run; infinite if unknown."""
-        return inf if row["loss"] is None else row["loss"]
-
-    candidates = (
-        [row for row in completed if row["success"]]
-        or [row for row in completed if row["converged"]]
-        or completed
-    )
-    return min(candidates, key=loss, default=None)
-
-
-def reference_parameters(rows: Sequence[Row], yardstick: SuccessCriterion) -> dict[str, float]:
-    """Return the parameters by name relative to which guesses are measured: the truth, or the
-    estimates of the best run, see `best_run`.
-
-    Empty if there is no truth and the best run did not converge, or no run has a result.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        Rows of `run_row`, at least one.
-    yardstick : SuccessCriterion
-        True values; if there are any, one for each estimated parameter (otherwise `KeyError`).
-    """
-    names = parameters_in(rows)
-    if yardstick.truth:
-        return {name: yardstick.truth[name] for name in names}
-    best = best_run(rows)
-    if best is None or not best["converged"]:
-        return {}
-    return {name: best[f"value_{name}"] for name in names}
-
-
-def guess_distance(row: Row, centre: Mapping[str, float]) -> float:
-    """Return the largest ratio, at least 1, between a guess and its reference in either direction;
-    NaN without a reference.
-
-    Parameters
-    ----------
-    row : Row
-        Row of `run_row`; for each parameter in `centre` its guess must be positive, not None.
-    centre : mapping of str to float
-        Positive reference by name.
-    """
-    logs = [abs(np.log(row[f"guess_{name}"] / value)) for name, value in centre.items()]
-    return float(np.exp(max(logs))) if logs else nan

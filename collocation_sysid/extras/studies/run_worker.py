@@ -53,8 +53,8 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     -------
     dict
         "outcome" (`FINISHED` or `ERROR`) and "message". Of a finished run also "model", see
-        `fit_record`, if `test_name` is not None (a comparison of models), else "result" and "tip",
-        see `_tip_record`. Of an unexpected error also "traceback".
+        `fit_record`, if `test_name` is not None (a comparison of models), else "result" and
+        "tip_max_m", see `_tip_error_m`. Of an unexpected error also "traceback".
     """
     try:
         problem = Problem.read(
@@ -69,7 +69,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
             "outcome": FINISHED,
             "message": finished.solution.message,
             "result": finished.result,
-            "tip": _tip_record(finished),
+            "tip_max_m": _tip_error_m(finished),
         }
     except (InputError, SimulationError) as error:
         return {"outcome": ERROR, "message": str(error)}
@@ -78,32 +78,23 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
         return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
 
 
-def _tip_record(finished: Run) -> dict[str, Any] | None:
-    """Return tracks of the marker farthest from the grasp, for JSON, or None."""
+def _tip_error_m(finished: Run) -> float | None:
+    """Return the largest error [m] of the marker farthest from the grasp in the forward simulation
+    of the first experiment; None without markers, measurements or a simulation.
+    """
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers
+    rollout = finished.rollouts[experiment.name]
+    if not (markers.names and isinstance(rollout, ForwardSimulation)):
+        return None
     nodes_m = experiment.body.nodes_m
     grasped_nodes = prescribed_nodes(experiment.grasps)
-    if not markers.names:
-        return None
     centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0)
     tip = int(np.linalg.norm(markers.predict_positions(nodes_m) - centre, axis=1).argmax())
-    measured = markers.positions_m[:, tip]
-    rollout = finished.rollouts[experiment.name]
-    rolled = (
-        rollout.trajectory.markers_m[:, tip] if isinstance(rollout, ForwardSimulation) else None
-    )
-    error = None
-    if rolled is not None and markers.is_complete[:, tip].any():
-        error = float(np.nanmax(np.linalg.norm(rolled - measured, axis=1)))
-    return {
-        "experiment": experiment.name,
-        "marker": markers.names[tip],
-        "max_m": error,
-        "t_s": experiment.t_s.tolist(),
-        "measured_m": measured.tolist(),
-        "rolled_out_m": None if rolled is None else rolled.tolist(),
-    }
+    if not markers.is_complete[:, tip].any():
+        return None
+    errors_m = rollout.trajectory.markers_m[:, tip] - markers.positions_m[:, tip]
+    return float(np.nanmax(np.linalg.norm(errors_m, axis=1)))
 
 
 def _end_with_study() -> None:

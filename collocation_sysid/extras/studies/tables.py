@@ -1,0 +1,281 @@
+"""Results of a study: tables for the terminal, a Markdown file with one picture, and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import exp
+from pathlib import Path
+from typing import Any
+
+from ...common.display import Shown, Table, TitledParts, as_markdown
+from ...common.files import SCHEMA, replaced_file, write_text_file
+from ...fem.laws.constants import symbol_of, symbol_with_unit
+from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
+from .planning import METHOD_STUDY, MODEL_STUDY, PlannedRun
+from .plots import convergence_figure, model_figure
+from .rows import Row, SuccessCriterion, error_columns, method_rows, run_row
+from .run_execution import Record, RunStore
+
+# Resolution of the picture [pixels per inch], for a page.
+RESOLUTION_DPI = 150
+MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with a result."
+
+
+@dataclass(frozen=True, eq=False)
+class StudyReport:
+    """Results of a study, finished or not."""
+
+    title: str
+    kind: str
+    planned: tuple[PlannedRun, ...]
+    records: Mapping[str, Record]  # mapping of str to Record: records of finished runs by key
+    yardstick: SuccessCriterion
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row for each planned run (`run_row`), or for each model (`model_rows`),
+        computed anew at each access.
+        """
+        if self.kind == MODEL_STUDY:
+            return model_rows(self.planned, self.records)
+        return [
+            run_row(run, self.records.get(run.key), yardstick=self.yardstick)
+            for run in self.planned
+        ]
+
+    def build_parts(self) -> list[Shown]:
+        """Return the advice of a comparison of models, the tables, and notes that explain them,
+        within 80 columns.
+        """
+        rows = self.rows
+        if self.kind == METHOD_STUDY:
+            parts: list[Shown] = [method_table(method_rows(rows)), ""]
+        else:
+            parts = [advice(rows), ""]
+            for table in model_tables(rows):
+                parts += [table, ""]
+        return [*parts, *self.make_notes(rows)]
+
+    @property
+    def failures(self) -> list[str]:
+        """One line for each run that has a record without a result: its label, outcome
+        and message. Runs without a record do not count.
+        """
+        return [
+            f"{run.make_label()}: {record['outcome']}: {record.get('message', '')}"
+            for run in self.planned
+            if (record := self.records.get(run.key)) is not None
+            and not {"result", "model"} & record.keys()
+        ]
+
+    def make_notes(self, rows: Sequence[Row]) -> list[str]:
+        """Return notes that explain the tables, the criterion of success of a comparison of
+        methods, and the number of runs without a record, if there are any.
+        """
+        missing = len(self.planned) - len(self.records)
+        explained = (
+            model_notes(rows)
+            if self.kind == MODEL_STUDY
+            else (self.yardstick.describe(), MEDIANS_NOTE)
+        )
+        remaining = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
+        return [*explained, *remaining]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the results for JSON, with dataclasses that `as_json` converts.
+
+        The keys are "schema", "kind", "title", "problem" (path of the first run's file), "runs",
+        "notes" and "failures"; for a comparison of methods also "truth" (None if unknown), "within"
+        and "methods", and of models "advice" and "laws".
+        """
+        rows = self.rows
+        content: dict[str, Any] = {
+            "schema": SCHEMA,
+            "kind": self.kind,
+            "title": self.title,
+            "problem": self.planned[0].problem,
+            "runs": rows,
+            "notes": self.make_notes(rows),
+            "failures": self.failures,
+        }
+        if self.kind == MODEL_STUDY:
+            return content | {"advice": advice(rows), "laws": law_disagreements(rows)}
+        return content | {
+            "truth": dict(self.yardstick.truth) or None,
+            "within": self.yardstick.within,
+            "methods": method_rows(rows),
+        }
+
+    def write(self, folder: Path) -> None:
+        """Write ``summary.md``, and the picture if a run has a result, into a folder, made if
+        missing: ``convergence.png`` of methods, or ``models.png``. Earlier files are replaced.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be written.
+        """
+        parts = (*self.build_parts(), *self.failures)
+        section = TitledParts(self.title, parts, level=1)
+        write_text_file(folder / "summary.md", as_markdown([section]))
+        if self.kind == MODEL_STUDY:
+            name, figure = "models.png", model_figure(self.rows)
+        else:
+            name, figure = "convergence.png", convergence_figure(self.rows, self.records)
+        if figure is not None:
+            with replaced_file(folder / name) as draft:
+                figure.savefig(draft, dpi=RESOLUTION_DPI)
+
+
+def load_report(
+    title: str,
+    kind: str,
+    planned: Sequence[PlannedRun],
+    store: RunStore,
+    yardstick: SuccessCriterion | None = None,
+) -> StudyReport:
+    """Return the report of planned runs from their stored records.
+
+    Parameters
+    ----------
+    title, kind
+        See `StudyReport`.
+    planned : sequence of PlannedRun
+        All runs of the study, at least one; those without a record remain to be done.
+    store : RunStore
+        Storage of the records.
+    yardstick : SuccessCriterion, optional
+        Criterion of success; by default convergence alone.
+    """
+    loaded = {run.key: store.load(run.key) for run in planned}
+    records = {key: record for key, record in loaded.items() if record is not None}
+    return StudyReport(
+        title,
+        kind,
+        planned=tuple(planned),
+        records=records,
+        yardstick=yardstick or SuccessCriterion(),
+    )
+
+
+def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
+    """Return a table of the runs of a study with their guesses ("–" if there is none), and which of
+    them are finished.
+
+    Parameters
+    ----------
+    planned : sequence of PlannedRun
+        Runs; they are numbered from 1.
+    finished : sequence of str
+        Keys of the finished runs.
+    """
+    rows = tuple(
+        (
+            str(number),
+            run.make_label(),
+            " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
+            "finished" if run.key in finished else "to do",
+        )
+        for number, run in enumerate(planned, start=1)
+    )
+    return Table("", ("", "run", "guess", ""), rows=rows, names=4)
+
+
+Cell = Callable[[Row], str]
+
+
+def method_table(summaries: Sequence[Row]) -> Table:
+    """Return the table "Methods" with a line for each method.
+
+    Parameters
+    ----------
+    summaries : sequence of Row
+        Rows of `method_rows`, at least one; None is shown as a dash.
+    """
+    cells: dict[str, Cell] = {"success": lambda row: f"{row['successes']}/{row['runs']}"}
+    for name in error_columns(summaries):
+        cells[f"Δ{symbol_of(name.removeprefix('error_'))} %"] = _number_cell(name, 100)
+    cells |= {
+        "markers mm": _number_cell("rms_m", 1e3),
+        "iter.": _number_cell("iterations", form=".4g"),
+        "total s": _number_cell("total_s"),
+    }
+    return _table("Methods", {"method": lambda row: row["method"]}, cells, summaries)
+
+
+def model_tables(rows: Sequence[Row]) -> list[Table]:
+    """Return the tables "Models" (fit and prediction, the chosen model with an arrow) and
+    "Parameters".
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        Rows of `model_rows`, at least one; all errors are shown in the unit of the first one, such
+        as mm. None is shown as a dash.
+    """
+    factor, unit = display_unit(rows[0]["unit"])
+    cells: dict[str, Cell] = {
+        "free": _number_cell("free", form="d"),
+        f"fit {unit}": _number_cell("rms", factor, form=".3g"),
+        "ΔAIC": _number_cell("delta_aic", form=".1f"),
+        f"held out {unit}": _number_cell("held_out_rms", factor, form=".3g"),
+        "relative to best": _ratio_text,
+        "total s": _number_cell("total_s"),
+    }
+    names: dict[str, Cell] = {
+        "": lambda row: "→" if row["chosen"] else "",
+        "model": lambda row: row["model"],
+    }
+    parameters = tuple(
+        (symbol_with_unit(name), *(_bounded_value(row, name) for row in rows))
+        for name in dict.fromkeys(name for row in rows for name in row["parameters"])
+    )
+    heads = ("", *(row["model"] for row in rows))
+    return [_table("Models", names, cells, rows), Table("Parameters", heads, rows=parameters)]
+
+
+def _ratio_text(row: Row) -> str:
+    """Return the ratio of a model's prediction error to the best one as text, with its standard
+    error; "–" if "log_ratio" is None, because not all held-out data were predicted. `row` is one of
+    `model_rows`.
+    """
+    if row["log_ratio"] is None:
+        return "–"
+    times = exp(row["log_ratio"])
+    form = ".2f" if times < 100 else ".2g"
+    return f"{times:{form}} ± {times * row['log_ratio_error']:{form}}"
+
+
+def _bounded_value(row: Row, name: str) -> str:
+    """Return the value of a parameter in a row of `model_rows` as text, followed by "(at lower
+    bound)" or "(at upper bound)" if it ended there; "–" if the model has no such parameter.
+    """
+    number = _number_text(row["parameters"].get(name), form=".4g")
+    bound = row["at_bound"].get(name)
+    return f"{number} (at {bound} bound)" if bound else number
+
+
+def _table(
+    title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
+) -> Table:
+    """Return a table with a line for each row and a column for each cell."""
+    columns = {**names, **numbers}
+    cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
+    return Table(title, tuple(columns), rows=cells, names=len(names))
+
+
+def _number_cell(name: str, factor: float = 1, form: str = ".2g") -> Cell:
+    """Return the cell of a number, see `_number_text`."""
+    return lambda row: _number_text(row[name], factor, form)
+
+
+def _number_text(value: float | None, factor: float = 1, form: str = ".2g") -> str:
+    """Return `value` times the factor as text; a dash "–" for None.
+
+    With the default format ".2g", magnitudes from 100 on are rounded to whole numbers.
+    """
+    if value is None:
+        return "–"
+    value *= factor
+    return format(value, ".0f" if form == ".2g" and abs(value) >= 100 else form)
