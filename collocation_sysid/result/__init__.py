@@ -1,4 +1,4 @@
-"""Output of a finished run: files, reports on a terminal, web pages, pictures and films.
+"""Output of a finished run: files, text on a terminal, reports, pictures and films.
 
 Files: `run_record` writes a run folder, `replay` reads one back, `run_writers` writes ParaView
 frames and replaces folders safely, `run_refinement` adds measured discretisation errors to a run

@@ -1,7 +1,7 @@
 """Motion of one experiment of a run: measured, fitted and simulated shapes and markers.
 
-Pictures, films and the 3-D view need nothing but a `MotionRecord`. It can be read from the arrays
-of a run folder (`read_run`), so that they can be drawn again without solving.
+Pictures and films need nothing but a `MotionRecord`. It can be read from the arrays of a run folder
+(`read_run`), so that they can be drawn again without solving.
 """
 
 from __future__ import annotations
