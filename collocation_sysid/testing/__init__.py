@@ -8,9 +8,8 @@ docs/howto/extend.md.
 - `damping_check`: derivatives, dissipation, objectivity, compiled forces.
 - `force_check`, `sensor_check`: values and derivatives in small programs.
 - `method_check`: answer, history, restart and options.
-- `missing_constant_check`: message for a constant that a problem does not state.
 - `property_check`, `finite_differences`: comparisons; `program_derivatives`: matrices of a program;
-  `internal_force_check`: compiled internal forces; `round_trip`: pickling and problem files;
+  `internal_force_check`: compiled internal forces;
   `small_problems`: bodies and recordings of the checks.
 """
 

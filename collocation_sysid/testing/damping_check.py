@@ -15,9 +15,7 @@ from ..fem.laws.damping_admissibility import viscous_stress
 from ..fem.laws.materials import DampingLaw, Energy, Material, as_damping, as_material
 from .internal_force_check import check_internal_forces, damping_stress
 from .material_check import deformation_gradients, random_rotation
-from .missing_constant_check import check_missing_constant
 from .property_check import PropertyCheck
-from .round_trip import check_pickling
 from .small_problems import usual_constants
 
 # Number of random deformations, and the largest entries of F − I: damping laws are used at large
@@ -38,14 +36,13 @@ def check_damping(
     elements: Sequence[str] = ("tet4",),
     largest_strain: float = LARGEST_STRAIN,
 ) -> None:
-    """Check a damping law: derivatives, dissipation, objectivity, compiled forces, pickling.
+    """Check a damping law: derivatives, dissipation, objectivity and compiled forces.
 
     The stress or potential can be evaluated, and its result has the right shape. At random
     deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a stated ∂P_v/∂F
     is the derivative of P_v by CasADi's automatic derivative and by central differences. The power
     P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation only rotates P_v. The
-    compiled forces of a small body with this law are checked as by `check_material`, and a missing
-    constant is refused by its name.
+    compiled forces of a small body with this law are checked as by `check_material`.
 
     Parameters
     ----------
@@ -101,16 +98,6 @@ def check_damping(
             is_objective=is_objective,
             is_dissipative=is_dissipative,
         )
-    own = {constant.name: values[constant.name] for constant in made.constants}
-    check_missing_constant(check, own, material=known, damping=made)
-    F = next(iter(deformation_gradients(check.rng, 1, largest_strain=largest_strain)))
-    check_pickling(
-        check,
-        made,
-        evaluate=lambda each: (
-            DampingStress(each, known, values=stress.values).evaluate(F, F).stress
-        ),
-    )
 
 
 @dataclass(frozen=True, eq=False)

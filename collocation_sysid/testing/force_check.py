@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -15,15 +14,10 @@ from numpy.typing import ArrayLike
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.laws.constants import Constant
 from ..fem.node_force import CONTEXT_OFFSETS, CONTEXT_SIZE, ForceContext, Law, NodeForce
 from ..model.generated_functions import GeneratedFunction
-from ..problem.code_loader import CodeLoader
-from ..problem.schema import NodeForceSection
-from .missing_constant_check import check_missing_constant
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
-from .round_trip import check_pickling, check_problem_file
 from .small_problems import (
     DENSITY_KG_M3,
     TIMESTEP_S,
@@ -57,15 +51,13 @@ def check_force(
     is_zero_at_rest: bool = False,
     positions_m: ArrayLike | None = None,
     body: Body | None = None,
-    file: str | Path | None = None,
 ) -> None:
-    """Check a custom force: values, derivatives in programs, energy, dissipation and round trips.
+    """Check a custom force: values, derivatives in programs, energy and dissipation.
 
     At random states the generated force equals the law called with numbers, its first and second
     derivatives by position, velocity, constants and internal variables are CasADi's automatic
     derivatives of the plain law and agree with central differences, and so do gradient, Jacobian
-    and Hessian of a small program with the force. A missing or misspelt constant is refused by
-    its name. The force can be pickled.
+    and Hessian of a small program with the force.
 
     Parameters
     ----------
@@ -87,9 +79,6 @@ def check_force(
     body : Body, optional
         Body with the force, for the small program; by default a box with the force on all nodes
         or faces.
-    file : str or Path, optional
-        Python file that contains the law, to check that a problem file can name it. The file is
-        run.
 
     Raises
     ------
@@ -102,8 +91,7 @@ def check_force(
     Notes
     -----
     An `energy` is compared only at random states of a node, with velocity zero. `is_zero_at_rest`
-    is checked at the first place, to 1e-9 N. With `file`, the function that the problem file names
-    is the ``__name__`` of the law.
+    is checked at the first place, to 1e-9 N.
     """
     made = force if isinstance(force, NodeForce) else NodeForce.from_law(force)
     check = PropertyCheck(f"force {made.name!r}")
@@ -128,8 +116,6 @@ def check_force(
             found, np.zeros(law.dofs), statement="the force at rest is not zero", scale=1.0
         )
     unplaced = replace(made, nodes=None)
-    _check_messages(check, unplaced, values=values)
-    _check_round_trips(check, law, state=states[0], file=file)
     small = body or Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced])
     check_program(check, program_of(swung_experiment(small), values))
 
@@ -348,43 +334,4 @@ def _check_dissipation(
             f"it adds energy {where}: the power (f(x, v) − f(x, 0))·v is positive",
             max(powers),
             expected="at most 0 W",
-        )
-
-
-def _check_messages(check: PropertyCheck, force: NodeForce, values: dict[str, float]) -> None:
-    """Require that unknown and missing constants are refused by name."""
-    misspelt = f"no_{next(iter(values), 'constant')}"
-    check.require_refusal(
-        lambda: NodeForce.from_law(
-            force.law, Constant(misspelt), on=force.on, carries=force.internal_variable_count
-        ),
-        naming=misspelt,
-        statement=f"the definition of {misspelt!r}, which the law does not have",
-    )
-    check_missing_constant(check, values, forces=[force])
-
-
-def _check_round_trips(
-    check: PropertyCheck, law: ForceLaw, state: tuple[Array, Array], file: str | Path | None
-) -> None:
-    """Require the same forces after pickling and from a problem file."""
-
-    def evaluate(force: NodeForce) -> Array:
-        """Return the force at a state."""
-        return ForceLaw(force, law.values).evaluate_plain(*state)
-
-    def load(loader: CodeLoader, table: Mapping[str, Any]) -> NodeForce:
-        """Return the force of a table of a problem file."""
-        return loader.force(NodeForceSection.model_validate(table), "object.force.0")
-
-    check_pickling(check, law.force, evaluate=evaluate)
-    if file is not None:
-        table = {
-            "file": Path(file).name,
-            "function": getattr(law.force.law, "__name__", law.force.name),
-            "on": law.force.on,
-            "carries": law.force.internal_variable_count,
-        }
-        check_problem_file(
-            check, file, table=table, load=load, extension=law.force, evaluate=evaluate
         )

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -14,15 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
 from ..fem.body import Body
-from ..fem.laws.constants import Constant
 from ..fem.laws.materials import DAMPINGS, Energy, Material, as_material
-from ..problem.code_loader import CodeLoader
-from ..problem.schema import CodeSection
 from .internal_force_check import check_internal_forces
-from .missing_constant_check import check_missing_constant
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
-from .round_trip import check_pickling, check_problem_file
 from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box, usual_constants
 
 # Number of random deformations.
@@ -30,9 +23,6 @@ DEFORMATIONS = 4
 # Largest entries of F − I in them: stretches from about 0.6 to 1.4, in which every usual material
 # has an energy.
 LARGEST_STRAIN = 0.2
-# Largest entry of F − I at which energies are compared after pickling: small, for materials with a
-# limit.
-ROUND_TRIP = 0.02
 # Largest relative difference of derivatives by a chain rule from those by F: both contain powers of
 # the invariants, whose rounding errors are larger.
 CHAIN_RULE = 1e-8
@@ -48,10 +38,8 @@ def check_material(
     elements: Sequence[str] = ("tet4",),
     has_memory: bool = False,
     largest_strain: float = LARGEST_STRAIN,
-    file: str | Path | None = None,
-    function: str | None = None,
 ) -> None:
-    """Check a material: energy, stress, stiffness, objectivity, compiled forces and round trips.
+    """Check a material: energy, stress, stiffness, objectivity and compiled forces.
 
     The undeformed material has no energy and no stress, and resists every small strain. Stress
     and stiffness at random deformations, and at deformations with equal principal stretches, are
@@ -59,8 +47,7 @@ def check_material(
     stress by the constants; a rotation changes neither the energy nor the stress in the body's
     axes. The compiled forces of a small body, and their derivatives of first and second order by
     positions, velocities and constants, agree with a plain sum over its elements and CasADi's
-    automatic derivatives of it, and with central differences. A missing or misspelt constant is
-    refused by its name. The material can be pickled.
+    automatic derivatives of it, and with central differences.
 
     Parameters
     ----------
@@ -77,11 +64,6 @@ def check_material(
         Whether to check a small program in which the material has a branch of memory, too.
     largest_strain : float
         Largest entry of F − I of the random deformations; smaller for materials with a limit.
-    file : str or Path, optional
-        Python file that contains the energy function, to check that a problem file can name it.
-        The file is run.
-    function : str, optional
-        Name of the function in the file; by default that of the energy function.
 
     Raises
     ------
@@ -92,8 +74,8 @@ def check_material(
 
     Notes
     -----
-    An empty `elements` skips the check of compiled forces. The missing and the misspelt constant
-    are those of this material; entries of `constants` that it does not declare are ignored.
+    An empty `elements` skips the check of compiled forces. Entries of `constants` that the material
+    does not declare are ignored.
     """
     made = as_material(material)
     check = PropertyCheck(f"material {made.name!r}")
@@ -104,8 +86,6 @@ def check_material(
         _check_derivatives(check, law, F=F, where=where)
         if is_objective:
             _check_objectivity(check, law, F=F, where=where)
-    _check_messages(check, made, values=values)
-    _check_round_trips(check, made, values=values, file=file, function=function)
     for element in elements:
         check_internal_forces(
             check,
@@ -330,45 +310,3 @@ def _check_objectivity(check: PropertyCheck, law: EnergyDerivatives, F: Array, w
         statement=f"the stress does not rotate with the body {where}",
         tolerance=1e-8,
     )
-
-
-def _check_messages(check: PropertyCheck, material: Material, values: dict[str, float]) -> None:
-    """Require that unknown and missing constants are refused by name."""
-    misspelt = f"no_{material.constants[0].name}"
-    check.require_refusal(
-        lambda: Material.from_energy(material.energy, material.name, Constant(misspelt)),
-        naming=misspelt,
-        statement=f"the definition of {misspelt!r}, which the energy does not have",
-    )
-    check_missing_constant(check, values, material=material)
-
-
-def _check_round_trips(
-    check: PropertyCheck,
-    material: Material,
-    values: dict[str, float],
-    file: str | Path | None,
-    function: str | None,
-) -> None:
-    """Require the same energies after pickling and from a problem file."""
-    constants = np.array([*values.values()])
-    deformations = [
-        *deformation_gradients(np.random.default_rng(0), DEFORMATIONS, largest_strain=ROUND_TRIP)
-    ]
-
-    def evaluate(made: Material) -> Array:
-        """Return ψ (`DEFORMATIONS`,) at the same few small deformations in every call."""
-        law = EnergyDerivatives(made, constants)
-        return np.concatenate([law.evaluate_plain(F) for F in deformations])
-
-    def load(loader: CodeLoader, table: Mapping[str, Any]) -> Material:
-        """Return the material of a table of a problem file."""
-        return loader.material(CodeSection.model_validate(table), "object.material")
-
-    check_pickling(check, material, evaluate=evaluate)
-    if file is not None:
-        name = function or getattr(material.energy, "__name__", material.name)
-        table = {"file": Path(file).name, "function": name}
-        check_problem_file(
-            check, file, table=table, load=load, extension=material, evaluate=evaluate
-        )

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from ..common.array_types import Array
-from ..errors import InputError
 from ..fem.body import Body
 from ..fem.meshes.structured import box_mesh
-from ..methods.options import method_from_options
 from ..methods.solution import Iteration, Method, Solution
 from ..model.parameters import Parameters, Unknown
 from ..program.collocation import Collocation
 from ..program.simulation import simulate, with_markers
 from .property_check import PropertyCheck
-from .round_trip import check_pickling
 from .small_problems import DENSITY_KG_M3, swung_experiment
 
 # Difference of two losses, sums of squares over variances, that rounding explains [1].
@@ -38,14 +31,12 @@ LARGEST_VIOLATION = 1e-5
 def check_method(
     method: Method, *, is_exact: bool = True, largest_error: float = LARGEST_ERROR
 ) -> None:
-    """Check a method on a small recording: answer, history, restart, options, round trips.
+    """Check a method on a small recording: answer, history and restart.
 
     The method converges to the parameters of the simulation, within the bounds, with the
     equations of motion satisfied. It passes every line of the history to `watch`, ends with a
     lower loss than it begins with, does not change the `Collocation`, and finds the same answer
-    from its own answer. If it is a dataclass of options: an unknown option and a value of a wrong
-    type are refused by their names, options from a problem file give an equal method, and it can
-    be pickled.
+    from its own answer.
 
     Parameters
     ----------
@@ -83,9 +74,6 @@ def check_method(
     _check_answer(
         check, again, is_exact=is_exact, largest_error=largest_error, where=" from its own answer"
     )
-    if is_dataclass(method) and hasattr(type(method), "name"):
-        _check_options(check, method)
-        check_pickling(check, method, evaluate=lambda each: [float(each == method)])
 
 
 def small_recording() -> Collocation:
@@ -169,33 +157,3 @@ def _check_history(check: PropertyCheck, solution: Solution, lines: list[Iterati
     expected = solution.collocation.objective(solution.z) / solution.collocation.loss_scale
     if not np.isfinite(expected):
         check.fail("the loss of the answer is not finite", expected, expected="a finite loss")
-
-
-def _check_options(check: PropertyCheck, method: Any) -> None:
-    """Require that wrong options are refused by name, and a round trip of right ones."""
-    kind = type(method)
-    key = f"solver.{method.name}"
-    check.require_refusal(
-        lambda: method_from_options(kind, {"no_such_option": 1}, key=key),
-        naming="no_such_option",
-        statement="an unknown option",
-    )
-    options = {each.name: getattr(method, each.name) for each in fields(method)}
-    for name, value in options.items():
-        if isinstance(value, bool | int | float):
-            check.require_refusal(
-                partial(method_from_options, kind, {name: "text"}, key=key),
-                naming=f"{key}.{name}",
-                statement=f"the text 'text' as the option {name}",
-            )
-    written = {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in options.items()
-        if value is not None and not callable(value)
-    }
-    try:
-        read = method_from_options(kind, tomllib.loads(tomli_w.dumps(written)), key=key)
-    except InputError as error:
-        check.fail("its options from a problem file are refused", error, expected="the same method")
-    if read != method:
-        check.fail("its options from a problem file give another method", read, expected=method)

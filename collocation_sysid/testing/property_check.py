@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
-from ..errors import InputError
 from .finite_differences import STEP, directional_derivative
 
 # Largest relative difference of two exact formulas of one quantity: rounding of some thousand
@@ -202,38 +201,6 @@ class PropertyCheck:
             tolerance=tolerance,
             scale=size,
         )
-
-    def require_refusal(self, call: Callable[[], Any], *, naming: str, statement: str) -> None:
-        """Require that a call raises an `InputError` that contains a name.
-
-        Parameters
-        ----------
-        call : callable
-            Call with invalid input.
-        naming : str
-            Key or name that the message has to contain.
-        statement : str
-            Description of the invalid input.
-
-        Raises
-        ------
-        AssertionError
-            If the call succeeds, raises another error, or the message lacks the name.
-        """
-        expected = f"an InputError that names {naming}"
-        try:
-            call()
-        except InputError as error:
-            if naming not in str(error):
-                self.fail(
-                    f"the message for {statement} lacks the name", str(error), expected=expected
-                )
-        except Exception as error:  # any other error is what the check reports
-            self.fail(
-                f"{statement} is not refused", f"{type(error).__name__}: {error}", expected=expected
-            )
-        else:
-            self.fail(f"{statement} is not refused", "no error", expected=expected)
 
 
 def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -15,13 +13,11 @@ from ..common.array_types import Array
 from ..fem.body import Body
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
-from ..problem.code_loader import CodeLoader
 from ..program.collocation import Collocation
 from ..program.custom_sensor_residual import CustomSensorResidual
-from ..recording.custom_sensor import CustomSensor, Gauge, stack_values
+from ..recording.custom_sensor import CustomSensor, stack_values
 from .program_derivatives import check_program
 from .property_check import PropertyCheck
-from .round_trip import check_pickling, check_problem_file
 from .small_problems import DENSITY_KG_M3, STEPS, TIMESTEP_S, program_of, swung_experiment
 
 # Number of random states.
@@ -41,27 +37,19 @@ MARGIN_M = 0.02
 SAMPLES = 7
 
 
-def check_sensor(
-    sensor: CustomSensor, *, file: str | Path | None = None, function: str | None = None
-) -> None:
-    """Check a custom sensor: values, derivatives, predictions, messages and round trips.
+def check_sensor(sensor: CustomSensor) -> None:
+    """Check a custom sensor: values, derivatives and predictions.
 
     At random states the expression's first and second derivatives agree with central differences
     of the expression called with numbers. In a small recording of a body around the sensor's
     points, the prediction for a motion that is quadratic in time is the expression at the exact
     positions, velocities and accelerations; gradient, Jacobian and Hessian of the program agree
-    with central differences. An unknown that the expression does not have is refused by its name.
-    The sensor can be pickled.
+    with central differences.
 
     Parameters
     ----------
     sensor : CustomSensor
         Sensor on points or on a grasp; its samples are not used.
-    file : str or Path, optional
-        Python file that contains the expression, to check that a problem file can name it. The
-        file is run.
-    function : str, optional
-        Name of the function in the file; by default that of the expression.
 
     Raises
     ------
@@ -78,13 +66,6 @@ def check_sensor(
     for number in range(STATES):
         u = expression.random_state(check.rng)
         _check_derivatives(check, expression, u=u, where=f"at random state {number}")
-    if isinstance(sensor, Gauge):
-        check.require_refusal(
-            lambda: replace(sensor, unknowns={**sensor.unknowns, "no_such_unknown": 1.0}),
-            naming="no_such_unknown",
-            statement="an unknown that the expression does not have",
-        )
-    _check_round_trips(check, sensor, file=file, function=function)
     collocation = _small_program(sensor)
     if sensor.grasp is None:
         _check_prediction(check, expression, collocation=collocation)
@@ -246,28 +227,3 @@ def _check_prediction(
             statement=f"the prediction for a known motion is wrong at t = {t_s:.4g} s",
             tolerance=1e-7,
         )
-
-
-def _check_round_trips(
-    check: PropertyCheck, sensor: CustomSensor, file: str | Path | None, function: str | None
-) -> None:
-    """Require the same numbers at one random state after pickling and, unless `file` is None, from
-    a problem file that names the expression in this Python file.
-    """
-    u = SensorExpression(sensor).random_state(check.rng)
-
-    def evaluate(each: CustomSensor) -> Array:
-        """Return the numbers of a sensor at a state."""
-        return SensorExpression(each).evaluate_plain(u)
-
-    check_pickling(check, sensor, evaluate=evaluate)
-    if file is not None and isinstance(sensor, Gauge):
-
-        def load(loader: CodeLoader, table: Mapping[str, Any]) -> Gauge:
-            """Return the sensor with the expression that a table of a problem file names."""
-            _, expression = loader.function(table["code"], table["function"], "reading.0.code")
-            return replace(sensor, expression=expression)
-
-        name = function or getattr(sensor.expression, "__name__", sensor.name)
-        table = {"code": Path(file).name, "function": name}
-        check_problem_file(check, file, table=table, load=load, extension=sensor, evaluate=evaluate)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,16 +10,13 @@ import numpy as np
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.fem.body import Body
 from collocation_sysid.model.nuisance_map import NuisanceMap
-from collocation_sysid.problem.code_loader import CodeLoader
-from collocation_sysid.problem.nuisance_schema import CustomNuisanceSection
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.markers.residual import MarkerResidual
 from collocation_sysid.recording.deviation import Deviation
 from collocation_sysid.recording.experiment import Experiment
-from collocation_sysid.recording.nuisance import KINDS, Nuisance
+from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.testing.program_derivatives import check_program
 from collocation_sysid.testing.property_check import PropertyCheck
-from collocation_sysid.testing.round_trip import check_pickling, check_problem_file
 from collocation_sysid.testing.small_problems import (
     DENSITY_KG_M3,
     program_of,
@@ -39,20 +33,13 @@ LARGEST_DEVIATION = 0.5
 FIRST_INNER_SAMPLE = 2
 
 
-def check_nuisance(
-    row: Deviation,
-    *,
-    experiment: Experiment | None = None,
-    file: str | Path | None = None,
-    name_in_file: str | None = None,
-) -> None:
-    """Check a nuisance parameter: effect, derivatives in programs, messages and round trips.
+def check_nuisance(row: Deviation, *, experiment: Experiment | None = None) -> None:
+    """Check a nuisance parameter: effect and derivatives in programs.
 
     Zero changes nothing; the reading's first and second derivatives agree with central
     differences. In a small recording the predicted markers are the reading of those without the
     parameter, or the markers at the later time of its clock; gradient, Jacobian and Hessian of
-    the program agree with central differences. A second parameter of the same name, and a prior
-    without width, are refused by name. The parameter can be pickled.
+    the program agree with central differences.
 
     Parameters
     ----------
@@ -61,11 +48,6 @@ def check_nuisance(
     experiment : Experiment, optional
         Recording that has the parameter; by default a swung box with markers. Other parameters of
         its `nuisance` are kept.
-    file : str or Path, optional
-        Python file that contains the row, to check that a problem file can name it. The file is
-        run.
-    name_in_file : str, optional
-        Name of the row in the file; by default its own name.
 
     Raises
     ------
@@ -85,10 +67,6 @@ def check_nuisance(
             expected="at least one value",
         )
     collocation = program_of(changed, {})
-    data = collocation.transcriptions[0].nuisance
-    _check_round_trips(check, row, data=data, file=file, name_in_file=name_in_file)
-    if row not in KINDS:
-        _check_messages(check, row, experiment=base)
     if row.reading is not None:
         _check_reading(check, row, collocation=collocation)
     if row.clock is not None:
@@ -233,52 +211,3 @@ def _smooth_motion(collocation: Collocation, shift_s: float = 0.0) -> Array:
     t_s = transcription.dynamics.t_s + shift_s
     steps = rates[0] * t_s[:, None, None] + 10 * rates[1] * t_s[:, None, None] ** 2
     return np.einsum("tij,nj->tni", np.eye(3) + steps, nodes_m).reshape(len(t_s), -1)
-
-
-def _check_messages(check: PropertyCheck, row: Deviation, experiment: Experiment) -> None:
-    """Require that a repeated name and a prior without width are refused by the name of the row."""
-    nuisance = experiment.nuisance
-    check.require_refusal(
-        lambda: replace(nuisance, own=(*nuisance.own, row, row)),
-        naming=row.name,
-        statement="a second parameter of the same name",
-    )
-    check.require_refusal(
-        lambda: Nuisance.none(own=[replace(row, sigma=0.0)]),
-        naming=row.name,
-        statement="a prior with a standard deviation of zero",
-    )
-
-
-def _check_round_trips(
-    check: PropertyCheck,
-    row: Deviation,
-    data: NuisanceMap,
-    file: str | Path | None,
-    name_in_file: str | None,
-) -> None:
-    """Require the same effect and prior after pickling and from a file."""
-    y = np.array([0.03, 0.05, 0.02])
-    values = (row.sigma or USUAL_SIGMA) * np.linspace(0.3, 0.5, _value_count(row))
-    t_s = float(np.mean(data.recorded_s))
-
-    def evaluate(each: Deviation) -> Array:
-        """Return prior standard deviation (0 if None), limits (0 if infinite) and effect of a row
-        at one state; a row without reading and clock has no effect.
-        """
-        has_effect = each.reading is not None or each.clock is not None
-        effect = _read(each, y, values=values, t_s=t_s, data=data) if has_effect else np.zeros(0)
-        limits = np.array([each.low, each.high, each.reach])
-        limits = np.where(np.isfinite(limits), limits, 0.0)
-        return np.concatenate([[each.sigma or 0.0], limits, effect])
-
-    def load(loader: CodeLoader, table: Mapping[str, Any]) -> Deviation:
-        """Return the row of a table of a problem file."""
-        return loader.nuisance_row(CustomNuisanceSection.model_validate(table))
-
-    check_pickling(check, row, evaluate=evaluate)
-    if file is not None:
-        table = {"file": Path(file).name, "row": name_in_file or row.name}
-        check_problem_file(
-            check, file, table=table, load=load, extension=row, evaluate=evaluate, key="row"
-        )

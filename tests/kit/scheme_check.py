@@ -17,7 +17,6 @@ from collocation_sysid.program.simulation import simulate
 from collocation_sysid.testing.finite_differences import observed_order
 from collocation_sysid.testing.program_derivatives import check_program
 from collocation_sysid.testing.property_check import PropertyCheck
-from collocation_sysid.testing.round_trip import check_pickling
 from collocation_sysid.testing.small_problems import (
     DENSITY_KG_M3,
     program_of,
@@ -74,12 +73,6 @@ def check_scheme(scheme: str | Scheme) -> None:
     _check_stability(check, made)
     _check_order(check, made)
     _check_simulation(check, made)
-    check.require_refusal(
-        lambda: as_scheme(made, "no_start_rule"),
-        naming="no_start_rule",
-        statement="an unknown start rule",
-    )
-    check_pickling(check, made, evaluate=lambda each: [float(each == made)])
 
 
 def _moment(coefficients: tuple[float, ...], power: int) -> float:

@@ -104,36 +104,3 @@ def test_an_energy_of_a_force_on_faces_is_refused():
         cs.InputError, match="'suction' is on faces, where an energy cannot be checked"
     ):
         check_force(cs.NodeForce.from_law(suction, on="faces"), energy=bed_energy)
-
-
-MINE = """
-import casadi as ca
-
-def drag(x, v, at, drag_coefficient):
-    return -0.6 * drag_coefficient * at.area_m2 * ca.sqrt(ca.sumsqr(v) + 1e-4) * v
-"""
-
-
-def test_a_problem_file_gives_the_same_force_or_the_check_fails(tmp_path):
-    file = tmp_path / "mine.py"
-    file.write_text(MINE)
-    check_force(drag, file=file)
-    file.write_text(MINE.replace("-0.6", "-0.5"))
-    with pytest.raises(
-        AssertionError, match=r"'drag': the one that a problem file reads from mine.py has other"
-    ):
-        check_force(drag, file=file)
-    file.write_text(MINE.replace("def drag", "def drags"))
-    with pytest.raises(cs.InputError, match="there is no function 'drag'; expected one of drags"):
-        check_force(drag, file=file)
-
-
-def test_a_force_that_no_cluster_can_evaluate_fails():
-    pytest.importorskip("cloudpickle")
-    factor = ca.SX(0.5)
-
-    def symbolic(x, v, at, push_n_m):
-        return -factor * push_n_m * (x - at.rest_m)
-
-    with pytest.raises(AssertionError, match="pickling fails, so that no cluster can evaluate it;"):
-        check_force(symbolic)

@@ -100,40 +100,6 @@ def test_a_limit_that_is_not_reached_is_no_fault():
     check_material(limited, constants={"limit": 5.0})
 
 
-MINE = """
-import casadi as ca
-
 def rubber(F, mu_pa):
     strain = (F.T @ F - ca.SX.eye(3)) / 2
     return mu_pa * (ca.sumsqr(strain) + ca.trace(strain) ** 2)
-
-def softer(F, mu_pa):
-    return rubber(F, 0.9 * mu_pa)
-"""
-
-
-def rubber(F, mu_pa):
-    strain = (F.T @ F - ca.SX.eye(3)) / 2
-    return mu_pa * (ca.sumsqr(strain) + ca.trace(strain) ** 2)
-
-
-def test_a_problem_file_gives_the_same_material_or_the_check_fails(tmp_path):
-    file = tmp_path / "mine.py"
-    file.write_text(MINE)
-    check_material(rubber, file=file)
-    with pytest.raises(
-        AssertionError,
-        match=r"the one that a problem file reads from mine.py has other values, entr",
-    ):
-        check_material(rubber, file=file, function="softer")
-
-
-def test_a_material_that_no_cluster_can_evaluate_fails():
-    pytest.importorskip("cloudpickle")
-    factor = ca.SX(0.5)
-
-    def symbolic(F, mu_pa):
-        return factor * rubber(F, mu_pa)
-
-    with pytest.raises(AssertionError, match="'symbolic': pickling fails, so that no cluster can"):
-        check_material(symbolic)

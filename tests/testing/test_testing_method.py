@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import pytest
 
@@ -104,19 +103,3 @@ def partial(collocation, watch=None, start=None):
 def test_a_fault_is_one_sentence(method, sentence: str):
     with pytest.raises(AssertionError, match=sentence):
         check_method(method)
-
-
-@dataclass(frozen=True)
-class Careless:
-    """A method that does not check its options."""
-
-    name: ClassVar[str] = "careless"
-    sweeps: int = 3
-
-    def __call__(self, collocation, watch=None, start=None):
-        return REDUCED(collocation, watch, start)
-
-
-def test_an_option_that_may_be_anything_fails():
-    with pytest.raises(AssertionError, match="'careless': the text 'text' as the option sweeps is"):
-        check_method(Careless())

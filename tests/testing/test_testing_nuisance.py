@@ -126,25 +126,3 @@ def test_a_fault_is_one_sentence(change: dict, sentence: str):
     row = replace(cs.Deviation("mine", "m", 0.01, reading=scaled), **change)
     with pytest.raises(AssertionError, match=sentence):
         check_nuisance(row)
-
-
-MINE = """
-import collocation_sysid as cs
-
-def scaled(y, values, t_s, data):
-    return (1 + values) * y
-
-scale = cs.Deviation("camera_scale", "1", 0.02, reading=scaled)
-"""
-
-
-def test_a_problem_file_gives_the_same_parameter_or_the_check_fails(tmp_path):
-    file = tmp_path / "mine.py"
-    file.write_text(MINE)
-    check_nuisance(ROWS["scale"], file=file, name_in_file="scale")
-    file.write_text(MINE.replace("0.02", "0.03"))
-    with pytest.raises(
-        AssertionError,
-        match=r"the one that a problem file reads from mine.py has other values, entry",
-    ):
-        check_nuisance(ROWS["scale"], file=file, name_in_file="scale")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from collocation_sysid.errors import InputError
 from collocation_sysid.testing.property_check import PropertyCheck
 
 CHECK = PropertyCheck("gel 'a'")
@@ -43,17 +42,3 @@ def test_a_product_with_a_wrong_sign_fails():
     CHECK.require_product(cubes, product, POINT, direction, statement="the slope is wrong")
     with pytest.raises(AssertionError, match="the slope is wrong, by central differences, entry"):
         CHECK.require_product(cubes, -product, POINT, direction, statement="the slope is wrong")
-
-
-def refuse(message: str):
-    raise InputError(message)
-
-
-def test_a_refusal_names_the_key_or_the_check_fails():
-    CHECK.require_refusal(lambda: refuse("no key 'size'"), naming="size", statement="a key")
-    with pytest.raises(AssertionError, match="the message for a key lacks the name; found no k"):
-        CHECK.require_refusal(lambda: refuse("no key"), naming="size", statement="a key")
-    with pytest.raises(AssertionError, match="a key is not refused; found KeyError: 'x', expected"):
-        CHECK.require_refusal(lambda: {}["x"], naming="size", statement="a key")
-    with pytest.raises(AssertionError, match="a key is not refused; found no error, expected an"):
-        CHECK.require_refusal(lambda: None, naming="size", statement="a key")
