@@ -13,9 +13,7 @@ from ..common.validated_classes import validated
 from ..common.validated_types import Flag, Positive, Text
 from ..fem.body import Body
 from ..model.parameters import Parameters
-from ..statistics.budget.shape_error import CORRELATION
 from ..statistics.budget.systematic_effects import (
-    CORRELATION_KEY,
     Assumptions,
     ExactIfNone,
     limited_poisson_deviation,
@@ -53,20 +51,17 @@ class UncertaintyOptions(ErrorModel):
     assumptions : Assumptions
         Standard deviations of systematic effects, by name; "none" if all are exact, as for a
         simulated recording.
-    surface_correlation : float
-        Correlation length of the error of the surface, divided by the longest extent of the body.
     """
 
     profile: tuple[Text, ...] = ()
     numerical: Flag = False
     assumptions: Annotated[Assumptions, ExactIfNone()] = field(default_factory=Assumptions)
-    surface_correlation: Positive = CORRELATION
 
     def collect_considered(
         self, bodies: Iterable[Body] = (), parameters: Parameters | None = None
     ) -> dict[str, float | None]:
         """Return the standard deviations of systematic effects by name (None for exact ones), with
-        the defaults for `bodies`, and the surface's correlation length under `CORRELATION_KEY`.
+        the defaults for `bodies`.
 
         With `parameters`, that of Poisson's ratio ends before the incompressible body, see
         `limited_poisson_deviation`.
@@ -75,7 +70,7 @@ class UncertaintyOptions(ErrorModel):
         stated = deviations["poisson"]
         if parameters is not None and stated is not None:
             deviations["poisson"] = limited_poisson_deviation(stated, parameters)
-        return deviations | {CORRELATION_KEY: self.surface_correlation}
+        return deviations
 
 
 @dataclass(frozen=True)

@@ -450,7 +450,6 @@ class UncertaintySection(Section, of=UncertaintyOptions):
     """
 
     assumptions: Annotated[AssumptionsSection, ExactIfNone()] = AssumptionsSection()
-    surface_correlation: Declared
 
 
 def _kind_tag(value: Any) -> str:

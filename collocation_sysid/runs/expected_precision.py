@@ -37,7 +37,6 @@ from ..statistics.budget.consider_analysis import (
     changes_of_assumptions,
     prescribes_no_motion,
 )
-from ..statistics.budget.systematic_effects import CORRELATION_KEY
 from ..statistics.budget.variance_sources import VarianceSources
 from ..statistics.combinations import (
     WIDE,
@@ -244,7 +243,7 @@ def with_measurements(
     if not combinations:
         return ()
     found: list[list[Fix]] = [[] for _ in combinations]
-    few = {n: s if n in (*dominant, CORRELATION_KEY) else None for n, s in deviations.items()}
+    few = {n: s if n in dominant else None for n, s in deviations.items()}
     # Rulers that the data determine may reduce the effects of other assumptions.
     has_bound = bool(dominant) and not prescribes_no_motion(collocation)
     distance = min(sample_distance(each.experiment) for each in collocation.transcriptions)

@@ -347,14 +347,15 @@ def test_a_smooth_error_of_the_surface_is_a_body_of_another_shape():
     assert np.abs(found["surface 1"] - expected).max() < 0.1 * size
 
 
-def test_modes_of_the_surface_have_the_deviation_and_the_length_that_are_stated():
-    from collocation_sysid.statistics.budget.shape_error import surface_modes
+def test_modes_of_the_surface_have_unit_deviation_and_the_correlation_length(monkeypatch):
+    from collocation_sysid.statistics.budget import shape_error
 
     bar, none = straight_bar(), np.zeros(0, dtype=np.int64)
     on_surface = np.unique(bar.mesh.surface)
 
     def share(correlation: float) -> float:
-        lengths = np.linalg.norm(surface_modes(bar, none, correlation), axis=2)[:, on_surface]
+        monkeypatch.setattr(shape_error, "CORRELATION", correlation)
+        lengths = np.linalg.norm(shape_error.surface_modes(bar, none), axis=2)[:, on_surface]
         return float(np.mean(np.sum(lengths**2, axis=0)))
 
     assert 0.9 < share(0.5) <= 1.02

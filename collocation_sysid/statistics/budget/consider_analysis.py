@@ -27,8 +27,7 @@ from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
 from ..linearised import LinearisedFit, linearise_fit
-from .shape_error import CORRELATION
-from .systematic_effects import ASSUMPTIONS, CORRELATION_KEY, Effect, ExperimentAtAnswer
+from .systematic_effects import ASSUMPTIONS, Effect, ExperimentAtAnswer
 
 # A threshold of Huber's loss that no residual reaches.
 UNWEIGHTED = 1e9
@@ -140,15 +139,11 @@ def changes_of_assumptions(
     Notes
     -----
     Assumptions without an entry have the deviation of their table; those that are None there are
-    left out. The entry for `CORRELATION_KEY` is the correlation length of the surface's error, by
-    default `CORRELATION`. Columns of `ASSUMPTIONS` come first, then those of nuisance parameters.
+    left out. Columns of `ASSUMPTIONS` come first, then those of nuisance parameters.
     """
     rows = [(row, deviations.get(row.name, row.considered)) for row in ASSUMPTIONS]
     assumptions = [(row, s) for row, s in rows if s is not None]
-    correlation = deviations.get(CORRELATION_KEY) or CORRELATION
-    of_bodies = changed_residuals(
-        collocation, z, assumptions=assumptions, surface_correlation=correlation
-    )
+    of_bodies = changed_residuals(collocation, z, assumptions)
     of_nuisances = changes_of_nuisances(collocation, z, deviations=deviations)
     if not of_nuisances.names:
         return of_bodies
@@ -219,11 +214,7 @@ def changes_of_nuisances(
 
 @one_blas_thread()
 def changed_residuals(
-    collocation: Collocation,
-    z: Array,
-    assumptions: Sequence[tuple[Deviation, float]],
-    *,
-    surface_correlation: float = CORRELATION,
+    collocation: Collocation, z: Array, assumptions: Sequence[tuple[Deviation, float]]
 ) -> ResidualChanges:
     """Return the changes of the residuals by some assumptions, each off by its standard deviation.
 
@@ -239,8 +230,6 @@ def changed_residuals(
         Variables that satisfy the equations of motion.
     assumptions : sequence of (Deviation, float)
         Assumptions with their standard deviations, in the unit of each.
-    surface_correlation : float
-        Correlation length of the surface's error over the longest extent of the body.
 
     Returns
     -------
@@ -250,9 +239,7 @@ def changed_residuals(
     names = tuple(name for row, _ in assumptions for name in row.components)
     changes: list[Array] = []
     for part in collocation.iterates(z):
-        at = ExperimentAtAnswer(
-            part, collocation.parameters, surface_correlation=surface_correlation
-        )
+        at = ExperimentAtAnswer(part, collocation.parameters)
         effects = [
             (_effect_of(row, at, axis), sigma)
             for row, sigma in assumptions

@@ -24,7 +24,7 @@ from ...fem.node_force import surface_shares
 # Modes of the error of the surface: with the correlation length below they have most of its
 # variance, and each costs one evaluation of the forces and one column of a sweep.
 SURFACE_MODES = 6
-# Default correlation length of the surface's error over the longest extent of the body: moulds and
+# Correlation length of the surface's error over the longest extent of the body: moulds and
 # scans are off by smooth shapes, such as a taper, a bend or a swelling.
 CORRELATION = 0.5
 # Over this share of the correlation length the error vanishes towards nodes that are known.
@@ -112,7 +112,7 @@ def other_section(mesh: TetMesh, points_m: Array) -> OtherSection | None:
     return OtherSection(name, volume / filled, moved_m, is_across, (low + high) / 2)
 
 
-def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) -> Array:
+def surface_modes(body: Body, known: Index) -> Array:
     """Return displacements (modes, n, 3) of the nodes for unit standard deviation of the surface's
     error.
 
@@ -123,8 +123,6 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
     ----------
     known : (k,) array
         Nodes of the mesh near which the surface is known, such as those that touch an obstacle.
-    correlation : float
-        Correlation length over the longest extent.
 
     Notes
     -----
@@ -135,7 +133,7 @@ def surface_modes(body: Body, known: Index, correlation: float = CORRELATION) ->
     area_m2, normals = surface_shares(corners)
     surface = np.flatnonzero(area_m2 > 0)
     fields = np.zeros((len(corners.points_m), SURFACE_MODES))
-    length_m = correlation * float(extents_m(corners.points_m)[0])
+    length_m = CORRELATION * float(extents_m(corners.points_m)[0])
     own = _correlation_modes(corners.points_m[surface], area_m2[surface], length_m=length_m)
     fields[surface, : own.shape[1]] = own
     if known.size:

@@ -57,7 +57,6 @@ from .obstacle_effects import (
 )
 from .platen_slip import slip_displacements_m, sticking_change_n
 from .shape_error import (
-    CORRELATION,
     SURFACE_MODES,
     other_section,
     sag_m,
@@ -89,8 +88,6 @@ OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
 # Differences by a displacement: its largest entry over the length of an edge.
 SMALL_STRAIN = 1e-4
 _MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
-# Beside the deviations: the correlation length of the error of the surface.
-CORRELATION_KEY = "surface_correlation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +114,6 @@ class ExperimentAtAnswer:
 
     iterate: ExperimentIterate
     parameters: Parameters  # shared parameters
-    # Correlation length of the surface's error over the longest extent of the body.
-    surface_correlation: float = CORRELATION
 
     @property
     def body(self) -> Body:
@@ -267,7 +262,7 @@ class ExperimentAtAnswer:
         nearest = np.fmin.reduce(gaps_m, axis=0)
         is_in_contact = np.nan_to_num(nearest, nan=np.inf) < transcription.length_m
         known = np.unique(self.body.mesh.surface[is_in_contact])
-        modes = surface_modes(self.body, known, correlation=self.surface_correlation)
+        modes = surface_modes(self.body, known)
         return thickness_m(self.body) * modes
 
     @cached_property

@@ -19,7 +19,6 @@ from ...common.array_types import Array
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...methods.starts.initial_trajectories import simulate_trajectories
 from ..budget.consider_analysis import with_relaxed_assumption
-from ..budget.systematic_effects import CORRELATION_KEY
 from ..distributions import normal_isf
 from ..linearised import (
     LinearisedFit,
@@ -180,8 +179,8 @@ def _iterate_probe(at: SolvedFit, probe: Probe, limit: float) -> Probe:
         return replace(probe, sentences=(probe.name,))
     first = len(at.fit.names)
     collocation = at.collocation
-    accepted_names = assumption_name(probe.name), CORRELATION_KEY
-    alone = {name: size if name in accepted_names else None for name, size in at.deviations.items()}
+    own = assumption_name(probe.name)
+    alone = {name: size if name == own else None for name, size in at.deviations.items()}
     wide = with_relaxed_assumption(
         at.fit, at.changes, name=probe.name, widening=prior_widening(probe.name)
     )
