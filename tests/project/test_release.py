@@ -56,7 +56,7 @@ def test_the_wheel_explains_every_page_of_the_documentation(tmp_path: Path, monk
 
     listed = [line.split()[0] for line in explain().splitlines()[1:]]
     assert sorted(listed) == sorted({page.stem for page in pages} - {"index", "api"})
-    assert explain("verdict").startswith("# Reading the verdict\n")
+    assert explain("trust").startswith("# Trust in an answer\n")
 
 
 def test_the_package_is_typed():
