@@ -63,7 +63,7 @@ def test_a_body_with_another_stress_free_shape_shares_no_gradients():
     )
 
 
-@pytest.mark.parametrize("element", ["tet4", "tet10", "tet10-p0"])
+@pytest.mark.parametrize("element", ELEMENTS)
 def test_the_forward_equilibrium_of_the_stress_free_shape_is_the_mesh(element):
     body = scanned_body(element)
     theta = body.theta_from_values(SOFT)

@@ -450,7 +450,9 @@ def ended(program: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-@pytest.mark.parametrize("name", ["importlib.metadata", "casadi"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("importlib.metadata", marks=pytest.mark.long), "casadi"]
+)
 def test_an_interrupt_during_imports_prints_nothing(name: str):
     done = ended(STARTED.format(name=name))
     assert done.returncode == -signal.SIGINT

@@ -90,7 +90,14 @@ def test_long_words_and_lists_are_no_endless_keys(tiny: Path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="alarms of POSIX")
-@pytest.mark.parametrize("value", ["1.0", "{}", "{ tied_to = 'mu_pa' }"])
+@pytest.mark.parametrize(
+    "value",
+    [
+        pytest.param("1.0", marks=pytest.mark.long),
+        pytest.param("{}", marks=pytest.mark.long),
+        "{ tied_to = 'mu_pa' }",
+    ],
+)
 def test_the_first_of_endless_unknown_parameters_is_named(tiny: Path, value: str):
     many = "".join(f"mu_pb{k} = {value}\n" for k in range(20_000))
     replace_text("[parameters]\n", f"[parameters]\n{many}")(tiny)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from kit.collocations import collocation_of
-from kit.problems import GUESS, SMALL_EXPERIMENTS, TRUTH, hung_cube, noisy
+from kit.problems import GUESS, TRUTH, hung_cube, noisy
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
@@ -14,11 +14,17 @@ from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.program.collocation import Collocation
 
 # Their bands are wide; a penalty of the same steps finds the truth of these every time.
+LONG = ("bar-in-two-hands", "cube-with-gaps")
 DEAR = ("quadratic-bar", "cube-with-nuisance", "bar-with-nuisance", "driven-bar")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n in DEAR else n for n in SMALL_EXPERIMENTS]
+    "name",
+    [
+        *("hung-cube", "released-cube", "bar-let-go"),
+        *(pytest.param(name, marks=pytest.mark.long) for name in LONG),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in DEAR),
+    ],
 )
 def test_the_true_parameters_are_recovered(name: str):
     # A cube that is let go tells little of γ_m: the last digits of the loss tell it.

@@ -111,7 +111,7 @@ def test_complementarity_is_the_limit_of_ever_stiffer_energies(name: str):
     assert observed_order(1 / STIFFER, apart_m) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", ["plane", pytest.param("let down", marks=pytest.mark.long)])
 def test_nothing_is_entered_and_pressure_times_gap_is_small(name: str):
     experiment, answer = answered(name)
     (hard,) = answer.positions_m

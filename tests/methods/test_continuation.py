@@ -6,7 +6,6 @@ import os
 import re
 import signal
 from dataclasses import replace
-from itertools import cycle
 
 import numpy as np
 import pytest
@@ -88,7 +87,13 @@ def test_a_part_has_the_layout_of_the_whole():
 
 
 @pytest.mark.parametrize(
-    ("experiment", "method"), [*zip(SMALL_EXPERIMENTS, cycle(["reduced-space", "shooting"]))]
+    ("experiment", "method"),
+    [
+        ("hung-cube", "shooting"),
+        ("bar-let-go", "reduced-space"),
+        ("bar-with-nuisance", "shooting"),
+        ("driven-bar", "reduced-space"),
+    ],
 )
 def test_the_true_parameters_are_recovered(experiment: str, method: str):
     made = measured(SMALL_EXPERIMENTS[experiment](14))

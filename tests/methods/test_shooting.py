@@ -57,7 +57,7 @@ def softened(factor: float) -> Parameters:
 
 @cache
 def cube() -> Collocation:
-    return Collocation([measured(hung_cube())], GUESS)
+    return Collocation([measured(hung_cube(6))], GUESS)
 
 
 # Gradients
@@ -76,7 +76,9 @@ def test_the_adjoint_gradient_is_the_sensitivities_share_of_the_loss():
 # The answer
 
 
-@pytest.mark.parametrize("experiment", SMALL_EXPERIMENTS)
+@pytest.mark.parametrize(
+    "experiment", ["hung-cube", "released-cube", "quadratic-bar", "bar-with-nuisance", "driven-bar"]
+)
 def test_the_true_parameters_are_recovered(experiment: str):
     solution = Shooting()(Collocation([measured(SMALL_EXPERIMENTS[experiment]())], GUESS))
     assert solution.status is Status.CONVERGED
@@ -87,7 +89,7 @@ def test_the_true_parameters_are_recovered(experiment: str):
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
-@pytest.mark.parametrize("make", [hung_cube, bar_in_two_hands, bar_let_go])
+@pytest.mark.parametrize("make", [bar_in_two_hands, bar_let_go])
 def test_the_answer_with_noise_is_that_of_the_reduced_space(make, gradient):
     collocation = with_noise(make())
     solution = Shooting(gradient)(collocation)
@@ -129,7 +131,7 @@ def test_a_search_with_all_parameters_fixed_simulates(gradient):
 
 def test_shooting_starts_from_given_parameters():
     seen: list[Iteration] = []
-    start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((11, 81))])
+    start = cube().pack(np.log(list(TRUTH.values())), [np.zeros((7, 81))])
     solution = Shooting()(cube(), watch=seen.append, start=start)
     assert solution.iterations < 4
     np.testing.assert_allclose([*seen[0].parameters.values()], list(TRUTH.values()))
@@ -156,7 +158,7 @@ def test_a_guess_that_cannot_be_simulated_is_a_status(gradient):
     np.testing.assert_allclose(solution.theta, as_theta(softened(1000)))
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
+@pytest.mark.parametrize("gradient", [pytest.param("forward", marks=pytest.mark.long), "adjoint"])
 def test_trials_that_cannot_be_simulated_are_stepped_back_from(gradient, monkeypatch):
     def short(collocation, p, stopwatch=None):
         if np.abs(p - GUESS.guess_q).max() > 0.2 and not short.failed:
@@ -190,10 +192,12 @@ def test_a_search_without_a_simulable_step_stalls_at_the_guess(gradient, monkeyp
 # Other ends
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
 @pytest.mark.parametrize(
-    ("limit", "status"),
-    [({"max_iterations": 3}, Status.ITERATION_LIMIT), ({"max_time_s": 1e-9}, Status.TIME_LIMIT)],
+    ("gradient", "limit", "status"),
+    [
+        ("forward", {"max_iterations": 3}, Status.ITERATION_LIMIT),
+        ("adjoint", {"max_time_s": 1e-9}, Status.TIME_LIMIT),
+    ],
 )
 def test_limits_keep_the_best_simulation(gradient, limit: dict, status: Status):
     solution = Shooting(gradient, **limit)(cube())
@@ -203,7 +207,7 @@ def test_limits_keep_the_best_simulation(gradient, limit: dict, status: Status):
     assert solution.max_violation_relative < 1e-9
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
+@pytest.mark.parametrize("gradient", ["forward", pytest.param("adjoint", marks=pytest.mark.long)])
 def test_an_interruption_keeps_the_best_simulation(gradient):
     def interrupt(iteration: Iteration) -> None:
         if iteration.number >= 3:

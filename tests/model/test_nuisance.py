@@ -88,7 +88,7 @@ def test_a_given_start_contains_the_place_in_the_grasp():
     assert NuisanceMap.from_experiment(cube).size == 0
 
 
-@pytest.mark.parametrize("share", [-0.6, 0.3, 1.0])
+@pytest.mark.parametrize("share", [pytest.param(-0.6, marks=pytest.mark.long), 0.3])
 def test_a_time_shift_reads_the_motion_at_another_time(share: float):
     cube = replace(hung_cube(20), nuisance=Nuisance.none(time_shift_s=0.01))
     (transcription,) = alone(cube, substeps=10).transcriptions
@@ -199,7 +199,7 @@ def test_the_clock_is_limited_to_samples_read_and_a_quarter_of_the_recording(abo
     np.testing.assert_allclose(limits, np.array([low, high]) * cube.timestep_s / 0.02)
 
 
-@pytest.mark.parametrize("samples", [-5, 5])
+@pytest.mark.parametrize("samples", [-5, pytest.param(5, marks=pytest.mark.long)])
 def test_a_shift_of_several_samples_is_found(samples: int):
     cube = replace(hung_cube(40), nuisance=Nuisance.none(time_shift_s=0.03))
     phi = np.array([samples * cube.timestep_s / 0.03])

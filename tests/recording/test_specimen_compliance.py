@@ -37,7 +37,8 @@ def estimate(test, assumptions, **keys):
     problem = cs.Problem([measured(test, **keys)], {**CONSTANTS, "young_pa": cs.Unknown()})
     stated = cs.Assumptions(**{**OTHERS, **assumptions})
     options = replace(problem.uncertainty, assumptions=stated)
-    return cs.run(replace(problem, uncertainty=options)).estimates["young_pa"]
+    run = cs.run(replace(problem, uncertainty=options), seek_causes=False)
+    return run.estimates["young_pa"]
 
 
 SIZE = {"length_m": LENGTH_M, "area_m2": AREA_M2}

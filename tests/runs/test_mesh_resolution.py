@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.runs.mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
@@ -83,6 +84,7 @@ def test_a_mesh_matters_only_to_estimated_moduli_of_fitted_bodies():
     assert mesh_resolution_concerns(damping, None) == []
 
 
+@pytest.mark.long
 def test_the_answer_and_its_file_carry_the_concern(tmp_path):
     run = cs.run(of_real_body(), "reduced-space")
     assert run.trust.verdict == "check"

@@ -62,7 +62,7 @@ def test_a_ball_that_rubs_may_come_deep_into_a_block_from_one_sample_to_the_next
     assert at_once == pytest.approx(slowly, rel=0.1)
 
 
-@pytest.mark.parametrize("off_m", [0.0, 3e-4])
+@pytest.mark.parametrize("off_m", [pytest.param(0.0, marks=pytest.mark.long), 3e-4])
 def test_stiffness_is_found_with_an_unknown_place_of_the_surface(off_m: float):
     finished = answer(poked(off_m))
     low, high = finished.result.parameters["young_pa"].statistical95
@@ -87,7 +87,8 @@ def test_intervals_contain_the_truth_at_their_nominal_rate():
 
 
 @pytest.mark.parametrize(
-    ("off_m", "prior_m", "verdict"), [(2.5e-3, 5e-4, "check"), (1e-3, 1e-4, "doubtful")]
+    ("off_m", "prior_m", "verdict"),
+    [pytest.param(2.5e-3, 5e-4, "check", marks=pytest.mark.long), (1e-3, 1e-4, "doubtful")],
 )
 def test_an_obstacle_far_from_its_stated_place_is_reported(
     off_m: float, prior_m: float, verdict: str
@@ -98,7 +99,7 @@ def test_an_obstacle_far_from_its_stated_place_is_reported(
     assert run.trust.verdict == verdict
 
 
-@pytest.mark.parametrize("factor", [30.0, 1 / 30.0])
+@pytest.mark.parametrize("factor", [pytest.param(30.0, marks=pytest.mark.long), 1 / 30.0])
 def test_a_compressed_block_is_found_from_thirty_times_its_stiffness_and_a_thirtieth(factor: float):
     pressed = poked(shape=FLAT)
     held, plate = pressed.grasps
@@ -189,11 +190,13 @@ def test_check_does_not_judge_contact_before_a_simulation(monkeypatch):
 
 
 def test_notes_shared_by_several_recordings_are_printed_once():
-    often = [touch_of(replace(poked(shape=SMALL), name=name)) for name in ("a", "b", "c")]
+    touch = touch_of(poked(shape=SMALL))
+    often = [replace(touch, experiment=name) for name in ("a", "b", "c")]
     (one,) = contact_concerns(often)
     assert "'a' and 2 more" in one.message
 
 
+@pytest.mark.long
 def test_friction_is_reported_in_a_line_and_stored_in_the_result(tmp_path):
     run = answer(poked(friction=0.3, place_sigma_m=None))
     said = " ".join(
@@ -219,8 +222,15 @@ def test_intervals_do_not_claim_the_step_where_something_is_touched_in_motion():
     assert cs.run(cs.Problem([free], GUESS), seek_causes=False).refinement is not None
 
 
-@pytest.mark.parametrize("unknown", ["obstacle_offset_m", "obstacle_tilt_rad", "obstacle_time_s"])
-@pytest.mark.parametrize("zero", ["", "y"])
+@pytest.mark.parametrize(
+    ("unknown", "zero"),
+    [
+        ("obstacle_offset_m", ""),
+        ("obstacle_offset_m", "y"),
+        ("obstacle_tilt_rad", ""),
+        ("obstacle_time_s", "y"),
+    ],
+)
 def test_a_forward_simulation_uses_the_estimated_place_of_an_obstacle(unknown, zero):
     pressed = pressed_cube(8, nuisance=cs.Nuisance.none(**{unknown: 1e-4}))
     displaced = [replace(obstacle, zero=zero) for obstacle in pressed.obstacles]

@@ -72,7 +72,7 @@ def test_likely_mistakes_of_a_specimen_are_deviations_that_correct_the_data():
     assert corrected["specimen-compression"] is None
 
 
-@pytest.mark.parametrize("law", ["neo-hookean", "yeoh"])
+@pytest.mark.parametrize("law", ["neo-hookean", pytest.param("yeoh", marks=pytest.mark.long)])
 def test_a_law_that_is_too_simple_is_no_mistake_of_the_description(law):
     run, causes = causes_of(TRELOAR[:, 0] - 1, 1e6 * TRELOAR[:, 1], sigma_pa=1e4, law=law)
     assert run.solution.status is Status.CONVERGED
@@ -89,7 +89,7 @@ def test_a_toe_region_is_no_mistake_of_the_description(law, seed):
     assert causes_of(STRAIN, stress_pa, sigma_pa=SIGMA_PA, law=law)[1] == []
 
 
-@pytest.mark.parametrize("law", ["mooney-rivlin", "yeoh"])
+@pytest.mark.parametrize("law", ["mooney-rivlin", pytest.param("yeoh", marks=pytest.mark.long)])
 def test_unloading_is_no_mistake_of_the_description(law):
     noise_pa = SIGMA_PA * np.random.default_rng((1, 3)).normal(size=25)
     strain = STRAIN[::-1]
@@ -189,6 +189,7 @@ def test_magnitudes_of_a_compression_test_are_named():
     assert "multiply the lateral strains in the file by -1" in run.trust.reasons[0]
 
 
+@pytest.mark.long
 def test_lateral_stretches_of_one_are_named_as_a_placeholder():
     noise_pa = SIGMA_PA * np.random.default_rng(5).normal(size=25)
     unknown = {"mu_pa": cs.Unknown()} | FIXED
