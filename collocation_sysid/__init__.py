@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from . import datasets, testing
     from .errors import InputError, SimulationError
     from .extras import live
-    from .extras.design.hand_limits import Limits
     from .extras.planning.folder import write_plan
+    from .extras.planning.hand_limits import Limits
     from .extras.planning.motion_plan import MotionPlan, plan_motion
     from .extras.planning.task import Task
     from .extras.studies.model_comparison import ModelComparison, compare_models

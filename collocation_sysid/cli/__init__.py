@@ -2,7 +2,7 @@
 
 Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
 check), `run_commands` (refine, export, plot, report, animate), `study_commands`
-(compare-methods, compare-models), `design_commands` (design, plan), `stream_commands` (live,
+(compare-methods, compare-models), `plan_commands` (plan), `stream_commands` (live,
 replay), `installation_commands` (doctor) and `texts`
 (methods, schema, explain, log, new). `command_options` makes command-line options from parameters,
 `common` has exit codes and output, and `markdown` shows documentation on a terminal.
@@ -37,7 +37,7 @@ from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_
 FAMILIES = (
     "problem_commands",
     "study_commands",
-    "design_commands",
+    "plan_commands",
     "run_commands",
     "stream_commands",
     "texts",
@@ -47,7 +47,7 @@ FAMILIES = (
 COMMAND_GROUPS = {
     "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
     "Inspect a run": ("report", "plot", "animate"),
-    "Extend a study": ("simulate", "compare-models", "compare-methods", "design", "plan"),
+    "Extend a study": ("simulate", "compare-models", "compare-methods", "plan"),
     "Exchange data": ("log", "export"),
     "Reference and installation": ("explain", "methods", "schema", "doctor"),
 }

@@ -2,6 +2,6 @@
 
 - `live`: estimation while the recording is being made.
 - `studies`: plans of many runs, comparisons of methods and of models.
-- `design`: motions that determine the parameters best.
+- `planning`: motions of the hand for a task, or that determine the parameters best.
 - `export`: identified bodies and motions in the formats of simulators and viewers.
 """

@@ -399,14 +399,12 @@ assert young_errors["auto"] > 1.5 * young_errors["independent"]
 # %% [markdown]
 # ## 3.5 Choice of the motion
 #
-# The standard errors depend on the motion. `collocation-sysid design` computes a motion that
-# minimises them within the limits of a robot, for all parameters or for some of them (`--for
-# poisson`). For this cylinder, two motions of two seconds with limited acceleration were computed
-# (`docs/howto/design.md`). The motion for ν gives standard errors of 0.34 % for ν, and of 0.30
-# and 0.46 % for the damping parameters. The motion for the damping parameters gives 0.65 % for ν,
-# and 0.17 and 0.21 % for the damping parameters. The motion for ν is a translation at 3 Hz with
-# hardly any rotation; the motion for the damping parameters is slower and larger, and contains a
-# rotation.
+# The standard errors depend on the motion. `collocation-sysid plan` with a table `[information]` in
+# the task computes a motion that minimises them within the limits of a robot, for all parameters
+# or for some of them. For this cylinder, two motions of two seconds were computed
+# (`docs/howto/plan.md`). The motion for ν gives standard errors of 0.022 % for ν, and of 0.12 and
+# 0.25 % for the damping parameters. The motion for the damping parameters gives 0.32 % for ν, and
+# 0.049 and 0.066 % for the damping parameters.
 #
 # ## 3.6 Combined interval and verdict
 #

@@ -27,8 +27,8 @@ from studies import markdown, number, save
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
-from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import MotionPlan, Task, plan_motion
+from collocation_sysid.extras.planning.hand_limits import Limits
 
 mujoco: Any = import_module("mujoco")
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
+import tomli_w
 from kit.problem_files import TRUTH as TRUTH_OF_FILES
 from kit.problem_files import run_command, write_problem
 from scipy.linalg import eigh, expm
@@ -20,7 +21,6 @@ from scipy.stats import norm
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.extras.design.hand_limits import Limits
 from collocation_sysid.extras.planning import durations, motion_plan, reduced_solver
 from collocation_sysid.extras.planning.folder import (
     command_times_s,
@@ -33,6 +33,8 @@ from collocation_sysid.extras.planning.full_program import (
     iteration_monitor,
     solve_full,
 )
+from collocation_sysid.extras.planning.hand_limits import Limits
+from collocation_sysid.extras.planning.hand_motion import angular_motion
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
 from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
@@ -184,6 +186,82 @@ def test_the_expression_of_a_rotation_is_that_of_scipy():
     for turn in ([0.3, -1.2, 0.7], [1e-3, 2e-3, 0.0], [0.0, 0.0, 0.0]):
         found = ca.evalf(rotation_expression(ca.SX(turn))).full()
         assert np.allclose(found, Rotation.from_rotvec(turn).as_matrix(), atol=1e-14)
+
+
+# The hand -----------------------------------------------------------------------------------------
+
+
+def test_angular_velocity_and_acceleration_are_those_of_the_rotation():
+    t_s, h = np.linspace(0.02, 0.28, 41), 1e-4
+    axes = np.array([[1.0, 0.4, -0.3], [0.2, -0.8, 0.5]])
+
+    def vectors(t, order):
+        """Rotation vectors up to 100°, or their derivatives."""
+        waves = [(7.0, 0.3), (11.0, 1.1)]
+        return sum(
+            np.outer(w**order * np.sin(w * t + phase + order * np.pi / 2), axis)
+            for (w, phase), axis in zip(waves, axes, strict=True)
+        )
+
+    def velocity(t):
+        before, after = (Rotation.from_rotvec(vectors(t + s, 0)) for s in (-h, h))
+        return (after * before.inv()).as_rotvec() / (2 * h)
+
+    found = angular_motion(*(vectors(t_s, order) for order in range(3)))
+    by_differences = velocity(t_s), (velocity(t_s + h) - velocity(t_s - h)) / (2 * h)
+    for each, other in zip(found, by_differences, strict=True):
+        assert np.abs(each - other).max() < 2e-4 * np.abs(other).max()
+
+
+def test_small_turns_have_the_series_of_the_same_formula():
+    rate, curvature = np.array([[1.0, 2.0, 3.0]]), np.array([[-3.0, 1.0, 2.0]])
+    near = [
+        angular_motion(np.array([[0.6, 0.8, 0]]) * s, rate, curvature) for s in (0.00999, 0.01001)
+    ]
+    for below, above in zip(*near, strict=True):
+        assert np.allclose(below, above, rtol=1e-4)
+
+
+BAD_LIMITS = {
+    "missing key": ("speed_m_s = 1.0\n", "", "speed_m_s: missing; expected largest speed"),
+    "unknown key": ("speed_m_s", "spede_m_s", "did you mean 'speed_m_s'"),
+    "text": ("= 30.0", '= "30"', "rotation_deg: found '30'; expected a number"),
+    "negative": ("= 10.0", "= -10.0", "acceleration_m_s2: found -10.0; expected a number above 0"),
+    "two corners": ("[0.2, 0.2, 0.2]]", "[0.2, 0.2]]", "workspace_m: found"),
+    "corners exchanged": ("[-0.1, -0.1, 0.0]", "[0.3, -0.1, 0.0]", "expected the lower one first"),
+    "half a turn": ("= 30.0", "= 180.0", "rotation_deg: found 180.0"),
+    "start outside": ("[-0.1, -0.1, 0.0]", "[0.1, -0.1, 0.0]", "workspace_m: the hand starts at"),
+    "no toml": ("speed_m_s =", "speed_m_s", "line 2: the file is not valid TOML"),
+}
+GOOD_LIMITS = """\
+workspace_m = [[-0.1, -0.1, 0.0], [0.2, 0.2, 0.2]]
+speed_m_s = 1.0
+acceleration_m_s2 = 10.0
+rotation_deg = 30.0
+angular_speed_deg_s = 300.0
+angular_acceleration_deg_s2 = 3000.0
+"""
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory) -> Path:
+    return write_problem(tmp_path_factory.mktemp("tiny"), {"swing": 8})
+
+
+@pytest.mark.parametrize("name", BAD_LIMITS)
+def test_a_bad_limits_file_gets_one_clear_message(tiny, name, tmp_path):
+    old, new, message = BAD_LIMITS[name]
+    assert old in GOOD_LIMITS
+    (tmp_path / "limits.toml").write_text(GOOD_LIMITS.replace(old, new))
+    (tmp_path / "task.toml").write_text(GOOD)
+    out = tmp_path / "out"
+    words = ["plan", tiny, tmp_path / "task.toml", "--limits", tmp_path / "limits.toml"]
+    done = run_command(*map(str, words), "--out", str(out))
+    assert done.code == 2
+    assert "limits.toml" in done.err
+    assert message in done.err
+    assert len(done.err.strip().splitlines()) == 1
+    assert not out.exists()
 
 
 # Optima -------------------------------------------------------------------------------------------
@@ -347,7 +425,8 @@ def test_limits_that_bind_are_respected_between_grid_points_too():
 
     planned = PlannedProgram.from_task(PlannedBody.read(hung_bar()), wanted, narrow)
     answer = solve_reduced(planned, watch=lambda number, value: seen.append(value))
-    shares = planned.bounds.shares(planned.space.motion(answer.c))
+    motion = planned.space.motion(answer.c)
+    shares = planned.bounds.shares(motion.derivatives(motion.grid_s))
     assert max(shares.values()) <= 1.0
     assert max(shares.values()) > 0.98
     assert seen == sorted(seen, reverse=True)
@@ -945,6 +1024,180 @@ def test_a_tendon_bends_the_shipped_tentacle(tmp_path: Path):
     assert command[0] == pytest.approx(3.077)
     # At first the tip is 98 mm aside; the deflection is nearly proportional to the tension.
     assert command[-1] / command[0] == pytest.approx(0.05 / 0.098, rel=0.1)
+
+
+# Information --------------------------------------------------------------------------------------
+
+CONSTANTS = ["young_pa", "poisson", "gamma_r_s"]
+
+
+def informative(half_width: float = 1e-4, **changes) -> Task:
+    """A motion that determines E, ν and γ_r."""
+    wanted = {"constants": CONSTANTS, "half_width": half_width}
+    usual = {"duration_s": 0.8, "sample_s": 0.02, "hand": {"intervals": 8}, "information": wanted}
+    return Task.model_validate(usual | changes)
+
+
+@cache
+def loosely_known_bar() -> cs.Problem:
+    """The bar with the default nuisance parameters."""
+    (hung,) = hung_bar().experiments
+    unknowns = {name: cs.Unknown(value) for name, value in TRUTH.items()}
+    return cs.Problem([replace(hung, nuisance=cs.Nuisance())], unknowns, substeps=1)
+
+
+@cache
+def informative_plan() -> MotionPlan:
+    return plan_motion(loosely_known_bar(), informative(), LIMITS)
+
+
+def sway(planned: PlannedProgram) -> np.ndarray:
+    """Unknowns of the largest sway along x, two periods, within the limits."""
+    t_s = np.linspace(0.0, 0.8, 100)
+    wave = np.zeros((100, 6))
+    wave[:, 0] = np.sin(2 * np.pi * t_s / 0.4)
+    matrix, constant = planned.space.affine(t_s)
+    shape = np.linalg.lstsq(
+        matrix.reshape(-1, planned.space.size), (wave - constant).ravel(), rcond=None
+    )[0]
+    return shape / planned.hand_limits.shares(shape).max()
+
+
+def test_derivatives_of_the_criterion_are_its_differences():
+    task = informative(0.02)
+    planned = PlannedProgram.from_task(PlannedBody.read(loosely_known_bar()), task, LIMITS)
+    c, way = 0.1 * np.random.default_rng(0).normal(size=(2, planned.space.size))
+    x = planned.simulate(c)
+    slopes = planned.driven.respond(planned.drive(c), x)
+    rows, residual = planned.criterion.linearise(c, x, slopes)
+    assert 4 * residual @ residual == pytest.approx(planned.criterion.value(c, x))
+    h = 1e-3
+    ends = [planned.criterion.value(e, planned.simulate(e)) for e in (c + h * way, c - h * way)]
+    assert 2 * residual @ rows @ way == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-3)
+
+
+@pytest.mark.long
+def test_a_motion_is_more_informative_than_a_sway_within_the_same_limits():
+    plan = informative_plan()
+    assert plan.is_complete
+    assert plan.exceeds_width
+    assert max(plan.shares.values()) <= 1.0
+    swayed = sway(plan.program)
+    half_widths = plan.program.criterion.half_widths(swayed, plan.program.simulate(swayed))
+    assert (np.array([*plan.intervals.values()]) < 0.7 * half_widths).all()
+    text = "\n".join(map(str, plan_summary(plan)))
+    assert "expected a longer duration_s or wider limits" in text
+    assert "intervals by the noise of this recording" in text
+    assert plan_json(plan)["intervals"] == plan.intervals
+
+
+@pytest.mark.long
+def test_predicted_intervals_are_those_of_a_fitted_twin():
+    plan = informative_plan()
+    t_s, rng = plan.t_s, np.random.default_rng(0)
+    executed = plan.execution(t_s, np.zeros((len(t_s), 1, 3)))
+    tracks_m = cs.simulate(executed, TRUTH, "midpoint", substeps=1).markers_m
+    tracks_m = tracks_m + 1e-3 * rng.normal(size=tracks_m.shape)
+    seen = replace(plan.execution(t_s, tracks_m), nuisance=cs.Nuisance())
+    run = cs.run(replace(loosely_known_bar(), experiments=[seen]))
+    for name, half_width in plan.intervals.items():
+        estimate = run.estimates[name]
+        found = 1.96 * estimate.statistical_std_error / estimate.value
+        assert half_width == pytest.approx(found, rel=0.2)
+
+
+@pytest.mark.long
+def test_the_search_ends_with_intervals_as_narrow_as_wanted():
+    wanted = 1.2 * max(informative_plan().intervals.values())
+    plan = plan_motion(loosely_known_bar(), informative(wanted), LIMITS)
+    assert plan.answer.status == "reached"
+    assert len(plan.answer.history) < len(informative_plan().answer.history)
+    assert not plan.exceeds_width
+    simple = {"hand": {"intervals": 6, "free": ["x"]}, "shortest": True}
+    short = plan_motion(hung_bar(), informative(0.1, **simple), LIMITS)
+    assert short.program.task.duration_s < 0.8
+    assert not short.exceeds_width
+
+
+def test_the_recordings_of_a_run_count():
+    deviations = np.array([0.01, 0.01, 0.01, 0.01])
+    body = replace(
+        PlannedBody.read(hung_bar()),
+        covariance=np.diag(deviations**2),
+        statistical_covariance=np.diag(deviations**2),
+    )
+    planned = PlannedProgram.from_task(body, informative(), LIMITS)
+    rest = np.zeros(planned.space.size)
+    standing = planned.criterion.half_widths(rest, planned.simulate(rest))
+    assert (standing <= 1.96 * 0.01 * (1 + 1e-9)).all()
+    assert standing[2] == pytest.approx(1.96 * 0.01)  # damping does not act on a body at rest
+    c = sway(planned)
+    assert (planned.criterion.half_widths(c, planned.simulate(c)) < standing).all()
+
+
+def test_a_force_sensor_and_nuisance_parameters_count():
+    (hung,) = hung_bar().experiments
+    (grasp,) = hung.grasps
+    wrench = cs.Wrench(hung.t_s, np.zeros((11, 6)), 0.01, 0.001)
+    sensing = replace(hung, grasps=[replace(grasp, wrench=wrench)])
+    unknowns = {name: cs.Unknown(value) for name, value in TRUTH.items()}
+    found = {}
+    for name, experiment in (
+        ("ideal", hung),
+        ("nuisance", replace(hung, nuisance=cs.Nuisance())),
+        ("wrench", sensing),
+    ):
+        problem = cs.Problem([experiment], unknowns, substeps=1)
+        planned = PlannedProgram.from_task(PlannedBody.read(problem), informative(), LIMITS)
+        c = sway(planned)
+        found[name] = planned.criterion.half_widths(c, planned.simulate(c))
+    assert (found["wrench"] < found["ideal"]).all()
+    assert (found["ideal"] < found["nuisance"]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reference": [{"point": "tip", "hold": True}]}, "information: found reference beside it"),
+        ({"end": {}, "largest_error_m": 1e-3}, "found end and largest_error_m beside it"),
+        ({"information": {"constants": [], "half_width": 0.1}}, "constants"),
+        ({"information": {"constants": CONSTANTS, "half_width": -0.1}}, "half_width: found -0.1"),
+        ({"information": {"constants": CONSTANTS}}, "half_width: missing; expected wanted half"),
+    ],
+)
+def test_tasks_of_information_that_cannot_be_are_explained(tmp_path: Path, changes, message):
+    task = {"duration_s": 0.8, "information": {"constants": CONSTANTS, "half_width": 0.1}}
+    (tmp_path / "task.toml").write_text(tomli_w.dumps(task | changes))
+    with pytest.raises(InputError, match=message):
+        Task.read(tmp_path / "task.toml")
+
+
+def test_constants_that_are_not_estimated_are_explained():
+    wanted = informative(information={"constants": ["poison"], "half_width": 0.1})
+    with pytest.raises(InputError, match=r"information.constants: found 'poison'; .*'poisson'"):
+        plan_motion(hung_bar(), wanted, LIMITS)
+    with pytest.raises(InputError, match=r"interior-point cannot plan this: .*\[information\]"):
+        plan_motion(hung_bar(), informative(), LIMITS, solver="interior-point")
+
+
+@pytest.mark.long
+def test_the_command_writes_a_plan_for_information(tmp_path: Path):
+    problem = write_problem(tmp_path, {"swing": 10})
+    (tmp_path / "task.toml").write_text(
+        "duration_s = 0.3\n[hand]\nintervals = 8\n"
+        '[information]\nconstants = ["lambda_pa", "poisson"]\nhalf_width = 0.5\n'
+    )
+    (tmp_path / "limits.toml").write_text(LIMITS_TEXT)
+    words = ["plan", str(problem), str(tmp_path / "task.toml"), "--limits",
+             str(tmp_path / "limits.toml"), "--out", str(tmp_path / "out")]  # fmt: skip
+    outcome = run_command(*words, "--no-film")
+    assert outcome.code == 0, outcome.err
+    assert "wanted ±" in outcome.out
+    content = json.loads((tmp_path / "out" / "plan.json").read_text())
+    assert content["status"] == "reached"
+    assert 0 < max(content["intervals"].values()) <= 0.5
+    for name in ("poses.csv", "hand.png", "report.html", "identify.toml", "predicted_markers.csv"):
+        assert (tmp_path / "out" / name).stat().st_size
 
 
 # Reliability --------------------------------------------------------------------------------------

@@ -71,7 +71,6 @@ SHORT = {
     "compare-methods": ["--dry-run"],
     "compare-models": ["--dry-run"],
     "solve": ["--method", "reduced-space"],
-    "design": ["--duration", "0.05", "--evaluations", "1", "--pairs", "0", "--no-film"],
     "plan": ["--no-film"],
 }
 

@@ -17,7 +17,6 @@ FILES = [file for file in sorted(SCRIPTS.glob("*/*.py")) if file.parent.name != 
 # Command lines without the ending of the script's name.
 COMMANDS = (
     "study_contact --parts poked --twins 2",
-    "study_design --twins 2 --evaluations 5",
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
     "study_kawabata --laws neo-hookean",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...common.array_types import Array, Index
 from ...model.contact.force import Contact, contact_terms
 from ...recording import Experiment
-from ..design.hand_limits import WITHIN
+from .hand_limits import WITHIN
 
 # Limits enter a step if their value is above this, or becomes positive to first order.
 NEAR = -0.05

@@ -4,6 +4,7 @@ identifies the constants again.
 
 from __future__ import annotations
 
+import os
 import tomllib
 from copy import deepcopy
 from pathlib import Path
@@ -14,16 +15,25 @@ import tomli_w
 
 from ...common.array_types import Array
 from ...common.files import safe_name
+from ...problem.recording_schema import MovedSection
 from ...problem.schema import with_experiment_defaults
 from ...recording import write_markers_csv, write_poses_csv
 from ...recording.writers import write_columns_csv
-from ..design.folder import MARKERS_FILE, OF_MARKERS, OF_POSES, OF_TIME, relative_to
 from .motion_plan import MotionPlan
 from .signals import standing_value
 
 NAME = "execution"
 POSES_FILE = "poses.csv"
+MARKERS_FILE = "predicted_markers.csv"
 CHECK_FILE, IDENTIFY_FILE = "check.toml", "identify.toml"
+# Keys of a grasp that describe the file of its poses: files of a plan have the package's format.
+OF_POSES = MovedSection.model_fields.keys() - {"gripper_to_body"}
+# Keys of markers that describe their file.
+OF_MARKERS = ("names", "labels", "length_unit", "rate_hz", "template_m", "template_window_s")
+# Keys whose texts are names of files, in any table.
+OF_FILES = ("mesh", "surface", "file", "poses", "displacement", "tension", "pressure")
+# Keys of an experiment that select samples, or exclude it from the fit.
+OF_TIME = ("window_s", "resample_hz", "every", "validation")
 # Keys of an experiment that describe its start, and sensors beside the markers.
 OF_RECORDING = (
     *("start", "start_velocity_m_s", "start_spin_rad_s", "start_rule", "loaded_since_s"),
@@ -69,7 +79,7 @@ def execution_problems(plan: MotionPlan, place: Path, target: Path) -> dict[str,
     if "markers" not in own:
         return {}
     for key in ("object", "experiment"):
-        content[key] = relative_to(content[key], home.resolve(), new=target)
+        content[key] = _relative_to(content[key], home.resolve(), new=target)
     executed = deepcopy(content["experiment"][names.index(body.template.name)])
     executed = _executed_table(executed, plan, place)
     executed["name"] = next(
@@ -164,3 +174,19 @@ def write_commands(plan: MotionPlan, place: Path, t_s: Array) -> None:
     for each, values in zip(plan.program.signals, plan.commands(t_s).values(), strict=True):
         columns = {"t_s": t_s, each.section.range_key: values}
         write_columns_csv(place / command_file(each.name), columns)
+
+
+def _relative_to(value: Any, old: Path, new: Path) -> Any:
+    """Return nested content of a problem with file names relative to the folder `new` instead of
+    `old`, in new lists and dictionaries; whether the files exist does not matter.
+    """
+    if isinstance(value, list):
+        return [_relative_to(each, old, new=new) for each in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: Path(os.path.relpath(old / each, new)).as_posix()
+        if key in OF_FILES and isinstance(each, str)
+        else (each if key == "columns" else _relative_to(each, old, new=new))
+        for key, each in value.items()
+    }

@@ -22,7 +22,6 @@ from ...result.replay import MotionRecord
 from ...result.report import report_html
 from ...result.run_writers import replaced_folder
 from ...statistics.remedies import remedy_for
-from ..design.hand_motion import angular_motion
 from .execution_problems import (
     CHECK_FILE,
     POSES_FILE,
@@ -30,6 +29,7 @@ from .execution_problems import (
     problem_text,
     write_commands,
 )
+from .hand_motion import angular_motion
 from .motion_plan import UNKNOWN, BandContribution, MotionPlan
 from .pictures import plan_figures
 from .trajectory_log import write_trajectory_mcap
@@ -197,6 +197,7 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         "limits_reached": plan.active_limits,
         "binding_limits": [each._asdict() for each in plan.binding_limits],
         "body": plan.body_extremes,
+        "intervals": plan.intervals,
         "largest_error_m": plan.largest_error_m,
         "accepted_error_m": program.task.largest_error_m,
         "sufficient_duration_s": plan.sufficient_duration_s,
@@ -266,6 +267,30 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
     return lines
 
 
+def _interval_lines(plan: MotionPlan) -> list[Shown]:
+    """Return the table of the intervals after a recording of the plan, and what they contain; empty
+    without information in the task.
+    """
+    section, body = plan.program.task.information, plan.program.body
+    if section is None:
+        return []
+    rows = tuple(
+        (symbol_of(name), f"{100 * half_width:.3g}", f"{100 * section.half_width:.3g}")
+        for name, half_width in plan.intervals.items()
+    )
+    data = "this recording" if body.run is None else "the recordings of the run and this one"
+    lines: list[Shown] = [
+        Table("", ("constant", "95 % interval ± [%]", "wanted ± [%]"), rows=rows),
+        f"intervals by the noise of {data}; systematic effects come in addition",
+    ]
+    if plan.exceeds_width:
+        lines.append(
+            Line("not all intervals are as narrow as half_width; expected a longer duration_s or "
+                 "wider limits", "check")
+        )  # fmt: skip
+    return lines
+
+
 def _improvement(largest: BandContribution) -> str:
     """Return the line about the largest contribution to the band, and what reduces it."""
     percent = f"{100 * largest.share:.0f} % of the band's variance"
@@ -283,7 +308,7 @@ def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
     notes: list[Shown] = [Line(f"warning: {text}", "check") for text in plan.program.body.warnings]
     if plan.interrupted:
         notes.append(Line("interrupted: the best plan so far", "check"))
-    elif plan.answer.status not in ("converged", "flat"):
+    elif not plan.is_complete:
         notes.append(Line(f"the search ended early: {plan.answer.status}", "check"))
     rows = []
     for each in plan.program.references:
@@ -298,7 +323,7 @@ def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
                 "" if error.band_m is None else f"{1e3 * error.band_m:.3g}",
             )
         )
-    shown: list[Shown] = [*notes]
+    shown: list[Shown] = [*notes, *_interval_lines(plan)]
     if rows:
         heads = ("point", "RMS error [mm]", "largest [mm]", "95 % band ± [mm]")
         shown.append(Table("", heads, rows=tuple(rows)))

@@ -264,12 +264,15 @@ class FullProgram:
 
 
 def require_full_program(program: PlannedProgram) -> None:
-    """Raise an `InputError` if the body or a force has history variables, or the body has limits."""
+    """Raise an `InputError` if the body or a force has history variables, the body has limits, or
+    the task has information.
+    """
     reasons = {
         "the body or a force has memory, whose history variables are no variables of its program":
             program.driven.collocation.has_eliminated_histories,
         "the task has [avoid], and principal stretches and distances have no second derivatives "
         "where the largest or nearest one changes": program.body_limits is not None,
+        "the task has [information], which has no second derivatives": program.criterion is not None,
     }  # fmt: skip
     for reason, applies in reasons.items():
         if applies:

@@ -23,9 +23,10 @@ from ...problem.code_loader import CodeLoader
 from ...program.simulation import Trajectory, simulate
 from ...recording import Experiment, Markers, PoseSequence
 from ...runs.solved_problem import SolvedProblem
-from ..design.hand_limits import REACHED, Limits
 from .durations import shortest, shortest_of_hand
 from .full_program import require_full_program, solve_full
+from .hand_limits import REACHED, Limits
+from .information import recorded_information, root_after, root_of_covariance
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
 from .reduced_solver import (
@@ -33,6 +34,7 @@ from .reduced_solver import (
     PlanAnswer,
     ReducedTolerances,
     Watch,
+    informative_motion,
     solve_reduced,
 )
 from .signals import Commands
@@ -119,6 +121,9 @@ class MotionPlan:
     sufficient_duration_s: float | None = None
 
     def __repr__(self) -> str:
+        if self.intervals:
+            found = f"widest interval ± {100 * max(self.intervals.values()):.3g} %"
+            return f"<MotionPlan of {self.program.task.duration_s:.3g} s, {self.answer.status}, {found}>"
         errors = (self.tracking_error(each) for each in self.program.references)
         return (
             f"<MotionPlan of {self.program.task.duration_s:.3g} s, {self.answer.status}, largest error "
@@ -130,6 +135,24 @@ class MotionPlan:
         """Whether Ctrl-C ended the search."""
         return self.answer.status == "interrupted"
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether the search ended at a stationary point, flat, or with intervals as narrow as
+        wanted.
+        """
+        return self.answer.status in ("converged", "flat", "reached")
+
+    @cached_property
+    def intervals(self) -> dict[str, float]:
+        """Half widths of the 95 % intervals of the wanted constants after a recording of this
+        motion, relative to the values, by name; empty without information in the task.
+        """
+        criterion = self.program.criterion
+        if criterion is None:
+            return {}
+        found = criterion.half_widths(self.answer.c, self.answer.x)
+        return dict(zip(criterion.section.constants, found.tolist(), strict=True))
+
     @cached_property
     def motion(self) -> SplineMotion:
         """Motion of the hand."""
@@ -138,7 +161,7 @@ class MotionPlan:
     @cached_property
     def shares(self) -> Mapping[str, float]:
         """Largest value over each limit of the robot, by name of the limit."""
-        return self.program.bounds.shares(self.motion)
+        return self.program.bounds.shares(self.motion.derivatives(self.motion.grid_s))
 
     @property
     def active_limits(self) -> list[str]:
@@ -295,23 +318,17 @@ class MotionPlan:
         motion were executed, recorded with the same markers, and included in the identification [m];
         None if that is not known. Systematic effects remain.
         """
-        body, contributions = self.program.body, self.contributions_m
-        places = {
-            name: place for name, place in body.marker_places_m.items() if np.isfinite(place).all()
-        }
-        statistical = body.statistical_covariance
-        if contributions is None or statistical is None or not places:
+        program, contributions = self.program, self.contributions_m
+        statistical = program.body.statistical_covariance
+        is_measured = program.body.template.markers.names or program.body.template.wrenches
+        if contributions is None or statistical is None or not is_measured:
             return None
-        markers = body.experiment(None, self.program.experiment.t_s, places).markers
-        weights = np.zeros((len(places), len(self.program.experiment.body.nodes_m)))
-        placement = markers.placement
-        for row, nodes, shares in zip(weights, placement.nodes, placement.weights, strict=True):
-            row[nodes] = shares
-        by_node = self._by_q.reshape(len(self.t_s), -1, 3, len(statistical))
-        rows = np.einsum("mn,tnaq->tmaq", weights, by_node).reshape(-1, len(statistical))
-        information = rows.T @ rows / float(np.median(body.template.markers.sigma_m)) ** 2
-        reduced = statistical @ np.linalg.inv(np.eye(len(statistical)) + information @ statistical)
-        remaining = self.covariance - statistical + reduced
+        if not program.references:
+            return None
+        moved = program.moved_experiment(self.answer.c)
+        information = recorded_information(program.body, program.driven, moved, self.answer.x)
+        root = root_after(root_of_covariance(statistical), information)
+        remaining = self.covariance - statistical + root @ root.T
         counted = [
             self._std_m(contributions[each.name], remaining)[np.isfinite(each.position_m)]
             for each in self.program.references
@@ -408,6 +425,12 @@ class MotionPlan:
         )
 
     @property
+    def exceeds_width(self) -> bool:
+        """Whether an interval of a constant is wider than the task wants."""
+        section = self.program.task.information
+        return section is not None and max(self.intervals.values()) > section.half_width
+
+    @property
     def exceeds_error(self) -> bool:
         """Whether the error is larger than the task accepts."""
         accepted_m = self.program.task.largest_error_m
@@ -470,7 +493,7 @@ def plan_motion(
     task : Task or path
         What the points shall do; task.toml.
     limits : Limits or path, optional
-        What the hand may do; limits.toml, as of a designed motion. Only a hand that does not move,
+        What the hand may do; limits.toml. Only a hand that does not move,
         ``free = []``, needs none.
     experiment : str, optional
         Name of the recording whose grasp, loads and surroundings the plan keeps; by default the
@@ -534,7 +557,8 @@ def plan_motion(
         if solver == "interior-point":
             require_full_program(program)
         scenarios = program.scenarios() if robust else ()
-        answer = solve_reduced(program, scenarios=scenarios, tolerances=tolerances, watch=watch)
+        start = None if program.criterion is None else informative_motion(program)
+        answer = solve_reduced(program, start, scenarios, tolerances=tolerances, watch=watch)
         if robust:
             answer.x = program.simulate(answer.c)
         if solver == "interior-point" and answer.status != "interrupted":
@@ -543,6 +567,8 @@ def plan_motion(
         return program, answer
 
     def suffices(program: PlannedProgram, answer: PlanAnswer) -> bool:
+        if program.criterion is not None:
+            return program.criterion.suffices(answer.c, answer.x)
         return task.largest_error_m is None or (
             program.largest_error_m(answer.x) <= task.largest_error_m
         )
@@ -568,7 +594,8 @@ def plan_motion(
     except np.linalg.LinAlgError as error:
         raise InputError(f"{error}; state wider limits", None, where="hand") from error
     is_enough = suffices(program, answer)
-    if answer.status != "interrupted" and (task.shortest or not is_enough):
+    has_error = not is_enough and task.information is None
+    if answer.status != "interrupted" and (task.shortest or has_error):
         with suppress(KeyboardInterrupt):  # the plan of the stated duration remains
             first = (program, answer) if is_enough else None
             found = shortest(attempt, task.duration_s, first)
@@ -583,19 +610,10 @@ def plan_motion(
 
 def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
     """Return the simulation of a plan with `FINER` time steps for each of the plan's."""
-    since_s = program.experiment.t_s - program.experiment.t_s[0]
-    fine_s = np.linspace(0.0, since_s[-1], POSES_PER_SAMPLE * (len(since_s) - 1) + 1)
-    markers = program.experiment.markers
-    places_m = markers.predict_positions(program.experiment.body.nodes_m)
-    points = dict(zip(markers.names, places_m, strict=True))
-    t_s = program.experiment.t_s
-    commands = {
-        name: (t_s[0] + fine_s, values) for name, values in program.commands(c, fine_s).items()
-    }
-    experiment = program.body.experiment(program.poses(c, fine_s), t_s, points, commands)
     problem = program.body.problem
     values = problem.parameters.values(program.body.q)
     substeps = FINER * program.driven.transcription.substeps
+    experiment = program.moved_experiment(c)
     return simulate(experiment, values, integrator=problem.scheme, substeps=substeps)
 
 

@@ -6,16 +6,20 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...result.figure_style import (
+    BLUE,
     COLOUR_CYCLE,
     LINE_PT,
     PAGE_MM,
+    VERMILION,
     add_legend_above,
     new_figure,
     own_settings,
     style_axes,
 )
-from ..design.page import motion_picture_of
+from .hand_limits import Limits
+from .hand_motion import angular_motion
 from .motion_plan import MotionPlan
+from .spline_motion import SplineMotion
 
 
 @own_settings()
@@ -25,12 +29,49 @@ def plan_figures(plan: MotionPlan) -> dict[str, Figure]:
     """
     figures = {}
     if plan.program.space.moves_hand.any():
-        figures["hand"] = motion_picture_of(plan.motion, plan.program.limits)
+        figures["hand"] = motion_picture(plan.motion, plan.program.limits)
     if plan.program.signals:
         figures["commands"] = commands_picture(plan)
     if any(np.isfinite(each.position_m).any() for each in plan.program.references):
         figures["tracking"] = tracking_picture(plan)
     return figures
+
+
+def motion_picture(motion: SplineMotion, limits: Limits) -> Figure:
+    """Return a figure of four panels over time: translation [mm] and rotation vector [°] of the
+    hand, and its speeds and accelerations in percent of their limits.
+    """
+    figure = new_figure(PAGE_MM, 100)
+    shift, turn, speed, growth = figure.subplots(2, 2, sharex=True).ravel()
+    t_s = motion.grid_s
+    place, rate, curvature = motion.derivatives(t_s)
+    angular = angular_motion(place[:, 3:], rate[:, 3:], curvature=curvature[:, 3:])
+    for axis, colour in zip(range(3), COLOUR_CYCLE, strict=False):
+        style = {"color": colour, "lw": LINE_PT, "label": "xyz"[axis]}
+        shift.plot(t_s, 1e3 * place[:, axis], **style)
+        turn.plot(t_s, np.degrees(place[:, 3 + axis]), **style)
+    for axes, of_shift, of_turn, most in (
+        (speed, rate, angular[0], (limits.speed_m_s, limits.angular_speed_deg_s)),
+        (
+            growth,
+            curvature,
+            angular[1],
+            (limits.acceleration_m_s2, limits.angular_acceleration_deg_s2),
+        ),
+    ):
+        used = np.linalg.norm(of_shift[:, :3], axis=1) / most[0]
+        turned = np.degrees(np.linalg.norm(of_turn, axis=1)) / most[1]
+        axes.plot(t_s, 100 * used, color=BLUE, lw=LINE_PT, label="of the hand")
+        axes.plot(t_s, 100 * turned, color=VERMILION, lw=LINE_PT, label="angular")
+        axes.axhline(100, color="black", lw=0.6, ls="--")
+        axes.set_ylim(bottom=0)
+    style_axes(shift, "", xlabel="", ylabel="displacement of the hand [mm]")
+    style_axes(turn, "", xlabel="", ylabel="rotation vector [°]")
+    style_axes(speed, "", xlabel="time [s]", ylabel="speed [% of limit]")
+    style_axes(growth, "", xlabel="time [s]", ylabel="acceleration [% of limit]")
+    add_legend_above(shift, columns=3)
+    add_legend_above(speed, columns=2)
+    return figure
 
 
 def commands_picture(plan: MotionPlan) -> Figure:

@@ -12,7 +12,9 @@ amplitude σ_rest at the lowest natural frequency ω₁. The unit j₀ of the je
 acceleration over the duration; for tensions and pressures it is the largest third derivative of the
 smoothest change over the whole range.
 
-For a static recording, each sample is an equilibrium, and the second term is omitted.
+For a static recording, each sample is an equilibrium, and the second term is omitted. With
+information in the task, its criterion takes the place of the first two terms, see
+`InformationCriterion`.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ from ...program.driven_motion import Drive, DrivenMotion
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.modes.natural import natural_modes
 from ...recording import Experiment, PoseSequence
-from ..design.hand_limits import HandBounds, Limits
 from .body_limits import BodyLimits
+from .hand_limits import HandBounds, Limits
+from .information import InformationCriterion
 from .planned_body import PlannedBody
 from .signals import Signal, task_signals
 from .spline_motion import HAND, LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
@@ -219,7 +222,7 @@ class PlannedProgram:
                 None,
                 where="end.window_s",
             )
-        task = task.without_rest if template.is_static else task
+        task = task.without_rest if template.is_static or task.information else task
         window = _window_samples(task, sample_s, lowest_hz)
         experiment, driven = standing(count + 1 + window)
         since_s = np.asarray(sample_s * np.arange(count + 1 + window), dtype=np.float64)
@@ -232,6 +235,8 @@ class PlannedProgram:
         hand = experiment, driven, space, start, references, lowest_hz, signals
         program = cls(body, task, limits, *hand, pose_limits)
         program.require_start_within_limits()
+        if program.criterion is not None:
+            program.criterion.require_identifiable()
         return program
 
     def require_start_within_limits(self) -> None:
@@ -370,6 +375,28 @@ class PlannedProgram:
         placed = self.frame.position_m + coordinates[:, :3] - turned.apply(self.body.hand_m)
         return PoseSequence(t_s + self.experiment.t_s[0], placed, quaternions_xyzw=turned.as_quat())
 
+    def moved_experiment(self, c: Array) -> Experiment:
+        """Return the experiment of the plan at the unknowns c, with points in place of the
+        measurements.
+        """
+        t_s = self.experiment.t_s
+        fine_s = np.linspace(0.0, t_s[-1] - t_s[0], POSES_PER_SAMPLE * (len(t_s) - 1) + 1)
+        markers = self.experiment.markers
+        places_m = markers.predict_positions(self.experiment.body.nodes_m)
+        points = dict(zip(markers.names, places_m, strict=True))
+        commands = {
+            name: (t_s[0] + fine_s, values) for name, values in self.commands(c, fine_s).items()
+        }
+        return self.body.experiment(self.poses(c, fine_s), t_s, points, commands)
+
+    @cached_property
+    def criterion(self) -> InformationCriterion | None:
+        """Criterion of the information; None if the task has none."""
+        section = self.task.information
+        if section is None:
+            return None
+        return InformationCriterion(section, self.body, self.driven, self.moved_experiment)
+
     @cached_property
     def body_limits(self) -> BodyLimits | None:
         """Limits of the body; None if the task has none."""
@@ -488,15 +515,26 @@ class PlannedProgram:
         matrix = sp.csr_array(sp.kron(difference, of_dofs))
         return matrix, np.zeros(len(rows) * len(free))
 
+    def linearise(self, c: Array, x: Array, slopes: Array) -> tuple[Array, Array]:
+        """Return the derivatives (m, c) by the unknowns, and the values (m,), of the residuals of
+        the body for a motion x (N, 3n) with derivatives (N, 3n, c).
+        """
+        if self.criterion is not None:
+            return self.criterion.linearise(c, x, slopes)
+        matrix, target = self.residuals
+        return matrix @ slopes.reshape(-1, len(c)), matrix @ x.ravel() - target
+
     def objective_parts(self, c: Array, x: Array) -> dict[str, float]:
         """Return the parts of the objective at unknowns c and motion x (N, 3n): of each reference,
-        of the rest at the end, and of the jerk.
+        of the rest at the end, of the information, and of the jerk.
         """
         parts: dict[str, float] = {}
         flat = x.ravel()
         for name, matrix, target in self.residual_rows:
             value = float(np.sum((matrix @ flat - target) ** 2))
             parts[name] = parts.get(name, 0.0) + value
+        if self.criterion is not None:
+            parts["information"] = self.criterion.value(c, x)
         matrix, constant = self.effort
         parts["jerk"] = float(np.sum((matrix @ c + constant) ** 2))
         return parts

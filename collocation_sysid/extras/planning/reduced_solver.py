@@ -22,14 +22,16 @@ from scipy.linalg import solve_triangular
 
 from ...common.array_types import Array
 from ...errors import SimulationError
-from ..design.hand_limits import WITHIN
 from .body_limits import NEAR
+from .hand_limits import WITHIN
 from .planned_program import LinearisedLimits, PlannedProgram
 
 # Tolerance of the conic program of a step, relative.
 SOLVER_TOLERANCE = 1e-12
 # Largest number of linearisations of the limits in the search for the smoothest motion.
 MOST_LINEARISATIONS = 10
+# Motions from which the search for information begins.
+RANDOM_MOTIONS = 8
 # Largest share of a limit that an iterate may use: limits are tightened by `WITHIN`, so that it
 # respects the limits themselves.
 LARGEST_SHARE = 1 + 0.5 * (1 / WITHIN - 1)
@@ -54,6 +56,10 @@ class ReducedTolerances:
     failures: int = 12  # largest number of steps in a row that are not better
 
 
+# A search for information ends when three iterations make the intervals narrower by less than 5 %.
+INFORMATIVE = ReducedTolerances(progress=0.1)
+
+
 @dataclass(eq=False)
 class PlanAnswer:
     """Result of the search."""
@@ -62,7 +68,7 @@ class PlanAnswer:
     x: Array  # (N, 3n): motion [m]
     multipliers: Array  # (k,): multipliers of the limits
     # How the search ended; "flat": three iterations did not improve the plan by
-    # `ReducedTolerances.progress`.
+    # `ReducedTolerances.progress`; "reached": all intervals are as narrow as wanted.
     status: str
     history: list[float] = field(default_factory=list)  # objective at each iterate
 
@@ -153,16 +159,17 @@ def minimise_within_limits(
     return free + np.array(answer.x)[:count], np.concatenate([of_norms, of_rows])
 
 
-def smoothest_motion(program: PlannedProgram) -> Array:
+def smoothest_motion(program: PlannedProgram, wanted: Array | None = None) -> Array:
     """Return the unknowns of the motion with the least jerk within the limits: no motion, unless
-    the end of the hand is given.
+    the end of the hand is given. With `wanted` unknowns (c,), those within the limits nearest to
+    these.
 
     Raises
     ------
     HandLimitsExcludeTask
         If no motion satisfies the limits.
     """
-    matrix, constant = program.effort
+    matrix, constant = program.effort if wanted is None else (np.eye(len(wanted)), -wanted)
     scale = 1.0 / max(float(np.abs(matrix).max()), 1e-300)
     matrix, constant = scale * matrix, scale * constant
     c = np.zeros(matrix.shape[1])
@@ -173,6 +180,31 @@ def smoothest_motion(program: PlannedProgram) -> Array:
         if np.abs(step).max() < 1e-8:
             break
     return c
+
+
+def informative_motion(program: PlannedProgram) -> Array:
+    """Return the unknowns of the most informative one of random motions within the limits.
+
+    Raises
+    ------
+    HandLimitsExcludeTask
+        If no motion satisfies the limits.
+    SimulationError
+        If none can be simulated.
+    """
+    rng = np.random.default_rng(0)
+    best, least = smoothest_motion(program), np.inf
+    for _ in range(RANDOM_MOTIONS):
+        c = smoothest_motion(program, rng.normal(size=program.space.size))
+        if program.hand_limits.shares(c).max() > LARGEST_SHARE:
+            continue
+        with suppress(SimulationError):
+            x = program.simulate(c)
+            if _violation(program, [x]) <= LARGEST_SHARE - 1:
+                value = program.objective(c, x)
+                if value < least:
+                    best, least = c, value
+    return best
 
 
 def solve_reduced(
@@ -204,7 +236,8 @@ def solve_reduced(
     SimulationError
         If the first motion cannot be simulated.
     """
-    limits = tolerances or ReducedTolerances()
+    usual = ReducedTolerances() if program.criterion is None else INFORMATIVE
+    limits = tolerances or usual
     c = smoothest_motion(program) if start is None else start
     programs = scenarios or (program,)
     drive = program.drive(c)
@@ -218,8 +251,11 @@ def solve_reduced(
         while len(answer.history) <= limits.iterations:
             if watch is not None:
                 watch(len(answer.history) - 1, value)
+            if program.criterion is not None and program.criterion.suffices(c, motions[0]):
+                answer.status = "reached"
+                break
             slopes = [p.driven.respond(drive, x) for p, x in zip(programs, motions, strict=True)]
-            undamped, present = _linearised(program, c, motions, slopes)
+            undamped, present = _linearised(programs, c, motions, slopes)
             near = program.hand_limits.linearise(c)
             while True:
                 root, offset = _damped(undamped, present, damping)
@@ -275,16 +311,14 @@ def solve_reduced(
 
 
 def _linearised(
-    program: PlannedProgram, c: Array, motions: list[Array], slopes: list[Array]
+    programs: Sequence[PlannedProgram], c: Array, motions: list[Array], slopes: list[Array]
 ) -> tuple[Array, Array]:
     """Return the least-squares problem of a step, without limits, as in `triangular`."""
-    matrix, target = program.residuals
-    by_jerk, jerk = program.effort
+    by_jerk, jerk = programs[0].effort
     share = 1 / np.sqrt(len(motions))
-    rows = np.vstack([*(share * (matrix @ s.reshape(-1, len(c))) for s in slopes), by_jerk])
-    residual = np.concatenate(
-        [*(share * (matrix @ x.ravel() - target) for x in motions), by_jerk @ c + jerk]
-    )
+    pairs = [p.linearise(c, x, s) for p, x, s in zip(programs, motions, slopes, strict=True)]
+    rows = np.vstack([*(share * by_c for by_c, _ in pairs), by_jerk])
+    residual = np.concatenate([*(share * values for _, values in pairs), by_jerk @ c + jerk])
     return triangular(rows, residual)
 
 

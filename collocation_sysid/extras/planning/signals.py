@@ -16,7 +16,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...errors import InputError, hint_at, listed
 from ...recording import Experiment, Pressure, Tendon
-from ..design.hand_limits import WITHIN
+from .hand_limits import WITHIN
 from .task import SignalSection, Task, TendonSection
 
 # Commands over times, by name of the tendon or pressure.

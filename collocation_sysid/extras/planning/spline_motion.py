@@ -22,8 +22,8 @@ from scipy.interpolate import BSpline
 from ...common.array_types import Array, Index
 from ...common.files import reason
 from ...errors import InputError
-from ..design.hand_limits import WITHIN, HandBounds
-from ..design.hand_motion import TimeDerivatives
+from .hand_limits import WITHIN, HandBounds
+from .hand_motion import TimeDerivatives
 from .signals import Signal
 
 # Expression (k,), which must not be positive, of the position (3,) and the rotation (3, 3).

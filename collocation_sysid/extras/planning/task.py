@@ -39,6 +39,8 @@ AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 VELOCITY_COLUMNS = ("vx_m_s", "vy_m_s", "vz_m_s")
 Row = tuple[Boundless, Boundless, Boundless]
+# Keys of a task that a motion for information does not have.
+OF_REFERENCES = ("reference", "end", "largest_error_m")
 # Distance of a reference from the body in sizes of the body beyond which it has another unit.
 MOST_BODIES = 20.0
 
@@ -295,6 +297,21 @@ class AvoidSection(Section):
     clearance_m: Positive | None = None
 
 
+class InformationSection(Section):
+    """Constants that a recording of the motion shall determine.
+
+    Attributes
+    ----------
+    constants : list of str
+        Estimated constants of the problem, or moduli that follow from these.
+    half_width : float
+        Wanted half width of the 95 % interval of each, relative to its value: 0.05 for ± 5 %.
+    """
+
+    constants: Annotated[list[Text], Field(min_length=1)]
+    half_width: Positive
+
+
 class Task(Section):
     """task.toml: a motion to be planned.
 
@@ -306,8 +323,8 @@ class Task(Section):
         Largest distance of a point from its reference, and of a node from rest at the end, that is
         acceptable. If the plan exceeds it, the duration that would suffice is computed.
     shortest : bool
-        Whether the duration is the shortest with which `largest_error_m` is not exceeded; all times
-        of the references are stretched with it.
+        Whether the duration is the shortest with which `largest_error_m`, or the half width of
+        `information`, is not exceeded; all times of the references are stretched with it.
     sample_s : float, optional
         Time between the samples of the plan; that of the recording by default.
     reference : list of tables
@@ -321,6 +338,9 @@ class Task(Section):
         keep their values before the motion.
     avoid : table
         Limits of the body.
+    information : table, optional
+        Constants that a recording of the motion shall determine, in place of references; the search
+        ends when their intervals are as narrow as wanted.
     """
 
     duration_s: Positive
@@ -333,6 +353,7 @@ class Task(Section):
     tendon: list[TendonSection] = Field(default_factory=list)
     pressure: list[PressureSection] = Field(default_factory=list)
     avoid: AvoidSection = Field(default_factory=AvoidSection)
+    information: InformationSection | None = None
 
     @property
     def signals(self) -> list[tuple[str, int, SignalSection]]:
@@ -360,7 +381,16 @@ class Task(Section):
                 None,
                 where="tendon" if self.tendon else "pressure",
             )
-        if self.shortest and self.largest_error_m is None:
+        if self.information is not None:
+            beside = [key for key in OF_REFERENCES if key in self.model_fields_set]
+            if beside:
+                raise InputError(
+                    f"found {listed(beside)} beside it; expected either, because the motion is chosen "
+                    "for its information alone",
+                    None,
+                    where="information",
+                )
+        if self.shortest and self.largest_error_m is None and self.information is None:
             raise InputError(
                 "the shortest duration needs the error that is acceptable; expected "
                 "largest_error_m",
@@ -368,9 +398,10 @@ class Task(Section):
                 where="shortest",
             )
         ends = [hand.end_m, hand.end_rotation_deg, *(each.end for each in signals)]
-        if not self.reference and all(end is None for end in ends):
+        has_purpose = self.reference or self.information is not None
+        if not has_purpose and all(end is None for end in ends):
             raise InputError(
-                "nothing to do; expected a [[reference]] table, or end_m in [hand]",
+                "nothing to do; expected a [[reference]] table, end_m in [hand], or [information]",
                 None,
                 where="reference",
             )

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...recording.sources.logs import require_packages
-from ..design.hand_motion import angular_motion
+from .hand_motion import angular_motion
 from .motion_plan import MotionPlan
 
 TRAJECTORY_TOPIC, POSE_TOPIC, COMMAND_TOPIC = "/hand_trajectory", "/hand_pose", "/command_{}"

@@ -3,8 +3,7 @@
 Studies: `arguments` parses command-line arguments,
 `planning` plans the runs, `run_execution` executes them (each in its own process, see
 `run_worker`) and stores their records, `rows` converts records to rows of numbers, and `tables`
-and `plots` present them. `progress` shows progress in the terminal, also of the search for a
-motion (package `design`).
+and `plots` present them. `progress` shows progress in the terminal.
 
 Model comparison: `model_variants` derives models from a problem file, `model_choice` compares their
 predictions, `model_comparison` does so in Python, and `law_disagreements` evaluates how much an

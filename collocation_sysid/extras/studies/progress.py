@@ -1,22 +1,17 @@
-"""Progress display in the terminal: of a study with the remaining time, and of a design."""
+"""Progress display of a study in the terminal, with the remaining time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Self
 
-import numpy as np
 from rich.console import Console
 
 from ...common.display import duration
 from ...result.solve_progress import SolveProgress
-from ..design.motion import FORBIDDEN
 from .planning import PlannedRun
 from .run_execution import Record
 
-# Number of motions between two lines of a search whose output is no terminal.
-EVERY = 20
 # Processor time of a run before its search [s]: start of its process, imports and reading.
 RUN_START_S = 2.7
 # Time of a run with its scan and checks over the expected time of its search: 0.3 to 6 for templates
@@ -27,8 +22,6 @@ FIT_FACTOR = 4.0
 STUDY_FACTOR = 2.0
 # Largest slowness of a machine that counts.
 LARGEST_SLOWNESS = 5.0
-# Hint beside each stage of a design.
-STOPPING = "Ctrl-C stops and keeps the best"
 
 
 class StudyProgress(SolveProgress):
@@ -99,52 +92,6 @@ class StudyProgress(SolveProgress):
             [run.method for run in self._waiting.values()], self._walls, worker_count=worker_count
         )
         return "" if remaining_s is None else f"; about {duration(remaining_s)} left"
-
-
-class DesignProgress(SolveProgress):
-    """Progress of the search for a motion: one updated line on a terminal, else a line every
-    `EVERY` motions and from time to time.
-
-    Parameters
-    ----------
-    console : Console
-        Terminal.
-    evaluations : int
-        Number of motions that will be evaluated.
-    quiet : bool
-        Whether to show nothing.
-    """
-
-    def __init__(self, console: Console, evaluations: int, quiet: bool = False) -> None:
-        super().__init__(console, quiet=quiet, activity=f"preparing the design ({STOPPING})")
-        self.evaluations = evaluations
-
-    def show_best(self, number: int, log_size: float) -> None:
-        """Show the number of evaluated motions, the remaining time and the smallest error bar so
-        far.
-
-        Parameters
-        ----------
-        number : int
-            Number of motions so far.
-        log_size : float
-            Logarithm of the smallest relative error bar; from `FORBIDDEN` on, no motion was
-            feasible.
-        """
-        best = "none feasible yet" if log_size >= FORBIDDEN else f"{100 * np.exp(log_size):.3g} %"
-        line = f"{number} of {self.evaluations} motions evaluated, smallest error bar: {best}"
-        share = number / self.evaluations
-        self.share(share if share < 1 else None)
-        self.state(partial(str, line))
-        if self._live is None and (number % EVERY == 0 or number == self.evaluations):
-            self.line(line)
-
-    def show_activity(self, what: str) -> None:
-        """Show what is being computed, such as a stage of the design, with a hint at Ctrl-C; `what`
-        is a text. The share of the previous stage is no longer shown.
-        """
-        self.share(None)
-        self.announce(f"{what} ({STOPPING})")
 
 
 def expected_study_s(
