@@ -107,16 +107,14 @@ def live(
         )
     problem = source.read_problem()
     estimator = LiveEstimator(problem)
-    lines: Iterable[bytes] = ()
+    lines: Iterable[bytes]
     if udp is None:
-        lines = sys.stdin.buffer
+        lines, name = sys.stdin.buffer, "standard input"
     else:
         receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         receiver.bind(("127.0.0.1", udp))
-        lines = receive_lines(receiver)
-        port = receiver.getsockname()[1]
-        error_console.print(f"listening on UDP port {port} of this machine")
-    name = "standard input" if udp is None else f"UDP port {udp}"
+        lines, name = receive_lines(receiver), f"UDP port {receiver.getsockname()[1]}"
+        error_console.print(f"listening on {name} of this machine")
     reader = FrameReader(estimator.experiment, problem, name)
     bad = 0
 
