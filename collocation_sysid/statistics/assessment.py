@@ -233,20 +233,17 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
 
 
 def _correlations(dependence: Dependence) -> tuple[bool, bool]:
-    """Return whether residuals are correlated in time, and among channels, so that it counts."""
     limit = float(normal_isf(RARE / 2)) * dependence.lag1_deviation
     return abs(dependence.lag1) > max(PERSISTENT, limit), dependence.shared_p < RARE
 
 
 def _disagreements(uncertainty: Uncertainty) -> list[str]:
-    """Return the names of the parameters on which recordings disagree."""
     scatter = uncertainty.scatter
     disagreeing = [] if scatter is None else np.flatnonzero(scatter.find_disagreements()).tolist()
     return [uncertainty.names[k] for k in disagreeing]
 
 
 def _disagreement_concerns(uncertainty: Uncertainty) -> list[Concern]:
-    """Return a concern with the parameters on which recordings disagree, or nothing."""
     names = [
         display_name(name, is_scalar=name in uncertainty.estimates)
         for name in _disagreements(uncertainty)
@@ -398,9 +395,7 @@ def probe_concerns(
 
 
 def _advice(probe: Probe, is_still: bool) -> str:
-    """Return the addition to a message on a relaxed assumption that names what resembles it, or how
-    to estimate it; "" for an assumption that is not probed in every solve.
-    """
+    """Return what a message adds; "" for an assumption that is not probed in every solve."""
     if not is_routine_assumption(probe.name):
         return ""
     advice = {MEMORY: MEMORY_ADVICE, ANISOTROPY: ANISOTROPY_ADVICE}
@@ -408,7 +403,6 @@ def _advice(probe: Probe, is_still: bool) -> str:
 
 
 def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
-    """Return the specimens whose branches differ clearly, with the remedy; "" if there are none."""
     sizes = branch_differences(experiments)
     if not sizes:
         return ""
@@ -419,10 +413,7 @@ def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
 
 
 def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
-    """Return the estimate of a parameter by a probe that relaxes an assumption, multiplied by a
-    correction, as text. The value is multiplied by the correction, the standard error is not; a
-    parameter without an estimate is "not determined".
-    """
+    """Return an estimate times a correction as text; its standard error is not multiplied."""
     move = probe.moves.get(name)
     if move is None:
         return f"{symbol_of(name)} not determined"

@@ -401,7 +401,7 @@ def _eigenpairs(matrix: Array) -> tuple[Array, Array]:
 def _equal_modulus(
     best: Direction, members: Index, covariance: Array, moduli: Mapping[str, Array]
 ) -> str | None:
-    """Return the derived modulus of these constants (indices) alone that is about as precise."""
+    """Return the derived modulus of these constants alone that is about as precise."""
     others = np.setdiff1d(np.arange(len(covariance)), members)
     for name, slope in moduli.items():
         size = np.abs(slope[members]).max(initial=0.0)

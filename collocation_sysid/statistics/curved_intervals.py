@@ -80,7 +80,6 @@ def _may_be_curved(name: str, estimate: Estimate, whole: float | None) -> bool:
 def _along_profile(
     uncertainty: Uncertainty, fit: LinearisedFit, collocation: Collocation, z: Array, k: int
 ) -> Uncertainty:
-    """Return the uncertainty with intervals along the profile of free parameter k."""
     parameters, q = collocation.parameters, z[: collocation.nq]
     item, quantile = parameters.free[k], float(uncertainty.quantiles[k])
     widening = (quantile / normal_isf(0.025)) ** 2
@@ -105,9 +104,6 @@ def _along_profile(
     } | dict(fit.derived.derivatives)
 
     def follow(name: str, estimate: Estimate) -> Estimate:
-        """Return an estimate with the interval that follows the profile; another compressibility
-        has its own profile.
-        """
         is_other = name != item.name and without_region(name) in COMPRESSIBILITIES
         if name not in slopes or estimate.statistical95 is None or is_other:
             return estimate
@@ -129,9 +125,7 @@ def _along_profile(
 
 
 def _with_ends(name: str, estimate: Estimate, moved: list[float], rest: float) -> Estimate:
-    """Return an estimate with the ends of its interval at moved values, in either order, widened in
-    quadrature by the half width `rest`.
-    """
+    """Return the interval of ends in either order, widened in quadrature by `rest`."""
     assert estimate.statistical95 is not None
     values = (estimate.value, *estimate.statistical95, *moved)
     at = IntervalCoordinate.for_estimate(name, values, linear=min(values) <= 0)

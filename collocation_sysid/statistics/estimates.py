@@ -266,7 +266,6 @@ def derived_estimates(
 
 
 def _derived_estimate(name: str, value: float, deviation: float, quantile: float) -> Estimate:
-    """Return the estimate of a modulus from its standard deviation."""
     if value > 0:
         return _logarithmic_estimate(name, value, deviation=deviation / value, quantile=quantile)
     if not np.isfinite(deviation):
@@ -303,7 +302,6 @@ def _parameter_estimate(
 
 
 def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
-    """Return an estimate multiplied by a ratio, which may be negative."""
     ends = estimate.statistical95 and sorted(
         (ratio * estimate.statistical95[0], ratio * estimate.statistical95[1])
     )
@@ -319,7 +317,6 @@ def _scaled_estimate(estimate: Estimate, ratio: float) -> Estimate:
 
 
 def _estimate_at_bound(value: float) -> Estimate:
-    """Return an estimate without standard error and interval, with the reason."""
     return Estimate(
         value, at_bound=True, reason="it ended at a bound, or follows from a parameter that did"
     )
@@ -410,7 +407,6 @@ def without_long_term_moduli(
 
 
 def _unidentifiable_notes(reasons: Mapping[str, str]) -> list[str]:
-    """Return a note for each parameter that is not identifiable, or for two confounded ones."""
     notes = []
     mentioned = set()
     for name, reason in reasons.items():

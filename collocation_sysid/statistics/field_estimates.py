@@ -309,7 +309,6 @@ def _mean_logarithm(constants: ThetaMap, part_index: int, modes: FieldModes) -> 
     part = constants.body.parts[part_index]
 
     def logarithm(q: ca.SX, _: ca.SX) -> ca.SX:
-        """Return the expression at q (nq,); the second argument, data, is empty."""
         own = body.split_theta(constants.expression(q))[part_index]
         if part.stress_field is None:
             return (

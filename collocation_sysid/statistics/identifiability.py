@@ -46,7 +46,6 @@ def identifiability_sentences(
 
 
 def _single_sentences(uncertainty: Uncertainty) -> list[str]:
-    """Return a sentence on the parameters with a useful interval, well determined first."""
     factors = {
         name: factor
         for name in uncertainty.names
@@ -62,7 +61,6 @@ def _single_sentences(uncertainty: Uncertainty) -> list[str]:
 
 
 def _other_convention(uncertainty: Uncertainty) -> list[str]:
-    """Return a sentence on the moduli of the other elastic convention with a useful interval."""
     if not set(ELASTIC) & {without_region(name) for name in uncertainty.names}:
         return []
     parts = []

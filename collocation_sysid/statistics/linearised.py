@@ -53,7 +53,6 @@ def observable_responses(collocation: Collocation, z: Array) -> list[ObservableR
     """
 
     def of(iterate: ExperimentIterate) -> ObservableResponse:
-        """Return the changes of the observables of one experiment with its parameters."""
         transcription = iterate.transcription
         grasp_forces = GraspForces.zeros(
             len(iterate.x),

@@ -121,7 +121,6 @@ def with_pose_noise(
 
 
 def _grasp_noise(name: str, grasp: Grasp) -> PoseNoise:
-    """Return the noise of a grasp's poses, as stated or else estimated."""
     rough_m, rough_rad = estimate_pose_noise(grasp.poses)
     sigma_m = rough_m if grasp.sigma_m is None else grasp.sigma_m
     sigma_rad = rough_rad if grasp.sigma_rad is None else grasp.sigma_rad
@@ -188,7 +187,7 @@ def _add_displacements(
     shifts: Array,
     rotations: Array,
 ) -> None:
-    """Add the displacements of a grasp's nodes due to pose errors to `displacements_m`, in place."""
+    """Add displacements due to pose errors in place."""
     transcription = iterate.transcription
     prescribed = iterate.equations.prescribed
     t_s = transcription.dynamics.t_s

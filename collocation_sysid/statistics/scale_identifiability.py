@@ -117,9 +117,7 @@ def scale_reference(
 def _scaled_parameters(
     experiments: Iterable[Experiment], parameters: Parameters, includes_declared: bool
 ) -> tuple[str, ...]:
-    """Return the free parameters that multiply all moduli and densities by a common factor; empty
-    if data or priors determine the factor.
-    """
+    """Return no names if data or priors determine the common factor."""
     fitted = [experiment for experiment in experiments if not experiment.validation]
     bodies = {id(e.body): e.body for e in fitted}
     with_known_force = {id(e.body) for e in fitted if e.has_known_force()}

@@ -23,7 +23,6 @@ class Threshold(float):
     study: str
 
     def __new__(cls, value: float, reason: str = "", study: str = "") -> Threshold:
-        """Return the number with its reason and study."""
         made = super().__new__(cls, value)
         made.reason, made.study = reason, study
         return made

@@ -407,9 +407,7 @@ def _dependence(fit: LinearisedFit) -> tuple[Dependence, bool, Dependence]:
 def _unexplained_dependence(
     fit: LinearisedFit, factored: Information, dependence: Dependence
 ) -> Dependence:
-    """Return the tests of the residuals without those that may be slow errors of instruments;
-    `dependence` has the tests of all.
-    """
+    """Return the tests without residuals that may be slow errors of instruments."""
     kept = [not block.may_be_slow_errors() for block in fit.blocks]
     if all(kept):
         return dependence
@@ -460,9 +458,7 @@ def _is_explained(
 def _correlated_score_covariance(
     fit: LinearisedFit, factored: Information, kind: Noise, level: NoiseLevel
 ) -> tuple[Array, Array]:
-    """Return the covariance (r, r) of the score for correlated errors, and degrees of freedom
-    (shared,).
-    """
+    """Return the covariance (r, r) of the score, and degrees of freedom (shared,)."""
     of_score, freedom = score_covariance(
         factored, error_processes(fit, factored), shared=fit.shared_count
     )

@@ -146,11 +146,9 @@ def widened_interval(ends: Interval, centre: float, deviation: float) -> Interva
 
 
 def _clip(bounds: Interval, value: float) -> float:
-    """Return a value clipped to bounds (lower, upper), which may be infinite."""
     low, high = bounds
     return float(min(max(value, low), high))
 
 
 def _interval(at: IntervalCoordinate, low: float, high: float, bounds: Interval) -> Interval:
-    """Return the interval between two coordinates, as values clipped to bounds."""
     return _clip(bounds, at.to_value(low)), _clip(bounds, at.to_value(high))

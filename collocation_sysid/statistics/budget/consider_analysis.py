@@ -35,8 +35,6 @@ UNWEIGHTED = 1e9
 
 @dataclass(frozen=True, eq=False)
 class _EffectColumns(SweepColumns):
-    """Right-hand sides of a forward substitution by changes of forces and of equations."""
-
     # (N, 3n, c): changes of the forces at the evaluations [N].
     forces_n: Array = field(kw_only=True)
     rows_n: Array = field(kw_only=True)  # (N, 3n, c): changes of the equations of motion [N]
@@ -49,12 +47,7 @@ class _EffectColumns(SweepColumns):
         residual: Array | None,
         free: Index,
     ) -> tuple[Array, Array]:
-        """Return R (k, free, c) and F_R (k, 3n, c) [N], copies of the stored changes of the
-        equations and the forces in k rows.
-
-        `rows` selects the time steps and `free` the dofs of R; the other arguments, those of
-        `SweepColumns.right_hand_sides`, are not used.
-        """
+        """Return R (k, free, c) and F_R (k, 3n, c) [N] of k rows."""
         return self.rows_n[rows][:, free].copy(), self.forces_n[rows].copy()
 
 
@@ -184,9 +177,6 @@ def changes_of_nuisances(
     """
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
-        """Return the experiment in which the parameters that are not estimated are
-        estimated too.
-        """
         nuisance = experiment.nuisance
         sigmas = {row: deviations.get(row.name, row.considered) for row in KINDS}
         more = {r.name: s for r, s in sigmas.items() if s and nuisance.sigma(r) is None}
@@ -250,7 +240,6 @@ def changed_residuals(
 
 
 def _effect_of(row: Deviation, at: ExperimentAtAnswer, axis: int) -> Effect | None:
-    """Return the effect of an axis of a deviation; None if it has none in this experiment."""
     is_specimen = at.iterate.transcription.experiment.specimen is not None
     if row.effect is None or (is_specimen and not row.of_specimens):
         return None

@@ -207,7 +207,6 @@ class Refinement:
         return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
 
     def _errors_of_notable(self, estimates: Mapping[str, Estimate]) -> dict[str, float | None]:
-        """Return the standard errors of the estimates whose correction is not negligible."""
         changes = {
             name: abs(estimates[name].value - error.extrapolated)
             for name, error in self.errors.items()

@@ -111,14 +111,12 @@ def finer_mesh_row(collocation: Collocation) -> Deviation:
 
 
 def _has_mesh(experiment: Experiment) -> bool:
-    """Return whether an experiment is not a homogeneous specimen."""
     return experiment.specimen is None
 
 
 def _effect(
     at: ExperimentAtAnswer, _: int, scheme: str | Scheme, finer: Mapping[int, Body]
 ) -> Effect:
-    """Return the change of the forces of one experiment by the finer mesh of its body."""
     iterate = at.iterate
     transcription = iterate.transcription
     if at.dynamics.is_temporarily_prescribed.any():
@@ -152,19 +150,7 @@ def _equivalent_forces(
     moving: Index,
     given: Index,
 ) -> Array:
-    """Return Iᵀ(F − M a − K e) + k e_g (N − first row, 3n) [N] at the evaluations.
-
-    Parameters
-    ----------
-    dynamics : Dynamics
-        Equations of motion on the finer mesh.
-    interpolation : (3m, 3n) sparse array
-        Matrix I.
-    moving : (k,) array
-        Dofs of the finer mesh of which e is sought.
-    given : (3n,) array
-        Dofs of the finer mesh that are those of the given mesh.
-    """
+    """Return Iᵀ(F − M a − K e) + k e_g (N − first row, 3n) [N] at the evaluations."""
     x = np.ascontiguousarray(at.iterate.x @ interpolation.T)
     unbalanced_n = _forces_less_inertia(dynamics, x)
     xi, nu = map(np.ascontiguousarray, dynamics.evaluation_states(x))

@@ -125,9 +125,7 @@ def rigid_contact_change_n(experiment: Experiment, dynamics: Dynamics, x: Array)
 
 
 def _contacts_with_energy(forces: Forces) -> list[Contact]:
-    """Return the contact forces with an energy, without those of complementarity; empty without
-    obstacles.
-    """
+    """Return the contact forces with an energy, without those of complementarity."""
     return [
         term
         for term in forces.external_terms
@@ -185,7 +183,6 @@ def scaled_start_m(iterate: ExperimentIterate) -> Array | None:
 
 
 def _free_axes(experiment: Experiment) -> NDArray[np.bool_]:
-    """Return for each axis whether no grasp of the body prescribes it."""
     prescribed = set("".join(grasp.axes for grasp in experiment.body_grasps))
     return np.array([axis not in prescribed for axis in "xyz"])
 

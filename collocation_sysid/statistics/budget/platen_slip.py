@@ -214,9 +214,7 @@ def sliding_faces(
 
 
 def _released_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> Index:
-    """Return the tangential dofs (s,) of the faces, ascending, without those that a plane of
-    symmetry holds: nodes of the faces that lie in that plane remain held along its normal.
-    """
+    """Return the tangential dofs (s,) of the faces, without those in a plane of symmetry."""
     released = set(_tangential_dofs(experiment, faces, axis))
     for normal, nodes in experiment.planes_of_symmetry:
         if normal != axis:
@@ -225,7 +223,6 @@ def _released_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> Ind
 
 
 def _tangential_dofs(experiment: Experiment, faces: list[Grasp], axis: int) -> list[int]:
-    """Return the dofs of the nodes of flat faces perpendicular to an axis, without those along it."""
     nodes_m = experiment.body.nodes.points_m
     tolerance_m = FLATNESS * float(np.ptp(nodes_m, axis=0).max())
     return [

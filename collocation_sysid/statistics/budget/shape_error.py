@@ -155,7 +155,6 @@ def _correlation_modes(points_m: Array, weights: Array, length_m: float) -> Arra
     chosen = np.sort(np.random.default_rng(0).permutation(len(points_m))[:count])
 
     def covariance(a: Array, b: Array) -> Array:
-        """Return the covariances (k, l) of the field between points a (k, 3) and b (l, 3)."""
         squares = np.sum((a[:, None] - b[None]) ** 2, axis=2)
         return np.asarray(np.exp(-0.5 * squares / length_m**2))
 

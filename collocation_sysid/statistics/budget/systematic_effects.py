@@ -219,9 +219,6 @@ class ExperimentAtAnswer:
         )
 
     def _solve_rest_shape(self) -> RestShape:
-        """Return the stress-free shape that follows from a mesh made under gravity; only for a body
-        with such a mesh.
-        """
         assert self.body.inverse_equilibrium is not None
         return self.body.inverse_equilibrium.solve(self.theta)
 
@@ -382,9 +379,7 @@ class ExperimentAtAnswer:
 
 
 def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
-    """Return the mask (n, 3) of the coordinates that are among the dofs (k,), for n = `nodes`
-    nodes; dof 3 i + axis belongs to node i.
-    """
+    """Return the mask (n, 3) of dofs (k,); dof 3 i + axis belongs to node i."""
     mask = np.zeros(3 * nodes, dtype=bool)
     mask[dofs] = True
     return mask.reshape(nodes, 3)
@@ -436,9 +431,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
 
 
 def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a body that is heavier by a share, per unit; None if a density is
-    estimated. The weight during a scan under gravity grows with it.
-    """
+    """Return the effect with the weight during a scan; None if a density is estimated."""
     if any(part.has_free_density for part in at.body.parts):
         return None
     return Effect(
@@ -447,9 +440,7 @@ def _mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Return the effect of a density that increases along an axis (index) of the body, by a share
-    at the end farther from the centre of mass, linearly through zero there.
-    """
+    """Return the effect of a share that grows linearly from zero at the centre of mass."""
     place_m = at.body.nodes_m[:, axis]
     shares = _linear_shares(place_m, at.own_mass_kg[::3], extent_m=place_m)
     mass = at.own_mass_kg * np.repeat(shares, 3)
@@ -457,10 +448,7 @@ def _density_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
 
 
 def _stiffness_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Return the effect of a stiffness that increases along an axis (index) of the body, by a share
-    at the end farther from the middle of its volume, linearly through zero there; damping and
-    memory are proportional to the stiffness.
-    """
+    """Return the effect of a share that grows linearly from the middle, with damping and memory."""
     body = at.stress_free_body
     place_m = at.stress_free_m[:, axis]
     shares = _linear_shares(
@@ -471,9 +459,7 @@ def _stiffness_gradient(at: ExperimentAtAnswer, axis: int) -> Effect:
 
 
 def _linear_shares(place_m: Array, weights: Array, extent_m: Array) -> Array:
-    """Return numbers (k,) that increase linearly along an axis, with a mean of zero and the
-    magnitude one at the farther end of the body.
-    """
+    """Return numbers (k,) with mean zero and magnitude one at the farther end of the body."""
     middle_m = np.average(place_m, weights=weights)
     return (place_m - middle_m) / np.abs(extent_m - middle_m).max()
 
@@ -509,27 +495,20 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
 
 
 def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
-    """Return the effect of a stiffness that grows linearly in time, at the end higher by a share
-    than at the beginning, and unchanged at the mean time.
-    """
+    """Return the effect of a share that grows linearly in time, zero at the mean time."""
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
 
 
 def _memory(at: ExperimentAtAnswer, index: int) -> Effect | None:
-    """Return the effect of a branch of memory with one of `RELAXATION_TIMES_S` (index), per unit of
-    its share; None where the model has memory, and if the recording cannot show it, see
-    `ExperimentAtAnswer.forces_of_memory_n`.
-    """
+    """Return the effect per share; None where the model has memory, or it cannot be seen."""
     force_n = at.forces_of_memory_n.get(RELAXATION_TIMES_S[index])
     return None if force_n is None else Effect(force_n)
 
 
 def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of clocks that are fast by a share, so that less time passes than they
-    show; None for a static experiment.
-    """
+    """Return the effect of clocks that are fast by a share: less time passes than they show."""
     if at.iterate.transcription.experiment.is_static:
         return None
     slower = at.internal_n(time_factor=1 + SMALL)
@@ -540,7 +519,6 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _stated_poisson_names(parameters: Parameters) -> set[str]:
-    """Return the names of Poisson's ratios that are fixed, or tied to a fixed one."""
     items = {item.name: item for item in parameters.components}
     return {
         name
@@ -566,9 +544,7 @@ def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float
 
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a larger Poisson's ratio, per unit, where it is stated (fixed, or tied
-    to a fixed one), in all such parts together; None if there is none.
-    """
+    """Return the effect of all ratios together that are fixed or tied to a fixed one."""
     constants = _stated_poisson_names(at.parameters)
     if not constants:
         return None
@@ -609,27 +585,19 @@ def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a layer of the body's own material, without mass, between body and
-    grippers, per metre of thickness; None without a gripper that holds faces of the body.
-    """
+    """Return the effect per metre of a massless layer of the body's material under grippers."""
     return at.effect_of_grips
 
 
 def _grasp_edge(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a gripper that holds less of the body than the grasped nodes, per metre:
-    that of a layer of the body's material between both, see `_grip`.
-
-    None without a gripper, and on a test bench, where platens end at the faces of the specimen.
-    """
+    """Return the effect per metre; None on a test bench, where platens end at the faces."""
     if at.iterate.transcription.experiment.is_static and _is_driven(at).any():
         return None
     return at.effect_of_grips
 
 
 def _is_driven(at: ExperimentAtAnswer) -> NDArray[np.bool_]:
-    """Return the mask (g,) of grasped dofs whose prescribed position changes; times at which a dof
-    is free (NaN) are ignored.
-    """
+    """Return the mask (g,) of grasped dofs whose prescribed position changes."""
     goals = at.iterate.equations.prescribed.positions_m
     return np.asarray(np.nanmax(goals, axis=0) > np.nanmin(goals, axis=0))
 
@@ -664,7 +632,7 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
 def _machine_of_specimen(
     at: ExperimentAtAnswer, deformation: HomogeneousDeformation
 ) -> Effect | None:
-    """Return the effect of the compliance C of a test bench on a homogeneous specimen."""
+    """Return the effect per unit of the compliance C."""
     if not deformation.area_over_length_m:
         return None
     dofs = at.iterate.equations.prescribed.dofs
@@ -680,9 +648,7 @@ def _machine_of_specimen(
 
 
 def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a gauge length of a homogeneous specimen that is longer than stated by a
-    share, per unit of that share: all prescribed strains are smaller by it; None for a body.
-    """
+    """Return the effect per share by which all strains are smaller; None for a body."""
     deformation = at.iterate.transcription.experiment.specimen
     if deformation is None:
         return None
@@ -695,9 +661,7 @@ def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _effective_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect `_gauge_length` where the length is that between grips that pull: the
-    shoulders of a dogbone stretch less than its narrow part; None otherwise.
-    """
+    """Return `_gauge_length` for grips: shoulders of a dogbone stretch less than the middle."""
     experiment = at.iterate.transcription.experiment
     deformation = experiment.specimen
     if deformation is None or not deformation.is_displacement or deformation.lateral == "":
@@ -735,9 +699,7 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of faces that slide freely on platens instead of sticking; None if other
-    measurements than loads show the grip, or no face may slide, see `slip_displacements_m`.
-    """
+    """Return None if other measurements than loads show the grip, see `slip_displacements_m`."""
     displacement_m = slip_displacements_m(at.iterate, at.theta, reactions_n=at.grasp_force_n)
     if displacement_m is None:
         return None
@@ -745,9 +707,7 @@ def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _platen_stick(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of faces that stick to platens instead of sliding; None where that of
-    `_platen_slip` has no counterpart, see `sticking_change_n`.
-    """
+    """Return None where `_platen_slip` has no counterpart, see `sticking_change_n`."""
     if not at.iterate.transcription.experiment.is_static:
         return None
     force_n = sticking_change_n(at.iterate, at.theta)
@@ -756,9 +716,7 @@ def _platen_stick(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of rigid contact in place of the pressure law, to first order; None without
-    contact, or where it is rigid already.
-    """
+    """Return the effect to first order; None where contact is rigid already."""
     change_n = rigid_contact_change_n(
         at.iterate.transcription.experiment, at.dynamics, x=at.iterate.x
     )
@@ -766,21 +724,16 @@ def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _buoyancy(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of more buoyancy, as a share of that in the model; None in a vacuum."""
     return Effect(at.buoyancy_n) if at.dynamics.mass.added_kg.any() else None
 
 
 def _added_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of more added mass, as a share of that in the model; None in a vacuum and
-    for a static experiment.
-    """
     if at.iterate.transcription.experiment.is_static or not at.dynamics.mass.added_kg.any():
         return None
     return Effect(mass_kg=at.dynamics.mass.added_kg)
 
 
 def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of more drag, as a share of that in the model; None in a vacuum."""
     return Effect(at.air_drag_n) if at.iterate.transcription.experiment.has_air_drag else None
 
 
@@ -819,23 +772,17 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
 
 
 def _objective_damping(at: ExperimentAtAnswer, index: int) -> Effect | None:
-    """Return the effect of another objective damping law, by its index in `OBJECTIVE_DAMPINGS`;
-    None if it is the stated one in all parts, see `_other_damping`.
-    """
+    """Return None if it is the stated law in all parts, see `_other_damping`."""
     return _other_damping(at, OBJECTIVE_DAMPINGS[index])
 
 
 def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of Rayleigh damping, which is not objective, instead of the stated law, see
-    `_other_damping`.
-    """
+    """Return the effect of the damping that is not objective, see `_other_damping`."""
     return _other_damping(at, "rayleigh")
 
 
 def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
-    """Return the effect of a mesh that was made under the body's own weight along one of its axes
-    (index); None if the problem states the rest shape.
-    """
+    """Return None if the problem states the rest shape."""
     if at.body.rest_shape is not None:
         return None
     return Effect(
@@ -861,9 +808,7 @@ def shape_effect(at: ExperimentAtAnswer, moved_m: Array) -> Effect:
 
 
 def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
-    """Return the effect of an error of the surface along its normal, by one mode (index from 0) of
-    a smooth random field, in units of the thickness; grasped nodes move with the surface.
-    """
+    """Return the effect per thickness; grasped nodes move with the surface."""
     return shape_effect(at, at.surface_modes_m[mode])
 
 
@@ -891,9 +836,7 @@ def section_effect(at: ExperimentAtAnswer) -> Effect | None:
 
 
 def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
-    """Return `section_effect` for one of `SECTIONS` (index); None for a mesh from a file or whose
-    origin is stated, with another section, or in contact with obstacles.
-    """
+    """Return None for a mesh from a file or of known origin, or in contact with obstacles."""
     body = at.body
     is_stated = body.mesh_from is not None or body.inverse_equilibrium is not None
     if is_stated or not body.mesh.is_generated or at.iterate.transcription.experiment.obstacles:
@@ -1200,7 +1143,6 @@ def usual_deviations(bodies: Iterable[Body]) -> dict[str, float | None]:
     origins = {(body.made, body.mesh_from) for body in bodies} or {(None, None)}
 
     def usual(row: Deviation) -> float | None:
-        """Return the largest default of an assumption."""
         known = [row.usual_considered(*origin) for origin in origins]
         return max((each for each in known if each is not None), default=None)
 
@@ -1311,7 +1253,7 @@ class ExactIfNone:
 
     @staticmethod
     def _exact_if_none(value: Any) -> Any:
-        """Return the values of all assumptions in place of "none"; other values unchanged."""
+        """Return the values of all assumptions in place of "none"."""
         if isinstance(value, str) and value != "none":
             raise ValueError(
                 f'found "{value}"; expected a table, or "none" if all assumptions are exact'

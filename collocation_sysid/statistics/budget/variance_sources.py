@@ -442,7 +442,6 @@ def _line(
     error: DiscretisationError | None,
     parameters: Parameters,
 ) -> BudgetLine:
-    """Return the budget of one estimate that has a statistical interval."""
     assert estimate.statistical95 is not None
     linear, bounds = parameters.scale_and_bounds(name)
     ends = estimate.statistical95
@@ -503,7 +502,6 @@ def _variance(at: IntervalCoordinate, middle: float, ends: Interval) -> float:
 
 
 def _ranked(shares: Mapping[str, float]) -> dict[str, float]:
-    """Return a copy of shares of a variance, the largest first; equal shares keep their order."""
     return dict(sorted(shares.items(), key=lambda part: -part[1]))
 
 

@@ -110,7 +110,6 @@ def initial_motion_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _loads_change(experiment: Experiment) -> bool:
-    """Return whether forces or point masses change within the recording."""
     loads = (
         experiment.declared_node_forces_n(experiment.t_s),
         experiment.point_mass_at_nodes_kg(experiment.t_s),

@@ -94,7 +94,6 @@ def with_laws(body: Body, material: Material | None, damping: DampingLaw | None)
 
 
 def _likely_mistakes(body: Body) -> Iterator[Deviation]:
-    """Yield the likely mistakes about a body; the name of a row is its hypothesis' code."""
     materials = ("", *other_materials(body))
     dampings = ("", *other_dampings(body))
     for laws in [(m, d) for m in materials for d in dampings][1:]:
@@ -109,8 +108,6 @@ def _likely_mistakes(body: Body) -> Iterator[Deviation]:
 
 
 def _other_laws(material: str, damping: str) -> Deviation:
-    """Return the row of other laws with the same constants, by their names, "" for the stated one."""
-
     def effect(at: ExperimentAtAnswer, _: int) -> Effect:
         other = with_laws(at.stress_free_body, MATERIALS.get(material), DAMPINGS.get(damping))
         return Effect(at.internal_n(body=other) - at.internal_force_n)
@@ -125,8 +122,6 @@ def _other_laws(material: str, damping: str) -> Deviation:
 
 
 def _other_width(axis: int) -> Deviation:
-    """Return the row of a body that is wider along an axis, as a share of the width."""
-
     def effect(at: ExperimentAtAnswer, _: int) -> Effect:
         moved_m = np.zeros_like(at.body.nodes_m)
         points_m = at.body.nodes_m
@@ -146,13 +141,12 @@ def _other_width(axis: int) -> Deviation:
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
-    """Return the effect of a mesh made under the whole weight along an axis (index)."""
     sag = sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
     return Effect(at.force_change_by_reference(sag))
 
 
 def _stress_free(experiment: Experiment, amplitudes: Array) -> Correction:
-    """Return the experiment with the mesh made under gravity; None unless of the whole weight."""
+    """Return None unless the mesh was made under the whole weight."""
     share = float(np.linalg.norm(amplitudes))
     if not WHOLE_WEIGHT[0] < share < WHOLE_WEIGHT[1]:
         return None
@@ -164,7 +158,6 @@ def _stress_free(experiment: Experiment, amplitudes: Array) -> Correction:
 
 
 def _of_other_section(experiment: Experiment, _: Array) -> Correction:
-    """Return the experiment with a round section in place of a square one, or the reverse."""
     other = with_other_section(experiment)
     if other is None:
         return None
@@ -184,7 +177,7 @@ REST_SHAPE = Deviation("rest-shape", "1", axes="x y z", effect=_scan_effect, cor
 
 
 def _is_uniform(body: Body) -> bool:
-    """Return whether a body consists of one part without a field, so that it can be made again."""
+    """Return whether the body has one part without a field, so that it can be made again."""
     return len(body.parts) == 1 and all(part.field is None for part in body.parts)
 
 
@@ -332,8 +325,6 @@ def mirrored_meshes(experiment: Experiment) -> Iterator[Deviation]:
 
 
 def _mirrored(axis: int, factors: Array, code: str) -> Deviation:
-    """Return the row of a mesh that is mirrored along an axis: multiplied by factors (3,)."""
-
     def corrected(experiment: Experiment, _: Array) -> Correction:
         other = with_shape(experiment, factors)
         return other and (other, {"axis": AXES[axis]})
@@ -342,7 +333,6 @@ def _mirrored(axis: int, factors: Array, code: str) -> Deviation:
 
 
 def _middle_of_grasps_m(experiment: Experiment) -> Array:
-    """Return the mean position (3,) of the grasped nodes in the mesh [m]."""
     nodes = np.unique(np.concatenate([grasp.nodes for grasp in experiment.body_grasps]))
     return experiment.body.nodes_m[nodes].mean(axis=0)
 
@@ -392,7 +382,7 @@ def _made_again(
     mass_kg: float,
     rest_shape: UnderGravity | None = None,
 ) -> Experiment | None:
-    """Return the experiment with points (n, 3) of the mesh elsewhere; None if it is not valid."""
+    """Return the experiment with other points (n, 3); None if it is not valid."""
     body = experiment.body
     (part,) = body.parts
     try:

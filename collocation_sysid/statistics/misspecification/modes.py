@@ -198,7 +198,6 @@ class ModalComparison:
         return self._misfit_with(self._response_at_implied_places(declared), declared)
 
     def _misfit_with(self, response: ModalResponse, declared: DeclaredMotion) -> float:
-        """Return the misfit [m] of a description as predicted by a response."""
         return float(self._misfits_m(declared, response.predict(declared)).min())
 
     def _response_at_implied_places(self, declared: DeclaredMotion) -> ModalResponse:
@@ -226,7 +225,6 @@ class ModalComparison:
 
     @cached_property
     def _located_body(self) -> LocatedBody:
-        """The undeformed body, prepared for locating points in it."""
         return LocatedBody(self.experiment.body.nodes_m, self.experiment.body)
 
     def best_prediction(self, declared: DeclaredMotion) -> Array:
@@ -264,11 +262,9 @@ class ModalComparison:
             )
 
     def _other_axes(self) -> Iterator[Hypothesis]:
-        """Yield the hypotheses of other axes of the tracks that fit far better by the modes."""
         predicted = self.response.predict(self.declared)
 
         def remaining_misfit(tracks_m: Array) -> float:
-            """Return the misfit [m] from the best prediction."""
             turned = replace(self.declared, tracks_m=tracks_m)
             return float(self._misfits_m(turned, predicted).min())
 
@@ -325,7 +321,6 @@ class ModalComparison:
             )
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield that markers have each other's names, if that fits far better."""
         declared = self.declared
         names = self.experiment.markers.names
         squares = np.sum(
@@ -402,7 +397,6 @@ def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 
 
 def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Yield inverted poses, inverted rotations and other quaternion orders, untested."""
     poses = declared.without_first_motion()
     inverse = poses.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, poses.translations_m)
@@ -428,7 +422,6 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
 def _unit_hypotheses(
     declared: DeclaredMotion, what: str, who: str, section: str
 ) -> Iterator[Hypothesis]:
-    """Yield untested hypotheses that an attribute of the description is in another unit of length."""
     key = f"{section}.length_unit"
     for factor, unit in UNITS.items():
         remedy = f'set {key} = "{unit}"' if unit else f"check {key}"

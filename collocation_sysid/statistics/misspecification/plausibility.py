@@ -125,7 +125,6 @@ def density_concerns(body: Body) -> list[Concern]:
 
 
 def _likely_section(ratio: float) -> str:
-    """Return what a ratio of the density in the mesh to the known one indicates, for a message."""
     for meshed, real, expected in (("square", "round", np.pi / 4), ("round", "square", 4 / np.pi)):
         if abs(ratio / expected - 1) < SECTION_RATIO:
             return f"a {real} section is meshed as a {meshed} one of the same width"
@@ -133,7 +132,6 @@ def _likely_section(ratio: float) -> str:
 
 
 def _likely_length(body: Body, *, too_large: bool) -> str:
-    """Return what to check of a body that is too large or too small, for a message."""
     if body.mesh.is_generated:
         return "its lengths, which are in metres"
     unit = 'likely "mm"' if too_large else "the mesh may be in metres already"
@@ -141,7 +139,6 @@ def _likely_length(body: Body, *, too_large: bool) -> str:
 
 
 def _likely_density(body: Body, density_kg_m3: float, size_m: float) -> str:
-    """Return what is wrong with an implausible density, for a message."""
     thin, dense = DENSITIES_KG_M3
     is_low = density_kg_m3 < thin
     if body.has_declared_mass and (size_m > SIZES_M[1] if is_low else size_m < SIZES_M[0]):
@@ -169,7 +166,7 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
 
 def _excess_factor(value: float, limits: tuple[float, float]) -> float:
-    """Return the factor by which a positive value is outside limits; at most 1 inside."""
+    """Return the factor by which a value is outside limits; at most 1 inside."""
     return max(limits[0] / value, value / limits[1])
 
 
@@ -333,7 +330,6 @@ def _changes(values: Array) -> bool:
 
 
 def _marker_box_m(experiment: Experiment) -> Array:
-    """Return the corners (2, 3) of the bounding box of the markers' places [m]."""
     places = experiment.markers.predict_positions(experiment.body.nodes_m)
     return np.vstack([places.min(axis=0), places.max(axis=0)])
 
@@ -365,7 +361,6 @@ def step_sizes(x: Array, t_s: Array | None = None) -> Array:
 
 
 def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hypothesis]:
-    """Yield the largest jump of points carried by the poses that markers do not follow."""
     sizes = step_sizes(moved_m).max(axis=1)
     k = int(sizes.argmax())
     markers = step_sizes(experiment.markers.positions_at_samples_m)[k]
@@ -379,7 +374,6 @@ def _pose_jump_hypotheses(experiment: Experiment, moved_m: Array) -> Iterator[Hy
 
 
 def _slip_hypotheses(experiment: Experiment, held: Container[str]) -> Iterator[Hypothesis]:
-    """Yield a hypothesis for each marker that steps alone and stays displaced, unless it is `held`."""
     markers = experiment.markers
     tracks_m = markers.positions_at_samples_m
     sizes = step_sizes(tracks_m)

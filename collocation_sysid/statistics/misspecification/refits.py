@@ -142,9 +142,7 @@ def motion_misspecifications(
 
 
 def _is_reproduced(hypothesis: Hypothesis, experiment: Experiment, residual_m: Array) -> bool:
-    """Return whether a step of a marker or of all markers is a motion of the fitted body: the
-    residuals (T, M, 3) [m] of these markers are everywhere below `REPRODUCED` times the step.
-    """
+    """Return whether all residuals (T, M, 3) [m] are below `REPRODUCED` times the step."""
     if hypothesis.cause not in ("marker-slip", "markers-jump") or "by_mm" not in hypothesis.data:
         return False
     names = experiment.markers.names
@@ -252,7 +250,6 @@ def _refit_hypotheses(
 def _corrected_again(
     hypothesis: Hypothesis, alone: _Refitter, trial: HypothesisTest
 ) -> Iterator[Hypothesis]:
-    """Yield a hypothesis about a sensor, corrected again beside another linear step."""
     refitted = alone.fit(hypothesis.corrected)
     if refitted is not None and (hypothesis.remaining or 0.0) > 1.0:
         again = sensor_hypotheses(refitted, NOISE, declared=alone.declared)
@@ -301,7 +298,6 @@ def _named_alone_or_together(
 
 
 def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return hypotheses as one, as likely as the likeliest, with their messages in order."""
     if not hypotheses:
         return []
     texts = (replace(each, subject="", corrected=None).message for each in hypotheses)
@@ -310,7 +306,6 @@ def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> Iterator[Hypothesis]:
-    """Yield the direction of gravity that suits the natural modes best."""
     others = gravity_hypotheses(comparison.declared)
     nearest = min(others, key=lambda each: comparison.misfit_m(each.corrected), default=None)
     if nearest is not None:
@@ -334,12 +329,7 @@ def _unloading(solution: Solution) -> Deviation:
 
 
 def _slip(fitted_m: Array) -> Deviation:
-    """Return the row of a marker that slipped, that whose residuals change most abruptly; without
-    it the marker is not fitted. `fitted_m` (T, M, 3) are the fitted positions of markers [m].
-
-    It is impossible if two means explain no marker's residuals better than one by the factor
-    `SLIP`, and for a single marker.
-    """
+    """Return an impossible row if two means explain no residuals `SLIP` times better than one."""
 
     def corrected(experiment: Experiment, _: Array) -> Correction:
         residual = _residual(experiment, fitted_m)
@@ -364,9 +354,7 @@ def _slip(fitted_m: Array) -> Deviation:
 
 
 def _largest_step(residual: Array) -> tuple[float, int]:
-    """Return the factor by which two means explain residuals (T, 3) better than one, and the index
-    of the sample at which the second begins; 1 and 0 for too few samples. NaN is ignored.
-    """
+    """Return how much better two means explain residuals (T, 3) than one, and where they change."""
     present = np.flatnonzero(np.isfinite(residual[:, 0]))
     if len(present) < 2 * SHORTEST:
         return 1.0, 0
@@ -418,20 +406,16 @@ class _Refitter:
             self.known[declared] = solution
 
     def fit(self, experiment: Experiment) -> Solution | None:
-        """Return the fit of an experiment, cached; None if there is none or no sweeps are left."""
         if experiment not in self.known:
             self.known[experiment] = self._fit(experiment)
         return self.known[experiment]
 
     def discrepancy_after_refit(self, corrected: Experiment | LinearCorrection) -> float | None:
-        """Return the discrepancy after a refit or linear correction; None without fit."""
         fitted, share = self._fit_and_share(corrected)
         return None if fitted is None else _discrepancy(fitted) * float(np.sqrt(share))
 
     def loss_after_refit(self, corrected: Experiment | LinearCorrection) -> float:
-        """Return the loss with priors after a refit, or with a linear correction, with the expected
-        loss of measurements that the corrected experiment leaves out; infinite if there is no fit.
-        """
+        """Return the loss with that expected of measurements left out; infinite without a fit."""
         fitted, share = self._fit_and_share(corrected)
         if fitted is None:
             return np.inf
@@ -443,16 +427,12 @@ class _Refitter:
     def _fit_and_share(
         self, corrected: Experiment | LinearCorrection
     ) -> tuple[Solution | None, float]:
-        """Return the fit, and the share of its χ² that a linear correction leaves."""
         if isinstance(corrected, LinearCorrection):
             return self.fit(self.declared), corrected.share
         return self.fit(corrected), 1.0
 
     def _fit(self, experiment: Experiment) -> Solution | None:
-        """Return the fit of one experiment, and subtract its sweeps from those allowed.
-
-        None if none are left, or the fit fails; a fit that reaches its limit of iterations counts.
-        """
+        """Return None if no sweeps are left or the fit fails; one that reaches its limit counts."""
         if self.sweeps <= 0:
             return None
         is_far = experiment in self.longer
@@ -597,11 +577,7 @@ def _lag_s(fitted: Solution) -> float:
 
 
 def _other_layer(deeper: bool) -> Deviation:
-    """Return the row of grasps that hold one layer of elements more or less than stated.
-
-    Deeper grasps hold all nodes of the elements that they touch; less deep ones leave out the nodes
-    of elements with a free node. A grasp holds at least three nodes, and not all.
-    """
+    """Return the row of grasps of at least three nodes, and not of all."""
 
     def corrected(experiment: Experiment, _: Array) -> Correction:
         cells = experiment.body.cells
@@ -630,7 +606,6 @@ GRASP_LAYERS = (_other_layer(deeper=True), _other_layer(deeper=False))
 
 
 def _residual(experiment: Experiment, predicted_m: Array) -> Array:
-    """Return predicted less measured markers (T, M, 3) [m], NaN where missing."""
     return np.where(
         experiment.markers.is_measured, predicted_m - experiment.markers.positions_m, np.nan
     )

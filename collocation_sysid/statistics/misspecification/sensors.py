@@ -145,7 +145,6 @@ def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]
 
 
 def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
-    """Yield the order or signs of the axes that are clearly nearest to the prediction."""
     measured = sensor.measured_values
 
     def misfit(values: Array) -> float:

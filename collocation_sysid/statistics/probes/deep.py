@@ -105,7 +105,6 @@ def deep_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
 
 
 def _window_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield the refits of each third of the time with enough measurements."""
     for k, name in enumerate(WINDOWS):
         cuts = [_third(block, k) for block in at.fit.blocks]
         blocks = [_restrict(block, cut) for block, cut in zip(at.fit.blocks, cuts, strict=True)]
@@ -114,13 +113,11 @@ def _window_probes(at: SolvedFit) -> Iterator[Probe]:
 
 
 def _third(block: ResidualBlock, k: int) -> slice:
-    """Return the slice of third k of a block's samples."""
     ends = np.round(np.linspace(0, len(block.t_s), len(WINDOWS) + 1)).astype(int)
     return slice(int(ends[k]), int(ends[k + 1]))
 
 
 def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
-    """Return a copy of the block with the samples in the slice `cut` only."""
     own = ("t_s", "is_present", "residual", "jacobian", "misfit", "components")
     there = {name: each[cut] for name in own if (each := getattr(block, name)) is not None}
     shaken = block.disturbances
@@ -128,7 +125,6 @@ def _restrict(block: ResidualBlock, cut: slice) -> ResidualBlock:
 
 
 def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
-    """Yield the refits of single recordings with enough measurements, if several."""
     if len(blocks_by_recording(at.fit)) < 2:
         return
     for alone, step in single_fits(at.fit):
@@ -138,7 +134,6 @@ def _recording_probes(at: SolvedFit) -> Iterator[Probe]:
 def _part_probe(
     at: SolvedFit, kind: Kind, name: str, alone: LinearisedFit, step: Array
 ) -> Iterator[Probe]:
-    """Yield the probe of a part of the data, unless it has fewer measurements than parameters."""
     if alone.measurement_count <= len(alone.names):
         return
     uncertainty = at.uncertainty_of_refit(
@@ -150,11 +145,7 @@ def _part_probe(
 
 
 def _with_significant_moves(probe: Probe, limit: float) -> Probe:
-    """Return a copy of the probe with the names, in `sentences`, of the estimates that differ by
-    more than `limit` of their standard errors.
-
-    A part of the data differs from all data with less than its own error bar (Hausman 1978).
-    """
+    """Return significant moves: a part differs by less than its own error bar (Hausman 1978)."""
     significant = (
         n for n, move in probe.moves.items() if abs(move.change) > limit * move.std_error
     )

@@ -115,10 +115,7 @@ def compute_profile(
         return float(np.clip(value * np.exp(way) if is_log else value + way, *bounds))
 
     def rise(way: float) -> float:
-        """Return √(rise of the loss over the threshold), at most √`HIGHEST`, less one; nearly
-        linear in `way`, the change of the parameter on its scale. Values within half of
-        `PRECISION` are zero.
-        """
+        """Return √(rise / threshold) − 1, nearly linear; zero within half of `PRECISION`."""
         trial = moved(way)
         if trial not in losses_by_value:
             try:
@@ -155,7 +152,7 @@ def compute_profile(
 
 
 def _find_end(rise: Callable[[float], float], step: float, bound: float) -> float | None:
-    """Return the change at which the loss has risen enough, on the side of `step`, or None."""
+    """Return the change on the side of `step` at which the loss has risen enough, or None."""
     inside = 0.0
     closest = min if step > 0 else max
     for _ in range(MOST_DOUBLINGS):
@@ -173,7 +170,6 @@ def _find_end(rise: Callable[[float], float], step: float, bound: float) -> floa
 def _message(
     parameter: str, interval: tuple[float | None, float | None], bounds: tuple[float, float]
 ) -> str:
-    """Return the message: two limits, one limit, or not identifiable."""
     lower, upper = interval
     how = "(95 %, profile likelihood)"
     if lower is not None and upper is not None:
@@ -319,7 +315,6 @@ class Refits:
 
 
 def _prior_loss(item: Parameter, value: float) -> float:
-    """Return the loss of the prior of a parameter at a value; 0 without a prior."""
     if item.prior is None:
         return 0.0
     mean, deviation = item.prior

@@ -143,7 +143,6 @@ class SolvedFit:
 
 
 def _share_of_interval(change: float, interval: tuple[float, float] | None) -> float | None:
-    """Return a change over the half width of an interval; None without one."""
     return None if interval is None else 2 * change / max(interval[1] - interval[0], 1e-300)
 
 
@@ -257,7 +256,7 @@ def relaxed_probe(fit: SolvedFit, name: str, wide: LinearisedFit, p: Array) -> P
 
 
 def _are_noise(uncertainty: Uncertainty) -> bool:
-    """Return whether the residuals of a fit are as small as noise, or not correlated in time."""
+    """Return whether residuals are as small as noise, or not correlated in time."""
     is_small = uncertainty.level.pooled <= NOISE**2
     dependence = uncertainty.dependence
     is_white = np.isfinite(dependence.lag1_deviation) and abs(dependence.lag1) <= PERSISTENT

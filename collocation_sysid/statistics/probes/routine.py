@@ -82,12 +82,7 @@ def routine_probes(solved_fit: SolvedFit) -> tuple[Probe, ...]:
 
 
 def _with_loose_fields(solved_fit: SolvedFit) -> SolvedFit | None:
-    """Return the fit with `WIDENING_OF_FIELDS` times wider priors of the coefficients of fields, at
-    its optimum; None without fields.
-
-    The prior of a field smooths it. What it smooths away is in the residuals, and an assumption that
-    is significant only there is a substitute for it.
-    """
+    """Return the fit with wider priors: what a prior smooths away is in the residuals."""
     items = solved_fit.collocation.parameters.items
     fields = [item for item in items if isinstance(item, FieldCoefficients)]
     coefficients = {each.name for item in fields for each in item.components}

@@ -401,7 +401,7 @@ def _autoregression_of(block: ResidualBlock, autocovariance: Array) -> Array:
 
 
 def _mean_sample_count(present: NDArray[np.bool_]) -> float:
-    """Return the mean number of samples of channels that have any; `present` (T, 3M)."""
+    """Return the mean over channels that have any samples; `present` (T, 3M)."""
     return float(present.sum() / max(1, present.any(axis=0).sum()))
 
 

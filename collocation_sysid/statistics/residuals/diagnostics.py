@@ -109,7 +109,6 @@ def _diagnose_marker(
     level: NoiseLevel,
     outliers: Mapping[str, Outlier],
 ) -> MarkerDiagnosis:
-    """Return the diagnosis of one marker of a block."""
     present = block.is_present[:, marker]
     name = f"{block.name}/{block.marker_names[marker]}"
     residual = block.residual[:, marker] * block.sigma_m[marker]
@@ -154,19 +153,14 @@ def _diagnose_marker(
 
 
 def _rms_m(block: ResidualBlock, marker: int) -> float:
-    """Return the RMS distance [m] of a marker from its measurements, outliers included."""
+    """Return the RMS distance [m], outliers included."""
     misfit = block.residual if block.misfit is None else block.misfit
     squares = np.sum(misfit[:, marker] ** 2) / block.is_present[:, marker].sum()
     return float(block.sigma_m[marker] * np.sqrt(squares))
 
 
 def _lag1(varying: Array, present: NDArray[np.bool_]) -> float:
-    """Return the autocorrelation of consecutive present samples of residuals (T, 3) about their
-    mean, pooled over the axes; 0 without pairs or power.
-
-    `varying` (T, 3) are the residuals less their mean, zero where missing; `present` (T,) is
-    whether there is a sample.
-    """
+    """Return a mean over axes of residuals (T, 3) less their mean; 0 without pairs or power."""
     pairs = np.sum(present[1:] & present[:-1])
     samples = present.sum()
     power = np.sum(varying**2)
@@ -207,7 +201,6 @@ def _message(
     motion: Array,
     estimated: tuple[bool, bool],
 ) -> str:
-    """Return the message for a marker without outlier: the likely cause of its residuals."""
     t_s = block.t_s
     name = f"{diagnosis.experiment}/{diagnosis.marker}"
     size = f"{1e3 * diagnosis.rms_m:.2g} mm RMS"
@@ -248,7 +241,6 @@ def _message(
 
 
 def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
-    """Return the description of uncorrelated residuals by their size over σ."""
     factor = diagnosis.noise_factor
     chance = normal_isf(SIGNIFICANCE / 2) / np.sqrt(6 * diagnosis.samples)
     if factor > max(LARGEST_AGREEING_RATIO, 1 + chance):
@@ -259,7 +251,6 @@ def _white_noise_message(diagnosis: MarkerDiagnosis) -> str:
 
 
 def _oscillation_message(diagnosis: MarkerDiagnosis, t_s: Array, motion: Array) -> str:
-    """Return a slow drift, or the frequency compared with that of the motion."""
     share = f"{100 * diagnosis.oscillating_share:.0f} % of the squared residuals"
     record_s = (t_s[1] - t_s[0]) * len(t_s)
     if diagnosis.frequency_hz * record_s < FEWEST_PERIODS:
@@ -361,9 +352,6 @@ def _find_outlier(block: ResidualBlock, marker: int, significance: float) -> Out
 
 
 def _without_sample(block: ResidualBlock, marker: int, sample: int) -> ResidualBlock:
-    """Return a copy of the block without one sample of a marker, both given by index: it counts as
-    missing.
-    """
     is_included: Mask = np.ones(block.is_present.shape, dtype=bool)
     is_included[sample, marker] = False
     each = is_included[..., None]

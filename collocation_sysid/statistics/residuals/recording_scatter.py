@@ -192,7 +192,6 @@ def compare_recordings(
 
 
 def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], excess: Array) -> Array:
-    """Return `RecordingComparison.sensitivities` (p, nq n)."""
     own = [least_squares_of_blocks(fit, blocks_by_recording(fit)[name]) for name in names]
     each = np.array([o.information for o in own])
     scores = np.array([o.score for o in own])
