@@ -423,7 +423,7 @@ class ReducedSearch:
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
             # The first step tells nothing of the rate of convergence.
-            rate = min(1.0, length / previous) if previous < np.inf else 1.0
+            rate = min(1.0, length / previous) if 0.0 < previous < np.inf else 1.0
             if is_last and is_full_step and length * rate <= SAFETY * tolerance:
                 final_positions = horizon.extrapolate(point, step)
                 summaries = horizon.fit_summaries(point.p + step, final_positions)

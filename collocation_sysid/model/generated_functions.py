@@ -81,19 +81,11 @@ class GeneratedFunction:
         mask[ca.jacobian(y, u).sparsity().get_col()] = True
         return mask
 
-    def depends_on_datum(self, datum: int) -> bool:
-        """Return whether any value y depends structurally on the datum with this index; the answer
-        is kept.
-        """
-        _, data, y = self._symbols
-        if datum not in self._datum_dependence:
-            self._datum_dependence[datum] = ca.depends_on(y, data[datum])
-        return self._datum_dependence[datum]
-
     @cached_property
-    def _datum_dependence(self) -> dict[int, bool]:
-        """Results of `depends_on_datum` by index of the datum, filled on demand."""
-        return {}
+    def depends_on_first_datum(self) -> bool:
+        """Whether any value y depends structurally on the first datum, the time of a force."""
+        _, data, y = self._symbols
+        return ca.depends_on(y, data[0])
 
     @cached_property
     def is_linear(self) -> bool:

@@ -428,14 +428,6 @@ class Experiment:
             is_prescribed[np.ix_(holding, grasp.nodes, grasp.axis_indices)] = True
         return is_prescribed
 
-    def prescribed_positions(self, t_s: ArrayLike) -> Array:
-        """Return the coordinates of `prescribed_dofs` (g,) at the times `t_s` (T,), (T, g) [m]; NaN
-        at times at which a dof is free, which are not among the samples. Errors as of
-        `prescribed_displacements`.
-        """
-        positions = self.prescribed_displacements(t_s)[1]
-        return positions.reshape(len(positions), -1)[:, self.prescribed_dofs]
-
     def moving_node_mass_kg(self, t_s: ArrayLike) -> Array:
         """Return the mass that moves with each node at the times `t_s` (T,), as (T, n) [kg].
 

@@ -183,12 +183,9 @@ def add_figure_legend(figure: Figure, columns: int, **how: Any) -> None:
     figure.legend(handles, labels, ncols=columns, **place | how)
 
 
-def format_plain_numbers(axis: Axis, form: str = "g") -> None:
-    """Write the numbers of a logarithmic axis without powers of ten, and remove ticks between them.
-
-    `form` is the format of a number.
-    """
-    axis.set_major_formatter(FuncFormatter(lambda value, _: format(value, form)))
+def format_plain_numbers(axis: Axis) -> None:
+    """Write the numbers of a logarithmic axis without powers of ten, and remove ticks between them."""
+    axis.set_major_formatter(FuncFormatter(lambda value, _: format(value, "g")))
     axis.set_minor_locator(NullLocator())
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from collocation_sysid.common.array_types import Array
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Box
@@ -315,3 +316,9 @@ def pressed_cube(steps: int = 5, friction: float | str = 0.0, **changes) -> Expe
     markers = vertex_markers(body, nodes_where(body, 2, EDGE_M), t_s)
     made = {"grasps": [held, ball, plate], "markers": markers, "name": "pressed cube"}
     return replace(cube, **(made | changes))
+
+
+def prescribed_positions(experiment: Experiment, t_s: ArrayLike) -> Array:
+    """Coordinates of the prescribed dofs (g,) at some times, (T, g); NaN where a dof is free."""
+    positions = experiment.prescribed_displacements(t_s)[1]
+    return positions.reshape(len(positions), -1)[:, experiment.prescribed_dofs]

@@ -17,6 +17,7 @@ from kit.problems import (
     cube_with_nuisance,
     hung_cube,
     measured,
+    prescribed_positions,
     some_point,
 )
 
@@ -145,7 +146,7 @@ def test_held_nodes_are_bound_to_the_grasp(make):
     collocation = Collocation([make()], GUESS, substeps=2)
     transcription = collocation.transcriptions[0]
     (lower,), (upper,) = (collocation.unpack(bound)[1] for bound in collocation.bounds())
-    held = transcription.experiment.prescribed_positions(transcription.dynamics.t_s)
+    held = prescribed_positions(transcription.experiment, transcription.dynamics.t_s)
     np.testing.assert_allclose(
         lower[:, transcription.prescribed_dofs], held, rtol=1e-14, atol=1e-17
     )

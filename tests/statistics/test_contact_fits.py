@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from kit.pokes import DEPTHS_M, FLAT, SIGMA_N, SMALL, TRUTH, poked
-from kit.problems import GUESS, measured, pressed_cube
+from kit.problems import GUESS, measured, prescribed_positions, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
@@ -242,8 +242,8 @@ def test_a_forward_simulation_uses_the_estimated_place_of_an_obstacle(unknown, z
         change_m = (
             transcription.prescribed_motion.evaluate_at(phi).positions_m - as_stated.positions_m
         )
-        simulated_m = transcription.corrected_experiment(phi).prescribed_positions(
-            transcription.dynamics.t_s
+        simulated_m = prescribed_positions(
+            transcription.corrected_experiment(phi), transcription.dynamics.t_s
         )
         assert np.abs(change_m).max() > 1e-6
         np.testing.assert_allclose(

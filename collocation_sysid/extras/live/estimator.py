@@ -231,7 +231,7 @@ def _only_experiment(problem: Problem) -> Experiment:
     loads = (experiment.point_mass_at_nodes_kg, experiment.declared_node_forces_n)
     is_constant = all(np.allclose(each, each[:1]) for each in (f(experiment.t_s) for f in loads))
     laws = [law_function(each.force, each.points.dofs) for each in experiment.body.placed_forces]
-    is_constant &= not any(law.depends_on_datum(0) for law in laws)
+    is_constant &= not any(law.depends_on_first_datum for law in laws)
     unsupported = {
         "a static experiment": experiment.is_static,
         'start = "given"': experiment.start == "given",
