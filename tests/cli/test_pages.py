@@ -31,7 +31,6 @@ from collocation_sysid.statistics.budget.variance_sources import source_label
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 from collocation_sysid.statistics.remedies import REMEDIES
 
-ROOT = Path(__file__).parents[2]
 CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve/no-start"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 
 import casadi as ca
 import numpy as np
@@ -89,11 +90,10 @@ LOADS = {
 }
 
 
-@pytest.mark.parametrize("load", LOADS)
 @pytest.mark.parametrize("name", POWER_LAWS)
-def test_stresses_are_the_closed_forms(name, load):
+def test_stresses_are_the_closed_forms(name):
     law = Law(name)
-    for stretch in (0.5, 0.8, 0.97, 1.0, 1.001, 1.3, 2.0, 2.8):
+    for load, stretch in product(LOADS, (0.5, 0.8, 0.97, 1.0, 1.001, 1.3, 2.0, 2.8)):
         stretches = LOADS[load](stretch)
         found = np.diag(law.piola(np.diag(stretches))) * stretches
         expected = expected_kirchhoff(name, stretches)

@@ -94,15 +94,15 @@ def test_zero_exponent_is_the_limit(traces):
 @pytest.mark.parametrize(
     "index", [(0,), (1,), (2,), (0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
 )
-@pytest.mark.parametrize("alpha", [-2.0, 1.3, 6.0])
-def test_partial_derivatives_agree_with_differences(traces, index, alpha):
-    values = np.array([*excesses(np.array([1.4, 0.8, 1 / 1.12])), alpha])
-    step = np.zeros(3)
-    step[index[-1]] = 1e-4
-    ends = [traces.evaluate(index[:-1], *(values + sign * step)) for sign in (1, -1)]
-    assert traces.evaluate(index, *values) == pytest.approx(
-        (ends[0] - ends[1]) / 2e-4, rel=2e-6, abs=1e-9
-    )
+def test_partial_derivatives_agree_with_differences(traces, index):
+    for alpha in (-2.0, 1.3, 6.0):
+        values = np.array([*excesses(np.array([1.4, 0.8, 1 / 1.12])), alpha])
+        step = np.zeros(3)
+        step[index[-1]] = 1e-4
+        ends = [traces.evaluate(index[:-1], *(values + sign * step)) for sign in (1, -1)]
+        assert traces.evaluate(index, *values) == pytest.approx(
+            (ends[0] - ends[1]) / 2e-4, rel=2e-6, abs=1e-9
+        )
 
 
 @pytest.mark.parametrize("index", [(0, 0, 0), (0, 0, 1), (0, 1, 2), (1, 2, 2)])

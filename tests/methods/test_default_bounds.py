@@ -334,8 +334,7 @@ def test_a_long_relaxation_time_is_found_beyond_the_default_bound():
 
 
 @pytest.mark.parametrize("name", sorted(KNOWN))
-@pytest.mark.parametrize("side", [0, 1])
-def test_a_bound_that_nobody_stated_is_widened_or_named_first(name, side):
+def test_a_bound_that_nobody_stated_is_widened_or_named_first(name):
     constant = KNOWN[name]
     item = Parameter(
         name,
@@ -344,13 +343,14 @@ def test_a_bound_that_nobody_stated_is_widened_or_named_first(name, side):
         scale=constant.scale,
         unit=constant.typical or 1.0,
     )
-    value = constant.bounds[side]
-    is_limit = constant.widest is not None and constant.widest[side] == value
-    assert is_default_bound(item, value) is not is_limit
-    if constant.widest is not None and not is_limit:
-        assert can_be_widened(item, value)
-        assert not can_be_widened(with_widest_bounds(item), constant.widest[side])
-        assert is_default_bound(with_widest_bounds(item), constant.widest[side])
+    for side in (0, 1):
+        value = constant.bounds[side]
+        is_limit = constant.widest is not None and constant.widest[side] == value
+        assert is_default_bound(item, value) is not is_limit
+        if constant.widest is not None and not is_limit:
+            assert can_be_widened(item, value)
+            assert not can_be_widened(with_widest_bounds(item), constant.widest[side])
+            assert is_default_bound(with_widest_bounds(item), constant.widest[side])
 
 
 @pytest.mark.parametrize("name", ["c01_pa", "lambda_pa", "mu_1_pa"])

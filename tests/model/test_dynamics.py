@@ -215,10 +215,6 @@ def energies(scheme: str, theta: np.ndarray) -> np.ndarray:
     return kinetic + np.array(elastic)
 
 
-def dofs_of(nodes: np.ndarray) -> np.ndarray:
-    return (3 * nodes[:, None] + np.arange(3)).ravel()
-
-
 @pytest.mark.parametrize("damping", [(0.0, 0.0), (0.002, 0.0), (0.0, 5.0), (0.002, 5.0)])
 @pytest.mark.parametrize("scheme", ["backward-euler", "bdf2"])
 def test_a_body_left_alone_never_gains_energy(scheme: str, damping: tuple[float, float]):

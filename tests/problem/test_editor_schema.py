@@ -21,6 +21,7 @@ from collocation_sysid.problem.editor_schema import (
 )
 from collocation_sysid.problem.new import TEMPLATES, create_problem
 from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.schema import ProblemFile
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = [
@@ -35,8 +36,9 @@ def first_line(file: Path) -> str:
 
 
 def validate(file: Path, schema: str) -> None:
-    content = tomllib.loads(file.read_text(encoding="utf-8"))
-    jsonschema.Draft202012Validator(json.loads(schema)).validate(content)
+    validator = jsonschema.Draft202012Validator
+    validator.check_schema(json.loads(schema))
+    validator(json.loads(schema)).validate(tomllib.loads(file.read_text(encoding="utf-8")))
 
 
 @pytest.mark.parametrize("kind", ["compression", "swing", "tension", "video"])
@@ -58,6 +60,7 @@ def test_a_shipped_problem_follows_the_schema_that_it_names(file):
     schema = file.parent / path
     assert schema.resolve() == ROOT / "problems" / SCHEMA_FILE
     validate(file, schema.read_text(encoding="utf-8"))
+    ProblemFile.model_validate(tomllib.loads(file.read_text(encoding="utf-8")))
 
 
 def test_a_misspelt_key_does_not_follow_the_schema(tmp_path):

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import casadi as ca
@@ -33,7 +31,6 @@ from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.reading import read_problem_file
-from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.runs.check import check_problem
@@ -514,21 +511,6 @@ def test_a_shipped_problem_loads_and_its_derivatives_agree(path):
             or each.depths
         )
     assert all(body.smallest_element_quality > 0.1 for body in findings.bodies)
-
-
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_a_shipped_problem_follows_the_schema(path):
-    content = tomllib.loads(path.read_text())
-    ProblemFile.model_validate(content)
-    schema_validator().validate(content)
-
-
-@cache
-def schema_validator():
-    jsonschema = pytest.importorskip("jsonschema")
-    schema = json.loads(json.dumps(ProblemFile.model_json_schema()))
-    jsonschema.Draft202012Validator.check_schema(schema)
-    return jsonschema.Draft202012Validator(schema)
 
 
 # What else a recording's table may say ------------------------------------------------------------

@@ -121,7 +121,7 @@ def swings(on_surface: bool) -> tuple[list[Experiment], np.ndarray]:
     return found, really
 
 
-@pytest.mark.parametrize("on_surface", [False, True], ids=["free", "on the surface"])
+@pytest.mark.parametrize("on_surface", [pytest.param(False, marks=pytest.mark.long), True])
 def test_markers_glued_once_are_found_once(on_surface: bool):
     together, really = swings(on_surface)
     solution = ReducedSpace()(Collocation(together, GUESS))
@@ -313,11 +313,10 @@ def test_a_file_shares_parameters_and_its_run_names_both(two: Path):
         ),
     ],
 )
-@pytest.mark.parametrize("command", ["check", "solve"])
-def test_a_file_that_shares_unshareable_keys_is_refused(two: Path, command, old, new, message: str):
+def test_a_file_that_shares_unshareable_keys_is_refused(two: Path, old, new, message: str):
     head, _, tail = (two / "problem.toml").read_text().rpartition(old)
     (two / "problem.toml").write_text(head + new + tail)
-    done = run_command(command, two / "problem.toml")
+    done = run_command("solve", two / "problem.toml")
     assert done.code == 2
     assert message in " ".join(done.err.split())
     assert "problem.toml" in done.err

@@ -124,8 +124,7 @@ def test_large_bodies_are_left_to_a_full_check():
     assert depth_image_hypotheses(problem, (), most_nodes=None)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("guess_pa", [5e4, 2e5, 1e6])
+@pytest.mark.parametrize(("seed", "guess_pa"), [(1, 5e4), (2, 2e5), (1, 1e6)])
 def test_times_that_are_right_are_not_doubted_far_from_the_truth(seed: int, guess_pa: float):
     assert from_motion(None, seed, guess_pa) == ()
 
