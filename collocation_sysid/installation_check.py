@@ -223,9 +223,7 @@ def optional_packages() -> Iterator[Extra]:
 
 
 def _requirements(extra: str) -> Iterator[Requirement]:
-    """Yield the requirements of an extra on this platform, without those of the package itself; or
-    those of the package itself for "".
-    """
+    """Yield the requirements of an extra on this platform; those of the package itself for ""."""
     from packaging.requirements import Requirement
 
     for text in stated_requirements():
@@ -243,7 +241,7 @@ def _requirements(extra: str) -> Iterator[Requirement]:
 
 
 def _finds_packaging() -> bool:
-    """Return whether the module is found; false also if it is blocked in `sys.modules`."""
+    """Return false also if the module is blocked in `sys.modules`."""
     try:
         return importlib.util.find_spec("packaging") is not None
     except ValueError:
@@ -251,7 +249,6 @@ def _finds_packaging() -> bool:
 
 
 def _dependency(requirement: Requirement) -> Dependency:
-    """Return a requirement with the installed version, and whether that is suitable."""
     try:
         installed = metadata.version(requirement.name)
     except metadata.PackageNotFoundError:
@@ -281,13 +278,7 @@ def available_solvers() -> Solvers | None:
 
 
 def _working_linear_solvers(names: Sequence[str]) -> Iterator[str]:
-    """Yield those of the named linear solvers with which IPOPT solves a small problem, in the given
-    order.
-
-    The problem is solved in other processes, because IPOPT crashes with some libraries that are
-    missing. After a crash a new process continues with the next solver; after a timeout of
-    `SOLVER_TIME_S` the remaining solvers are not tried.
-    """
+    """Solve in other processes, because IPOPT crashes with some libraries that are missing."""
     remaining = list(names)
     while remaining:
         try:
@@ -359,9 +350,7 @@ def thread_state() -> Threads:
 
 
 def _self_test_unless_missing(dependencies: Sequence[Dependency]) -> SelfTest:
-    """Return the outcome of the self test, which fails without an attempt if packages are missing;
-    any exception of the test is its outcome, not raised.
-    """
+    """Fail without an attempt if packages are missing; an exception is the outcome."""
     missing = [each.name for each in dependencies if each.installed is None]
     if missing:
         return SelfTest(False, f"not attempted: {', '.join(missing)} missing", time_s=0.0)

@@ -213,9 +213,7 @@ def run(
     searched_s = time.perf_counter()
 
     def timed(answer: Run) -> Run:
-        """Return the answer with the times of search and checks until now; a search with finer
-        steps counts as search.
-        """
+        """A search with finer steps counts as search."""
         finer_s = answer.solution.timing.total - solution.timing.total
         checks_s = time.perf_counter() - searched_s - finer_s
         return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
@@ -275,7 +273,6 @@ def run(
 
 
 def _with_estimated_lengths(problem: Problem, solution: Solution) -> Problem:
-    """Return the problem with the correlation lengths of its fields that the solve used."""
     return problem.with_lengths(
         {
             name: length_m
@@ -286,9 +283,6 @@ def _with_estimated_lengths(problem: Problem, solution: Solution) -> Problem:
 
 
 def _with_problem_notes(answer: Run) -> Run:
-    """Return the run with notes on rotations within time steps, on time steps for impacts, and on
-    material tests of a single kind, before its other notes.
-    """
     problem = answer.problem
     substeps = answer.solution.collocation.substeps
     coarse = (
@@ -307,9 +301,6 @@ def _with_problem_notes(answer: Run) -> Run:
 
 
 def _with_curved_intervals(answer: Run, fit: LinearisedFit) -> Run:
-    """Return the run with statistical intervals that follow the loss, and the effect of the step on
-    them, see `with_curved_intervals`.
-    """
     solution, known = answer.solution, answer.uncertainty
     assert known is not None
     combined = {name: each.combined_std_error for name, each in answer.estimates.items()}
@@ -324,9 +315,6 @@ def _with_curved_intervals(answer: Run, fit: LinearisedFit) -> Run:
 
 
 def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
-    """Return the run with the effect of the mesh on the estimates, to first order, or with a note
-    why it is unknown.
-    """
     say("estimating the error of the mesh")
     with counted_phase(StepUnit.TIME_STEP, _row_count(answer.solution)):
         refinement, note = estimate_mesh_error(
@@ -337,9 +325,6 @@ def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
 
 
 def _with_added_measurements(answer: Run, say: Log) -> Run:
-    """Return the run with the sensors or tests that would determine constants that are not, or of
-    which only a combination is.
-    """
     if not answer.vague_constants or answer.uncertainty is None:
         return answer
     say("predicting the effect of another measurement")
@@ -364,22 +349,13 @@ def _with_added_measurements(answer: Run, say: Log) -> Run:
 
 
 def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:
-    """Return the run with notes on constant offsets of the stresses of specimens after its other
-    notes; `fit` is its linearised fit.
-    """
     fitted = [each.experiment for each in answer.solution.collocation.transcriptions]
     offsets = stress_offset_notes(fit, fitted)
     return replace(answer, notes=(*answer.notes, *offsets))
 
 
 def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
-    """Return a solution with forward simulations, uncertainties and step error, and the linearised
-    fit.
-
-    The fit is None if the solution did not converge or cannot be linearised; the run then has
-    forward simulations only, and in the latter case a note. A problem without free parameters has a
-    fit and diagnoses of the residuals, but no uncertainties.
-    """
+    """The fit is None if the solution did not converge or cannot be linearised."""
     say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
     if not solution.status.converged:
@@ -418,9 +394,6 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
 
 
 def _changes(answer: Run, say: Log) -> ResidualChanges:
-    """Return the changes of the residuals of a run by the systematic effects and by the routine
-    probes; `say` is called with a text before.
-    """
     say("computing the effects of assumptions")
     solution = answer.solution
     deviations = _evaluated_deviations(answer.problem)
@@ -430,16 +403,13 @@ def _changes(answer: Run, say: Log) -> ResidualChanges:
 
 
 def _row_count(solution: Solution) -> int:
-    """Return the number of time steps in one sweep over all fitted experiments."""
     return sum(s.grid_times - s.dynamics.first_row for s in solution.collocation.transcriptions)
 
 
 def _sources(
     answer: Run, fit: LinearisedFit, known: Uncertainty, changes: ResidualChanges
 ) -> VarianceSources:
-    """Return the systematic contributions to the uncertainty, without effects of a deviation of
-    None, and the alternatives to assumptions.
-    """
+    """Deviations of None have no effect."""
     solution = answer.solution
     problem = answer.problem
     return VarianceSources.from_fit(
@@ -456,7 +426,6 @@ def _sources(
 
 
 def _ruler_notes(problem: Problem, sources: VarianceSources) -> Iterator[str]:
-    """Yield a note on each ruler that the data determine."""
     for name, (value, error) in sources.rulers.items():
         row = DEVIATIONS[name.partition(" ")[0]]
         deviation = problem.assumed_deviations[row.name] or 0.0
@@ -470,9 +439,7 @@ def _ruler_notes(problem: Problem, sources: VarianceSources) -> Iterator[str]:
 
 
 def _evaluated_deviations(problem: Problem) -> dict[str, float | None]:
-    """Return the deviations of all assumptions that are evaluated: those of the budget, of the
-    routine probes, and one unit of those whose alternative is reported, unless stated exact.
-    """
+    """Return deviations of the budget and the probes, and one unit of alternatives unless exact."""
     deviations = probed_deviations(problem.assumed_deviations)
     stated = vars(problem.uncertainty.assumptions)
     unstated = (row.name for row in ASSUMPTIONS if row.alternative and stated[row.name] is None)
@@ -495,12 +462,7 @@ def _solved_fit(answer: Run, fit: LinearisedFit, changes: ResidualChanges) -> So
 
 
 def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
-    """Return the run with a note and the residuals that deviations within the budget leave, if
-    there are concerns about the residuals or significant probes, and these deviations explain all
-    concerns about the residuals. Routine probes that do not remain beside them are then not
-    significant, and none is where residuals as small as noise may be those of the mesh in contact,
-    whose error is not known.
-    """
+    """Take back concerns and probes if deviations within the budget explain all residuals."""
     assert answer.uncertainty is not None
     concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
     is_contradicted = concerns or any(p.routine and is_alarming(p) for p in answer.probes)
@@ -533,9 +495,7 @@ def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
 
 
 def _probes(solved_fit: SolvedFit, say: Log, deep: bool) -> tuple[Probe, ...]:
-    """Return the routine probes, or for a `deep` check those of subsets and of every assumption,
-    with a text to `say` before.
-    """
+    """Return the routine probes; those of subsets and of every assumption if `deep`."""
     if not deep:
         return routine_probes_with_steps(solved_fit)
     say("refitting parts of the data, and with assumptions relaxed")
@@ -572,14 +532,7 @@ def _fine_enough(
     say: Log,
     scheduler: str | None,
 ) -> tuple[Run, LinearisedFit | None]:
-    """Return the run solved again with as many substeps as its uncertainties require, or `coarse`
-    itself if it has enough, or no step error.
-
-    The answer may already have several substeps, if it was started from such a run. A parameter
-    that ended at a bound has no standard error, and coarse steps may have driven it there: it
-    starts from its guess again. If every parameter ended at a bound, the largest number of substeps
-    is used.
-    """
+    """A parameter at a bound starts from its guess again: coarse steps may have driven it there."""
     if coarse.refinement is None or fit is None:
         return coarse, fit
     first = coarse.solution
@@ -620,7 +573,6 @@ def _fine_enough(
 def _solve_from_parameters(
     collocation: Collocation, p: Array, solver: Method, watch: Watch | None, scheduler: str | None
 ) -> Solution:
-    """Return the solution of a problem, started from a simulation at parameters p (np,)."""
     positions, failure = simulate_trajectories(collocation, p)
     if failure is not None:
         raise failure

@@ -75,9 +75,6 @@ def command_sources() -> dict[str, tuple[str, str]]:
 
 
 def _command_name(function: str) -> str:
-    """Return the name of the command that a function called `function` implements: hyphens in place
-    of underscores.
-    """
     return function.replace("_", "-")
 
 
@@ -88,15 +85,9 @@ class LazyCommands(TyperGroup):
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of all commands, in the order of their modules; the
-        context is not used.
-        """
         return [*command_sources()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command called `cmd_name`, or None if there is none; its module is imported.
-        The context is not used.
-        """
         if cmd_name not in command_sources():
             return None
         with error_console.status("starting"):  # on a terminal only; it takes a second
@@ -106,16 +97,7 @@ class LazyCommands(TyperGroup):
         return get_command_from_info(info, **how)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name and the command that the arguments `args` begin with, and the other
-        arguments.
-
-        Raises
-        ------
-        click.UsageError
-            For an unknown name, with a similar command or the commands that replace it; it ends the
-            program with exit code 2. While completions are computed, only a replaced command is
-            refused.
-        """
+        """Name a similar command for an unknown one."""
         if args and (replacement := REPLACED_COMMANDS.get(args[0])):
             ctx.fail(f"No such command {args[0]!r}: {replacement}.")
         if args and args[0] not in command_sources() and not ctx.resilient_parsing:
@@ -123,9 +105,6 @@ class LazyCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line on each command into the help, by the groups of `COMMAND_GROUPS`, to
-        `formatter`; the context is not used.
-        """
         sources = command_sources()
         for title, names in COMMAND_GROUPS.items():
             with formatter.section(title):
@@ -148,7 +127,6 @@ app = typer.Typer(
 
 
 def _print_version(is_requested: bool) -> None:
-    """Print the version and exit if the option was given; otherwise do nothing."""
     if is_requested:
         typer.echo(package_version())
         raise typer.Exit
@@ -163,13 +141,12 @@ def _root(
         ),
     ] = False,
 ) -> None:
-    """Do nothing: the options of the program itself act by their callbacks, before any command."""
+    """Do nothing: the options of the program itself act by their callbacks."""
     pass
 
 
 @cache
 def _root_command() -> Callable[..., Any]:
-    """Return the callable that parses the arguments and runs a command; made when first needed."""
     return get_command(app)
 
 
@@ -188,7 +165,6 @@ def main() -> None:
 
 
 def _run_command() -> None:
-    """Run the command of the arguments; the function ends with an exception in any case."""
     restore = heed_interrupts()
     if Path("matplotlibrc").is_file():
         # matplotlib obeys the one in the working folder when it is imported.
@@ -212,7 +188,6 @@ def _run_command() -> None:
 
 
 def _exit_with_error(kind: str, error: Exception, code: int) -> NoReturn:
-    """Print an error on stderr after the word `kind`, and raise `SystemExit` with `code`."""
     error_console.print(
         Text(f"{kind}: ", style="red").append(str(error), style="default"), soft_wrap=True
     )

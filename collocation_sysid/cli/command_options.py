@@ -96,12 +96,10 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[..., None]
     """
 
     def registered(function: Callable[..., None]) -> Callable[..., None]:
-        """Register the function in `group`, and return it unchanged."""
         kind = _options_of(function)
         parameters = [*_typer_parameters(kind)]
 
         def called(**values: Any) -> None:
-            """Run the command with the options of the command line, by name."""
             function(**vars(_options_from_values(kind, values)))
 
         called.__name__ = function.__name__
@@ -116,7 +114,6 @@ def command(group: typer.Typer, *examples: str) -> Callable[[Callable[..., None]
 
 
 def _options_of(function: Callable[..., None]) -> type:
-    """Return a validated dataclass whose fields are the parameters of a function."""
     hints = get_type_hints(function, include_extras=True)
     stated = inspect.signature(function).parameters
     defaults = {n: each.default for n, each in stated.items() if each.default is not each.empty}
@@ -125,7 +122,6 @@ def _options_of(function: Callable[..., None]) -> type:
 
 
 def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
-    """Yield the parameters of a command, from which typer makes its options."""
     documented = attributes(kind)
     for name, default, hint, marks in _typed_fields(kind):
         if is_dataclass(hint):
@@ -151,9 +147,7 @@ def _typer_parameters(kind: type) -> Iterator[inspect.Parameter]:
 
 
 def _option_names(field: str, default: Any, type_text: str = "") -> list[str]:
-    """Return the names of an option on the command line: those in `type_text`, and unless a long
-    one is among them the name of the field before them, with hyphens.
-    """
+    """Use the long name in `type_text`, or else that of the field with hyphens."""
     option = field.strip("_").replace("_", "-")
     names = [word for word in type_text.split() if word.startswith("-")]
     if not any(word.startswith("--") for word in names):
@@ -162,7 +156,6 @@ def _option_names(field: str, default: Any, type_text: str = "") -> list[str]:
 
 
 def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Return the options of a command from their values by name."""
     content = {
         name: _options_from_values(hint, values)  # type: ignore[arg-type]
         if is_dataclass(hint)
@@ -182,9 +175,7 @@ def _options_from_values(kind: type[T], values: Mapping[str, Any]) -> T:
 
 @cache
 def _typed_fields(kind: type) -> list[tuple[str, Any, Any, tuple[Any, ...]]]:
-    """Return name, default, type and annotations of each field, those of a class before its
-    bases'.
-    """
+    """Return name, default, type and annotations, those of a class before its bases'."""
     hints = get_type_hints(kind, include_extras=True)
     defaults = {field.name: field.default for field in fields(kind)}  # type: ignore[arg-type]
     order = (name for base in kind.__mro__ for name in inspect.get_annotations(base))

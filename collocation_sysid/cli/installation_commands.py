@@ -68,9 +68,6 @@ def installation_sections(report: InstallationReport) -> list[Shown]:
 
 
 def _requirement_text(dependency: Dependency) -> str:
-    """Return the range of required versions, empty for any; with the remedy where the installed one
-    is not suitable.
-    """
     if dependency.is_suitable:
         return dependency.required
     package = f"{dependency.name}{dependency.required}"
@@ -78,9 +75,6 @@ def _requirement_text(dependency: Dependency) -> str:
 
 
 def _solver_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the solvers, value by name; a single row if CasADi cannot be
-    imported.
-    """
     if report.solvers is None:
         return {"solvers": "unknown, because CasADi cannot be imported"}
     linear = ", ".join(report.solvers.ipopt_linear) or "none that works"
@@ -93,9 +87,6 @@ def _solver_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _kernel_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of the compiler and the cache of kernels, value by name; a single row
-    if llvmlite cannot be imported.
-    """
     kernels = report.kernels
     if kernels is None:
         return {
@@ -112,7 +103,6 @@ def _kernel_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _thread_rows(report: InstallationReport) -> dict[str, str]:
-    """Return the table rows of threads and memory, value by name."""
     threads = report.threads
     memory = number(threads.memory_mb and threads.memory_mb / 1e3, 3)
     return {
@@ -122,9 +112,6 @@ def _thread_rows(report: InstallationReport) -> dict[str, str]:
 
 
 def _conclusion(report: InstallationReport) -> Line:
-    """Return the outcome of the self test and of the whole check as a line: "good", or "doubtful"
-    if the installation does not work.
-    """
     test = report.self_test
     outcome = "passed" if test.is_passed else "FAILED"
     text = f"Self test {outcome} in {test.time_s:.1f} s: {test.message}."

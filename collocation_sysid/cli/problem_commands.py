@@ -208,9 +208,6 @@ def simulate(
 
 
 def _draw_instability(error: SimulationError, folder: Path) -> None:
-    """Write a picture of the mode in which the body loses its stability to instability.png in the
-    folder, which is made if necessary, and print its name on stderr.
-    """
     from ..result.figure_style import RESOLUTION_DPI
     from ..result.pictures.instability import instability_picture
 
@@ -280,9 +277,6 @@ def check(
 
 
 def _write_camera_overlays(problem: Problem, folder: Path, quiet: bool) -> None:
-    """Write a picture of each camera's first image with the undeformed body into the folder, and
-    print the names of the files. Progress is shown unless `quiet`.
-    """
     if not any(each.camera_names for each in problem.experiments):
         return
     from ..result.camera_overlays import OVERLAY_TEXT, save_overlays

@@ -184,7 +184,6 @@ def _print_export(
     as_json: bool,
     tables: Sequence[Table] = (),
 ) -> None:
-    """Print warnings, what the target cannot express, tables and the destination, or JSON."""
     if as_json:
         places = {"folder": str(destination.folder), "file": str(destination.main_file)}
         typer.echo(json_text({**places, **report}))
@@ -198,7 +197,6 @@ def _print_export(
 def _export_recording(
     run_folder: Path, destination: ExportDestination, experiment: str | None, quiet: bool
 ) -> Sequence[str]:
-    """Write the recording of a run for the Rerun viewer, and return what is missing in it."""
     from ..extras.export.rerun_recording import RECORDING_FILE, write_rerun
 
     destination.require_possible()

@@ -26,9 +26,7 @@ EveryS = Annotated[Positive, option("Seconds of new frames before each solve.", 
 def _updates(
     estimator: LiveEstimator, batches: Iterable[list[Frame]], every_s: float
 ) -> Iterator[LiveUpdate]:
-    """Add the frames of each batch, and yield the answers of solves, each with at least `every_s`
-    seconds of new frames; a recording that cannot be solved yet is reported once.
-    """
+    """Yield answers, each after `every_s` of frames; report once that nothing can be solved yet."""
     solved_s, newest_s, reported = None, -float("inf"), ""
     for batch in batches:
         for frame in batch:
@@ -54,9 +52,6 @@ def _follow(
     has_json: bool,
     quiet: bool = False,
 ) -> None:
-    """Print the answers of the solves, then the result of the complete recording; after Ctrl-C the
-    last answer is kept.
-    """
     from ..result.run_summary import run_summary
 
     last = None

@@ -200,7 +200,6 @@ def compare_models(
 
 
 def _single_method(text: str | None) -> str | None:
-    """Return the method named by --method, or None if the option is not used (`text` is None)."""
     if text is None:
         return None
     method, *others = parse_methods(text, "--method")
@@ -217,12 +216,7 @@ def _run_study(
     output: OutputOptions,
     yardstick: SuccessCriterion | None = None,
 ) -> None:
-    """Execute the runs that are not finished, write tables and a picture, and print the tables.
-
-    The folder is `study.out`, by default runs/NAME-KIND. With `study.dry_run` the planned runs
-    are only listed, with those that are finished marked, and nothing is written. Runs that fail do
-    not end the study: they are in the tables. Without any record no tables are written.
-    """
+    """Failed runs are in the tables; without any record no tables are written."""
     from ..extras.studies.progress import StudyProgress
     from ..extras.studies.tables import load_report, plan_table
 

@@ -27,9 +27,6 @@ class UnbrokenCode(CodeBlock):
     """A code block of Markdown whose lines are never broken."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the lines of the code, each indented by two spaces, whatever the width of the
-        console.
-        """
         for line in str(self.text).rstrip().splitlines():
             yield Text(f"  {line}", style="cyan", no_wrap=True, overflow="ignore")
 
@@ -148,9 +145,6 @@ def _known_topic(topic: str) -> str:
 
 
 def _key_table(name: str) -> Table:
-    """Return the table of the keys of the problem file with a name or path: path, values, default
-    and description.
-    """
     from ..problem.key_descriptions import find_keys
 
     rows = tuple((each.path, each.form, each.default, each.description) for each in find_keys(name))
@@ -159,9 +153,6 @@ def _key_table(name: str) -> Table:
 
 
 def _word_table(word: str) -> Table:
-    """Return the table of the constants with a name or symbol, of the rows of the uncertainty budget
-    with a label, of nuisance parameters, and of terms of the glossary: name, symbol and meaning.
-    """
     from ..fem.laws.constants import KNOWN, constants_with_symbol, unit_of
     from ..recording.nuisance import nuisances_called
     from ..statistics.budget.systematic_effects import ASSUMPTIONS
@@ -295,7 +286,6 @@ def new(
 
 
 def _methods_table() -> Table:
-    """Return the table of the methods: name, and the first line of the docstring."""
     from ..methods import METHODS, method_summary
 
     return Table(
@@ -304,9 +294,6 @@ def _methods_table() -> Table:
 
 
 def _options_table(method: str) -> list[Shown]:
-    """Return the description of a method's options for display: a summary, the heading of its table
-    in the problem file, and default, allowed values and meaning of each option.
-    """
     from ..methods import method_options_schema, method_summary
     from ..problem.solver_schema import table_heading
 
@@ -330,7 +317,6 @@ def _options_table(method: str) -> list[Shown]:
 
 
 def _default_text(option: Mapping[str, Any]) -> str:
-    """Return the default of an option as text, from its JSON schema; a tuple in brackets."""
     default = option["default"]
     items = default if isinstance(default, tuple) else [default]
     text = ", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in items)
@@ -338,9 +324,7 @@ def _default_text(option: Mapping[str, Any]) -> str:
 
 
 def _allowed_values_text(option: Mapping[str, Any]) -> str:
-    """Return the allowed values of an option in words, from its JSON schema, such as "number above
-    0"; for an array the words are about its items.
-    """
+    """Return words such as "number above 0"; for an array about its items."""
     if "enum" in option:
         return ", ".join(
             each if isinstance(each, str) else json.dumps(each) for each in option["enum"]

@@ -231,7 +231,6 @@ def _rubber(
     largest_stretch: float | None = None,
     is_exact: bool = False,
 ) -> Experiment:
-    """Return the experiment of a table of stretches and stresses of the package."""
     file = dataset_file(dataset, f"{name}.csv")
     table = read_specimen(file, SpecimenLayout(test=test, columns={}))
     limit = float("inf") if largest_stretch is None else largest_stretch

@@ -126,9 +126,7 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
 
 
 def _copy_file(file: Path, copy: Path, schema: str) -> None:
-    """Copy a file of a dataset; in a TOML file whose first line names a schema, that is replaced by
-    the address or file name `schema`.
-    """
+    """The schema that the first line of a TOML file names is replaced by `schema`."""
     if file.suffix == ".toml":
         text = file.read_text(encoding="utf-8")
         if text.startswith(_SCHEMA_COMMENT):

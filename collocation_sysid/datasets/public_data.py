@@ -159,7 +159,6 @@ def fetch(name: str) -> Path:
 
 
 def _download(name: str, collection: PublicCollection, folder: Path) -> None:
-    """Bring the files of a collection into a folder, unless they are there."""
     try:
         import pooch
     except ImportError as error:

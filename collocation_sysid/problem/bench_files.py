@@ -261,7 +261,6 @@ def bench_tables(
     tables: dict[str, BenchTable] = {}
 
     def table_of(layout: TableSection, t_s: Array) -> BenchTable:
-        """Return the table of the file of a layout; a new one has the times `t_s`."""
         name = table_name(section, layout)
         time_column = time_columns.get(name, usual_time)
         return tables.setdefault(name, BenchTable(t_s, time_column))

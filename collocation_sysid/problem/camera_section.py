@@ -63,7 +63,6 @@ class DepthSection(MeasurementSection, of=Depth):
     length_unit: Unit = "m"
 
     def read_times_s(self, folder: RecordingFolder, where: str) -> Array:
-        """Return the times of all images or clouds [s], see `_read_images`."""
         return self._read_images(folder, where)[1]
 
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> Depth:
@@ -109,12 +108,7 @@ class DepthSection(MeasurementSection, of=Depth):
             )
 
     def _read_images(self, folder: RecordingFolder, where: str) -> tuple[DepthFileContent, Array]:
-        """Return the content of the file or folder of the table, and the times of its images or
-        clouds [s].
-
-        Times are the stated ones, or those of the file; for equilibria, or a single image, without
-        times they are 0, 1, 2, …
-        """
+        """Return times that default to those of the file; of equilibria to 0, 1, 2, …"""
         file = folder.path / self.file
         if not file.is_dir():
             file = existing_file(folder.path, self.file, key=f"{where}.file")

@@ -108,7 +108,6 @@ class CodeLoader:
         """
 
         def is_row(value: Any) -> bool:
-            """Whether a value of the file is a nuisance parameter."""
             return isinstance(value, Deviation)
 
         key = "nuisance.own.file"
@@ -134,7 +133,6 @@ class CodeLoader:
         """
 
         def is_function(value: Any) -> bool:
-            """Whether a value of the file is callable or a `NodeForce`."""
             return callable(value) or isinstance(value, NodeForce)
 
         return self._load(file, name, key=key, kind="function", is_kind=is_function)
@@ -164,7 +162,7 @@ class CodeLoader:
     def _load(
         self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]
     ) -> tuple[Path, Any]:
-        """Run a file, which is done in every call, and return its path and the value with a name."""
+        """Run a file in every call, and return its path and the value with a name."""
         if not self.is_allowed:
             message = (
                 f"found the file {name}, which would be run as Python code; allow that with "

@@ -66,7 +66,6 @@ def with_declared_densities(
 
 
 def _with_guessed_density(region: RegionSection, parameters: Sections) -> RegionSection:
-    """Return a region with its density, or the guess of its parameter."""
     if region.density_kg_m3 is not None:
         return region
     guess = _guess(parameters, f"{region.name}.{DENSITY.name}")

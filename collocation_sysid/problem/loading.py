@@ -270,11 +270,7 @@ def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterator[None]:
-    """Context that adds file and table to errors that have no file.
-
-    Each `InputError` is replaced by a new one. Errors of another file keep it; an error of the
-    air's density is located in the table `environment` of this file.
-    """
+    """Add file and table to errors that have no file; the air's density is in `environment`."""
     try:
         yield
     except InputError as error:
@@ -307,7 +303,6 @@ def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
 
 
 def _generate_mesh(section: ObjectSection, edge_length_m: float) -> TetMesh:
-    """Return a mesh of the stated cylinder or box, with edges of about this length."""
     if (shape := section.cylinder) is not None:
         return cylinder_of_edge(
             shape.diameter_m, shape.height_m, edge_length_m=edge_length_m, quarter=shape.quarter
@@ -346,7 +341,6 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 
     def material(law: str | CodeSection | None, key: str) -> Any:
-        """Return a custom material for a table of a Python file, else the name."""
         return code.material(law, key) if isinstance(law, CodeSection) else law
 
     def branches(region: str | None) -> list[str]:
@@ -394,10 +388,7 @@ def _rest_shape(section: ObjectSection) -> UnderGravity | Literal["stress_free"]
 
 
 def _frictions(file: ProblemFile) -> tuple[Constant, ...]:
-    """Return the friction parameters that obstacles name, each once, in the order of the file;
-    frictions given as numbers are left out, and so are names that do not end with that of a
-    coefficient of friction.
-    """
+    """Return each named friction once, in the order of the file."""
     declared = (each.friction for section in file.recordings for each in section.obstacle)
     named = (one for one in declared if isinstance(one, str) and one.endswith(FRICTION.name))
     return tuple(dict.fromkeys(map(constant_named, named)))
@@ -423,11 +414,7 @@ def _as_parameter(name: str, section: ParameterSection | float) -> Unknown | Tie
 
 
 def _prior(section: PriorSection, linear: bool) -> tuple[float, float]:
-    """Return mean and standard deviation of a prior.
-
-    The deviation is absolute for a linear parameter, and relative to the mean otherwise; the one
-    that the section states is converted with the absolute mean if necessary.
-    """
+    """The deviation is absolute for a linear parameter, and relative to the mean otherwise."""
     size = abs(section.mean)
     if linear:
         return section.mean, section.deviation or (section.relative or 0.0) * size

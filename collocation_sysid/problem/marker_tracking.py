@@ -154,5 +154,4 @@ def _rigidity_note(
 
 
 def _mm(length_m: float) -> str:
-    """Return a length [m] as text in millimetres with three digits, such as "1.25 mm"."""
     return f"{1e3 * length_m:.3g} mm"

@@ -153,9 +153,7 @@ def own_tables() -> dict[str, type[MeasurementSection]]:
 
 
 def _type_of(entry: EntryPoint) -> Any:
-    """Return the type of a list of tables of another package; one that refuses every value with the
-    reason if the class cannot be imported, so that only problems with such a table are refused.
-    """
+    """Return a type; of a class that cannot be imported, one that refuses every value."""
     try:
         kind = entry.load()
         if issubclass(kind, MeasurementSection):

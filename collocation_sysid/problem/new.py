@@ -64,9 +64,7 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
 
 
 def _without_simulated_settings(text: str) -> str:
-    """Return a template without the tables that hold only for its simulated recording: those with
-    `SIMULATED_MARK` in a comment.
-    """
+    """Tables with `SIMULATED_MARK` in a comment hold only for the simulated recording."""
     paragraphs = text.split("\n\n")
     measured = [each for each in paragraphs if SIMULATED_MARK not in each]
     return "\n\n".join(measured).rstrip() + "\n"

@@ -23,7 +23,6 @@ KEYS = {key: list(rows) for key, rows in groupby(KINDS, key=lambda row: row.key)
 
 
 def _require_scope(word: str) -> str:
-    """Return "recording", "shared", or "shared" and a word; `ValueError` otherwise."""
     if word != "recording" and not re.fullmatch(SCOPE, word):
         raise ValueError(f'found {word!r}; expected "recording", {SCOPE_TEXT}')
     return word
@@ -68,9 +67,7 @@ class NuisancePriorSection(Scoped):
 
     @model_validator(mode="after")
     def _require_one_prior(self) -> NuisancePriorSection:
-        """Return the section itself; raise `ValueError` if no standard deviation is given, unless
-        the parameter has a default and another scope than "recording" is stated.
-        """
+        """A parameter with a default and another scope than "recording" needs no deviation."""
         priors = [key for key in type(self).model_fields if key != "scope"]
         if not used_keys(self, *priors) and (self.scope == "recording" or not self.has_default):
             expected = "one or both" if len(priors) > 1 else "it"
@@ -79,7 +76,6 @@ class NuisancePriorSection(Scoped):
 
 
 def _prior_section(key: str, rows: Sequence[Deviation]) -> type[NuisancePriorSection]:
-    """Return the class of the table of a key of [experiment.nuisance]."""
     # A prior that refers to another one needs it.
     missing = ... if any(row.reference is not None for row in rows) else None
     form: Any = Positive

@@ -31,17 +31,14 @@ from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
 def _unconverted(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
-    """Return the argument; a mapping is converted when the bodies are known."""
+    """A mapping is converted when the bodies are known."""
     return cast(Parameters, parameters)
 
 
 def _as_parameters(
     parameters: Parameters | Mapping[str, Unknown | Tied | float], experiments: Iterable[Experiment]
 ) -> Parameters:
-    """Return parameters as they are; a mapping by name is converted by `Parameters.from_mapping`
-    with the definitions of the constants of the bodies. Without a recording, γ_r and γ_m are 0 if
-    they are not stated.
-    """
+    """Without a recording, γ_r and γ_m of a mapping are 0 if they are not stated."""
     if isinstance(parameters, Parameters):
         return parameters
     if not isinstance(parameters, Mapping):
@@ -304,13 +301,6 @@ class Problem:
             )
 
     def _validate(self) -> None:
-        """Raise `InputError` if experiments, parameters and options do not fit together; return
-        nothing.
-
-        Checked are names of experiments, steps, constants of the bodies, stress-free shapes,
-        fields, scopes of nuisance parameters, scheme, time step of the forward simulation, method,
-        and names of profiles.
-        """
         names = [experiment.name for experiment in self.experiments]
         if not names:
             raise InputError("there is no experiment; expected at least one")
@@ -344,7 +334,6 @@ class Problem:
 
 
 def _require_plausible_noise(experiment: Experiment) -> None:
-    """Raise an `InputError` if the noise of the markers is larger than the body."""
     if not experiment.markers.sample_count:
         return
     sigma_m = float(np.min(experiment.markers.sigma_m))
@@ -368,7 +357,6 @@ def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None
 
 
 def _require_equal_fields(bodies: Iterable[Body]) -> None:
-    """Refuse bodies with fields of the same constant but other shapes."""
     shapes_by_name: dict[str, Array] = {}
     for part in (part for body in bodies for part in body.parts if part.field):
         assert part.field is not None
@@ -383,10 +371,7 @@ def _require_equal_fields(bodies: Iterable[Body]) -> None:
 def _with_free_densities(
     experiments: Iterable[Experiment], parameters: Parameters
 ) -> tuple[Experiment, ...]:
-    """Return the experiments in their order; where parameters name a density or the mass, with
-    copies of their bodies whose density follows from these parameters. Experiments without such
-    a body are the same objects.
-    """
+    """Experiments without such a body are the same objects."""
     bodies = {}
     experiments = tuple(experiments)
     for body in {id(e.body): e.body for e in experiments}.values():

@@ -138,7 +138,6 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
 
 
 def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
-    """Return the error for invalid TOML, with the line if it is stated."""
     reason, _, place = complaint.rpartition(" (at ")
     reason = _PLAINER.get(reason, reason)
     matched = re.match(r"line (\d+)", place)
@@ -157,12 +156,7 @@ def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
 
 
 def _apply_override(content: dict[str, Any], override: str) -> None:
-    """Set one value of the content of a problem file, in place, from "key=value"; missing tables
-    are created.
-
-    If a part of a table that an experiment has from [experiment_defaults] is set, the experiment
-    gets a copy of the complete table.
-    """
+    """An experiment gets a copy of a table of [experiment_defaults] of which a part is set."""
     key, equals, value = override.partition("=")
     key = key.strip()
     parts = key.split(".")
@@ -204,7 +198,7 @@ def _join_dotted_names(content: Any, parts: list[str]) -> list[str]:
 
 
 def _item_key(place: Any, part: str, key: str) -> str | int:
-    """Return the key in a table, or the index in a list, that a part of a dotted key refers to."""
+    """Return the key in a table, or the index in a list."""
     if isinstance(place, dict):
         return part
     if not isinstance(place, list):

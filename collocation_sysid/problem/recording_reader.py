@@ -158,7 +158,6 @@ class RecordingReader:
 
     @cached_property
     def _frames(self) -> RecordingFrames:
-        """Frames in which the files are stated, as far as logs name them."""
         return RecordingFrames(self.section, self.folder)
 
     @property
@@ -167,13 +166,11 @@ class RecordingReader:
         return self.section.kind == "static"
 
     def _add_notes(self, *notes: str) -> None:
-        """Add notes to `notes`, in place, each with the experiment's name in front."""
         self.notes += [f"experiment '{self.section.name}': {note}" for note in notes]
 
     # Files ----------------------------------------------------------------------------------------
 
     def _table_file(self, table: TableSection, key: str) -> Path:
-        """Return a table's own file, else that of the experiment."""
         key = "file" if table.file is None and self.section.file else key
         return self._recording_folder.require_existing(
             self.section.file_of(table), key, what="a file here, or a file of the experiment"
@@ -181,20 +178,13 @@ class RecordingReader:
 
     @property
     def _requires_times(self) -> bool:
-        """Whether files must contain times: for motions, and for equilibria of bodies with
-        memory.
-        """
+        """Motions, and equilibria of bodies with memory, need times."""
         return not self._is_static or self.body.has_memory
 
     # Grasps ---------------------------------------------------------------------------------------
 
     def _grasp_key(self, k: int, key: str = "") -> str:
-        """Return the key of the grasp or obstacle with index k for messages, followed by `key`
-        unless that is empty.
-
-        The grasps have the first indices, from 0, the obstacles follow. A single grasp is "grasp"
-        without an index.
-        """
+        """Indices are those of grasps, then of obstacles; a single grasp has none."""
         grasps = len(self.section.grasp_list)
         one = f"grasp.{k}" if grasps > 1 else "grasp"
         one = one if k < grasps else f"obstacle.{k - grasps}"
@@ -230,7 +220,6 @@ class RecordingReader:
         return replace(poses, interpolation=grasp.interpolation)
 
     def _poses_from_markers(self, grasp: Moved, key: str) -> PoseSequence:
-        """Return the poses of a grasp fitted to its markers, and add notes on the fit."""
         if self._marker_tracks is None:
             message = (
                 "the poses are to be fitted to markers, but there are no marker tracks; expected "
@@ -246,11 +235,7 @@ class RecordingReader:
         return poses
 
     def _grasp(self, k: int, poses: PoseSequence, t_s: Array) -> Grasp:
-        """Return the grasp or obstacle with index k (grasps first), with its wrench within the
-        times t_s.
-
-        A grasp is placed on the nodes of the body; obstacles without a name are numbered from 1.
-        """
+        """Index k counts grasps, then obstacles; obstacles without a name are numbered from 1."""
         section = self.section.moved_sections[k]
         zero = ""
         if (table := section.displacement) is not None:
@@ -332,11 +317,7 @@ class RecordingReader:
             return Wrench(at_s[is_used], values[is_used], **arguments)
 
     def _custom_sensor(self, k: int, section: ReadingSection, t_s: Array) -> Gauge:
-        """Return the custom sensor with index k and its values within the times t_s [s], and note
-        how many samples are used.
-
-        If a simulation has no file, the values are None and the times are t_s.
-        """
+        """In a simulation without a file, the values are None and the times are t_s."""
         key = f"reading.{k}"
         arguments: dict[str, Any] = {"name": section.name, **declared_in(section, where=key)}
         _, arguments["expression"] = self.code.function(
@@ -373,7 +354,6 @@ class RecordingReader:
         )
 
     def _measurements(self, t_s: Array) -> dict[str, list[Any]]:
-        """Return the measurements of all tables, by the field of `Experiment`."""
         section = self.section
         fields: dict[str, list[Any]] = {
             "readings": [
@@ -388,11 +368,7 @@ class RecordingReader:
         return fields
 
     def _from_table(self, list_key: str, k: int) -> Any:
-        """Return the object of a table in a list, such as a tendon or a pressure, on the body.
-
-        Values over time are read from the files that the table names. An object without a name is
-        called by `list_key` and its number from 1, such as tendon_1.
-        """
+        """Return the object of a table in a list; without a name it is called such as tendon_1."""
         table = getattr(self.section, list_key)[k]
         where = f"{list_key}.{k}"
         defaults = {"name": f"{list_key}_{k + 1}"} if "name" in type(table).model_fields else {}
@@ -428,11 +404,7 @@ class RecordingReader:
         return table
 
     def _fitted_tracks(self, poses: Sequence[PoseSequence]) -> MarkerTable:
-        """Return the tracks to fit, without those of the gripper alone.
-
-        They have no columns if the experiment has no markers. If a simulation has no file, they are
-        zero. In both cases the times are those of `_sample_times`.
-        """
+        """Tracks have no columns without markers, and are zero if a simulation has no file."""
         if not self.section.has_markers:
             times = self._sample_times(poses)
             return MarkerTable(times, (), positions_m=np.zeros((len(times), 0, 3)))
@@ -500,11 +472,7 @@ class RecordingReader:
         return times
 
     def _select_tracks(self, table: MarkerTable) -> MarkerTable:
-        """Return the tracks to fit, in the order of the table; markers of a weight of 0 are noted.
-
-        They are the markers that `names` of the section has, or else all but those of grippers,
-        without those of weight 0.
-        """
+        """Return the tracks to fit; markers of a weight of 0 are noted."""
         markers = self.section.markers
         for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
@@ -665,9 +633,6 @@ def by_marker(values: Mapping[str, float] | float, names: Sequence[str], default
 
 
 def _require_known_markers(requested: Iterable[str], names: Sequence[str], key: str) -> None:
-    """Raise `InputError` at `key` for the first requested name that is not among `names`; without
-    requested names nothing is checked.
-    """
     present = set(names)
     for name in requested:
         if name not in present:
@@ -740,5 +705,4 @@ def _implausible_markers(experiment: Experiment) -> str | None:
 
 
 def _diagonal(points_m: Array) -> float:
-    """Return the diagonal [m] of the box along the axes that contains points (n, 3), n ≥ 1."""
     return float(np.linalg.norm(np.ptp(points_m, axis=0)))

@@ -125,7 +125,6 @@ class DisplacementSection(TableSection):
 
     @model_validator(mode="after")
     def _require_one_size(self) -> DisplacementSection:
-        """Return the section itself, or raise `ValueError` for a scale of strains of the body."""
         if self.length_m == "body" and self.scale != 1.0:
             raise ValueError(
                 f'found scale = {self.scale:g} with length_m = "body"; expected one of them: the '
@@ -176,7 +175,6 @@ class ForceSensorSection(TableSection, of=Wrench):
 
     @model_validator(mode="after")
     def _require_one_frame(self) -> ForceSensorSection:
-        """Return the section itself; raise `ValueError` for sensor_frame with frame or point_m."""
         if self.sensor_frame is not None and self.states_axes:
             raise ValueError(
                 "found sensor_frame together with frame or point_m; expected either sensor_frame, "
@@ -186,9 +184,6 @@ class ForceSensorSection(TableSection, of=Wrench):
 
 
 def _as_table(value: str | DisplacementSection) -> DisplacementSection:
-    """Return a displacement as a table: text is the name of its file, a table is returned
-    as it is.
-    """
     return DisplacementSection.model_validate({"file": value}) if isinstance(value, str) else value
 
 
@@ -239,12 +234,6 @@ class MovedSection(Section):
 
     @model_validator(mode="after")
     def _require_one_source(self) -> MovedSection:
-        """Return the section itself, or raise `ValueError`.
-
-        The error is raised if more than one of poses, displacement and markers is given,
-        `gripper_to_body` with markers, a key without the source that it belongs to, fewer than
-        three markers, or a weight of an unknown marker.
-        """
         sources = used_keys(self, "poses", "displacement", "markers")
         if len(sources) > 1:
             raise ValueError(f"found {' and '.join(sources)}; expected one of them")
@@ -368,10 +357,6 @@ class MarkersSection(Section, of=Markers):
 
     @model_validator(mode="after")
     def _require_template(self) -> MarkersSection:
-        """Return the section itself; raise `ValueError` unless `template_m` and `template_window_s`
-        are given together or not at all, with at least three positions and a window that does
-        not end before it starts.
-        """
         present = used_keys(self, "template_m", "template_window_s")
         if len(present) == 1:
             raise ValueError(
@@ -536,7 +521,6 @@ class ExperimentSection(NamedSection, of=Experiment):
     def __get_pydantic_json_schema__(
         cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> JsonSchemaValue:
-        """Return the schema of the table with the tables of features."""
         schema = handler(core_schema)
         properties = handler.resolve_ref_schema(schema)["properties"]
         for key, table in own_tables().items():
@@ -552,9 +536,7 @@ class ExperimentSection(NamedSection, of=Experiment):
     @model_validator(mode="wrap")
     @classmethod
     def _with_registered_tables(cls, table: Any, validated: Any) -> Any:
-        """Return the section with the tables of features and of other packages, validated by their
-        own classes.
-        """
+        """Tables of features and of other packages are validated by their own classes."""
         registered = registered_tables()
         if not isinstance(table, dict):
             return validated(table)
@@ -577,9 +559,6 @@ class ExperimentSection(NamedSection, of=Experiment):
 
     @model_validator(mode="after")
     def _require_window(self) -> ExperimentSection:
-        """Return the section itself; raise `ValueError` unless the window is missing or begins
-        before it ends.
-        """
         if self.window_s is not None and not self.window_s[0] < self.window_s[1]:
             raise ValueError(
                 f"found window_s = {list(self.window_s)}; expected [start, end] with start < end"
@@ -588,12 +567,7 @@ class ExperimentSection(NamedSection, of=Experiment):
 
     @model_validator(mode="after")
     def _require_static_keys(self) -> ExperimentSection:
-        """Return the section itself; raise `ValueError` if a series of equilibria has a key of
-        motions.
-
-        These are another `start` than "equilibrium", another `start_rule` than "standard",
-        `resample_hz`, and a table `nuisance.time_shift`.
-        """
+        """Equilibria have no keys of motions."""
         if self.kind == "dynamic":
             return self
         usual = {"start": "equilibrium", "start_rule": "standard", "resample_hz": None}
@@ -609,9 +583,6 @@ class ExperimentSection(NamedSection, of=Experiment):
 
 
 def _require_three(places: dict[str, Any] | None, key: str) -> None:
-    """Raise `ValueError` for fewer than three positions, which do not determine a rotation; None
-    passes. `key` is for the message.
-    """
     if places is not None and len(places) < 3:
         raise ValueError(
             f"found {len(places)} in {key}; expected at least three, to determine a rotation"

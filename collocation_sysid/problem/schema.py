@@ -258,13 +258,6 @@ class ObjectSection(Section):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> ObjectSection:
-        """Return the section itself, or raise `ValueError` for keys that exclude or require each
-        other.
-
-        Required are at most one shape, `edge_length_m` exactly with a shape other than a mesh, not
-        both mass and density, `scan` exactly with rest_shape = "under_gravity", and existing
-        regions of Prony branches.
-        """
         if self.has_shape:
             require_one(self, *SHAPES)
         if self.has_shape and self.mesh is None and self.edge_length_m is None:
@@ -314,9 +307,6 @@ class PriorSection(Section):
 
     @model_validator(mode="after")
     def _require_one_deviation(self) -> PriorSection:
-        """Return the section itself; raise `ValueError` unless exactly one of both deviations is
-        given.
-        """
         require_one(self, "relative", "deviation")
         return self
 
@@ -346,9 +336,6 @@ class ParameterSection(Section, of=Unknown):
 
     @model_validator(mode="after")
     def _require_one_kind(self) -> ParameterSection:
-        """Return the section itself; raise `ValueError` for more than one of guess, fixed and
-        tied_to, or for keys that do not belong to it (without any of them: to a guess).
-        """
         if len(used_kinds := used_keys(self, "guess", "fixed", "tied_to")) > 1:
             raise ValueError(f"found {' and '.join(used_kinds)}; expected one of them, or none")
         of_kind = {
@@ -368,12 +355,7 @@ class ParameterSection(Section, of=Unknown):
 
 
 def _flatten_parameters(tables: Any, *, prefix: str = "") -> Any:
-    """Return parameters by their full names, such as ``core.mu_pa``, from tables nested by region.
-
-    A table with a key of `ParameterSection`, or an empty one, is a parameter; any other table is a
-    region. `prefix` precedes all names. Anything but a table is returned unchanged, to be refused
-    by the schema.
-    """
+    """Return parameters by full names; a table with a key of `ParameterSection` is a parameter."""
     if not isinstance(tables, dict):
         return tables
     flattened: dict[str, Any] = {}
@@ -453,9 +435,7 @@ class UncertaintySection(Section, of=UncertaintyOptions):
 
 
 def _kind_tag(value: Any) -> str:
-    """Return the tag of an experiment's table or model, which messages omit: `SPECIMEN_TAG` for the
-    kind "specimen", else "<recording>".
-    """
+    """Return the tag of an experiment, which messages omit."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return SPECIMEN_TAG if kind == "specimen" else "<recording>"
 
@@ -502,16 +482,11 @@ class ProblemFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _merge_defaults(cls, content: Any) -> Any:
-        """Return the content with [experiment_defaults] inserted into each experiment, before the
-        file is validated, see `with_experiment_defaults`.
-        """
+        """Insert [experiment_defaults] before the file is validated."""
         return with_experiment_defaults(content)
 
     @model_validator(mode="after")
     def _require_shape(self) -> ProblemFile:
-        """Return the file itself; raise an `InputError` if the object states no shape although
-        there is a recording, or has regions, a field, a force or a scan.
-        """
         if self.object.has_shape:
             return self
         if self.recordings:
@@ -559,11 +534,7 @@ def with_experiment_defaults(content: Any) -> Any:
 
 
 def _known_defaults(shared: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
-    """Return the defaults for the table of an experiment.
-
-    All defaults are returned, unless the table has the kind "specimen" and the defaults do not:
-    then they are for recordings too, and only the keys that specimens know are returned.
-    """
+    """Return the defaults; those of recordings too leave out keys that specimens do not know."""
     if table.get("kind") != "specimen" or shared.get("kind") == "specimen":
         return shared
     return {key: value for key, value in shared.items() if key in SpecimenSection.model_fields}

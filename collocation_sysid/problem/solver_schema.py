@@ -30,9 +30,7 @@ DEFAULT = "reduced-space"
 
 
 def _require_offered(name: Any) -> Any:
-    """Return the name of a method, also an unknown one; raise `ValueError` with the reason if it is
-    a solver of CasADi that cannot be used here.
-    """
+    """An unknown name is returned, too; a solver of CasADi that cannot be used is refused."""
     reason = refusal_reason(name) if isinstance(name, str) else None
     if reason is not None:
         raise ValueError(reason)
@@ -62,9 +60,6 @@ class OptionTable:
 
 
 def _method_key(kind: type[MethodOptions]) -> Any:
-    """Return the pydantic field of a method's table: its name in the file as alias, the summary of
-    the class, and the method with default options as default.
-    """
     return Field(default_factory=kind, alias=kind.name, description=method_summary(kind.name))
 
 
@@ -98,9 +93,7 @@ class SolverSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _require_option_tables(cls, table: Any) -> Any:
-        """Return the table unchanged; raise `ValueError` if options of a method are outside the
-        method's table.
-        """
+        """Options of a method outside the method's table are refused."""
         outside = (
             [name for name in table if _methods_with(name)] if isinstance(table, Mapping) else []
         )
@@ -122,7 +115,6 @@ class SolverSection(Section):
 
 
 def _method_from_table(method: str, table: Any) -> Any:
-    """Return the method called `method` with the options of its table, defaults elsewhere."""
     where = f"solver.{method}"
     if not isinstance(table, Mapping):
         raise InputError(f"found {table!r}; expected a table of options", None, where=where)
@@ -136,18 +128,11 @@ def _method_from_table(method: str, table: Any) -> Any:
 
 
 def _methods_with(option: str) -> list[str]:
-    """Return the names of the methods that have an option, in the order of `METHODS`; empty if none
-    has it.
-    """
     return [method for method in METHODS if option in OPTIONS[method]]
 
 
 def _advice_on_tables(options: Sequence[str], chosen: Any) -> str:
-    """Return text that says to which method's table each of the options belongs: that of the method
-    `chosen` in the file if it has the option, else that of the first that has it.
-
-    Every option must belong to a method.
-    """
+    """Say to which method's table each option belongs, that of `chosen` first."""
     options_by_method: dict[str, list[str]] = {}
     for option in options:
         owners = _methods_with(option)

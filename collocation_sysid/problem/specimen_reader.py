@@ -112,13 +112,9 @@ class SpecimenReader:
         return specimen, replace(experiment, specimen=deformation)
 
     def _add_note(self, note: str) -> None:
-        """Add a note that begins with the experiment's name."""
         self.notes.append(f"experiment '{self.section.name}': {note}")
 
     def _specimen(self, table: SpecimenTable) -> Specimen:
-        """Return the measurements of the rows to use, with their uncertainties, and note how many
-        rows are used if not all.
-        """
         section = self.section
         rows = self._rows(table)
         if len(rows) < len(table.t_s):
@@ -171,9 +167,7 @@ class SpecimenReader:
         )
 
     def _placeholders(self, arguments: Mapping[str, Array | None]) -> list[str]:
-        """Return the names of measurements that are all 0, or another constant in a test of several
-        strains, although they cannot be, and note that they are not used.
-        """
+        """Return measurements that are all 0, or constant in a test of several strains."""
         names = []
         strain = arguments["strain"]
         is_varied = strain is not None and np.ptp(strain) > 0
@@ -222,9 +216,7 @@ class SpecimenReader:
         return rows[:: section.every]
 
     def _sigma_pa(self) -> float:
-        """Return the standard deviation of the noise of the stress [Pa]: the stated one, or else
-        that of the force over the undeformed area (the schema requires one of both).
-        """
+        """The schema requires the σ of stress, or that of force and the undeformed area."""
         section = self.section
         if isinstance(section.sigma_pa, float):
             return section.sigma_pa
@@ -233,9 +225,7 @@ class SpecimenReader:
         return section.sigma_n / section.area_m2
 
     def _note_unknown_past(self, specimen: Specimen) -> None:
-        """Add a note if the material has memory and the absolute strain of the first sample exceeds
-        `UNKNOWN_PAST` of the largest.
-        """
+        """A material with memory whose first strain exceeds `UNKNOWN_PAST` has an unknown past."""
         strain: Array = np.abs(specimen.strain)
         if self.body.has_memory and strain[0] > UNKNOWN_PAST * strain.max():
             self._add_note(

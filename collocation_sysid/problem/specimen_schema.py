@@ -154,10 +154,6 @@ class SpecimenSection(NamedSection):
 
     @model_validator(mode="after")
     def _require_consistent(self) -> SpecimenSection:
-        """Return the section itself, or raise `ValueError`: unless exactly one of sigma_pa and
-        sigma_n is given, for sigma_n without area_m2, for a window that does not begin before it
-        ends, for keys that a table of a modulus does not have, and for two temperatures.
-        """
         sigmas = ("relative_sigma",) if self.modulus == "harmonic" else ("sigma_pa", "sigma_n")
         excluded = NOT_OF_MODULI if self.modulus else frozenset()
         excluded |= {"sigma_pa", "window_s"} if self.modulus == "harmonic" else {"relative_sigma"}

@@ -54,11 +54,7 @@ _TAGS = re.compile(r"<|(function-\w+|literal)\[|constrained-\w+$|(float|int|str|
 
 
 def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
-    """Return the parts of the key of a fault, from the root of the file: keys, and indices from 0
-    of tables in lists.
-
-    Tags of unions are left out, and so are indices at the end that refer to numbers in an array.
-    """
+    """Tags of unions are left out, and final indices of numbers in an array."""
     loc = fault["loc"]
     own = len(loc) - 1 if fault["type"] == "extra_forbidden" else len(loc)  # that is the file's
     parts = [p for k, p in enumerate(loc) if k >= own or not _TAGS.match(str(p))]
@@ -70,7 +66,6 @@ def _fault_key(fault: Fault, root: type[BaseModel]) -> list[Part]:
 
 
 def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
-    """Return the message of a fault: what was found and what was expected."""
     key = _fault_key(fault, root)
     field, _ = _schema_field(key, root)
     description = (field.description if field else None) or ""
@@ -102,23 +97,14 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
 
 
 def _fault_location(fault: Fault, content: dict[str, Any], root: type[BaseModel]) -> str:
-    """Return the location of a fault as text, as it is written in the file.
-
-    An `InputError` that a validator raised contains the location within its value, which is then
-    returned.
-    """
+    """The value of an `InputError` that a validator raised contains the location."""
     error = (fault.get("ctx") or {}).get("error")
     known = error.where if isinstance(error, InputError) else None
     return known or _written_key(_fault_key(fault, root), content)
 
 
 def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
-    """Return a key as text, as it is written in the file: "experiment 'swing': markers.file" for a
-    key of an experiment with a name, else its parts joined by dots.
-
-    A value that an experiment has from [experiment_defaults] is located there. `content` is that of
-    the file, without defaults inserted.
-    """
+    """A value from [experiment_defaults] is located there."""
     value: Any = content
     defaults = _item(content, "experiment_defaults")
     if key[:1] == ["experiment"] and len(key) > 2:
@@ -138,9 +124,7 @@ def _written_key(key: Sequence[Part], content: dict[str, Any]) -> str:
 
 
 def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
-    """Return the value of a key in the content of a file; None if it does not exist; the content
-    itself for an empty key.
-    """
+    """Return the value of a key in the content; None if it does not exist."""
     value: Any = content
     for part in key:
         value = _item(value, part)
@@ -148,9 +132,6 @@ def _value_at(key: Sequence[Part], content: dict[str, Any]) -> Any:
 
 
 def _item(container: Any, part: Part) -> Any:
-    """Return an item of a table by key, or of a list by index; None if it does not exist or
-    `container` is neither.
-    """
     try:
         return container[part]
     except (KeyError, IndexError, TypeError):
@@ -161,12 +142,7 @@ def _item(container: Any, part: Part) -> Any:
 
 
 def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo | None, int]:
-    """Return the deepest field of the schema on the path of a key, and the number of parts up to
-    and including it.
-
-    Indices and names that the user chooses are passed over. The field is None, and the number 0, if
-    the first part is not in the schema.
-    """
+    """Return the deepest field on the path and the number of parts to it; None and 0 without."""
     model: type[BaseModel] | None = root
     field = None
     part_count = 0
@@ -190,14 +166,11 @@ def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo
 
 
 def _fields_by_key(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by their keys in the file: the alias, else the name."""
     return {field.alias or name: field for name, field in model.model_fields.items()}
 
 
 def _table_model(annotation: Any) -> type[BaseModel] | None:
-    """Return the first model of a field that is a table or a list of tables; None for other
-    fields.
-    """
+    """Return the first model of a field that is a table or a list of tables, or None."""
     return next(iter(table_models(annotation)), None)
 
 
