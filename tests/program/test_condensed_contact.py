@@ -6,9 +6,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from benchmark_contact import TRUTH, pressed_cube
 from kit.problems import EDGE_M, IDEAL, box, vertex_markers
 
+import collocation_sysid as cs
 from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.forward import condensed_steps, newton_solver
@@ -19,6 +19,31 @@ from collocation_sysid.recording import Cuboid, Experiment, Grasp, Obstacle, Pla
 
 STEPS = 12
 SCHEME = "bdf2"
+TRUTH = {"lambda_pa": 2e3, "mu_pa": 3e3, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
+
+
+def pressed_cube(divisions: int, steps: int, friction: float | None) -> Experiment:
+    """Return the recording of the cube with a plate of this friction coefficient; None for no
+    plate.
+    """
+    body = cs.Body(cs.box_mesh((EDGE_M,) * 3, (divisions,) * 3), density_kg_m3=30.0, threads=1)
+    t_s = 0.01 * np.arange(steps + 1)
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    sway_share = 1 - np.cos(10 * t_s)
+    foot_poses = PoseSequence(t_s, np.outer(0.004 * sway_share, [1.0, 0.0, 0.0]), upright)
+    grasps: list[Grasp] = [Grasp(np.flatnonzero(body.nodes_m[:, 2] < 1e-9), foot_poses)]
+    if friction is not None:
+        plate_poses = PoseSequence(
+            t_s, np.outer(-0.001 - 0.002 * sway_share, [0.0, 0.0, 1.0]), upright
+        )
+        corners = np.array([(-1.0, -1.0, EDGE_M), (0.6 * EDGE_M, 1.0, 1.0)])
+        grasps.append(Obstacle(poses=plate_poses, shape=Cuboid(corners), friction=friction))
+    top = np.flatnonzero(body.nodes_m[:, 2] > EDGE_M - 1e-9)
+    no_tracks = np.zeros((len(t_s), len(top), 3))
+    markers = cs.Markers(t_s, no_tracks, 1e-3, [f"m{k}" for k in top], body.nodes_m[top]).on_body(
+        body
+    )
+    return Experiment(body, t_s, grasps, markers, nuisance=cs.Nuisance.none())
 
 
 def simulated(experiment: Experiment) -> np.ndarray:

@@ -19,17 +19,14 @@ COMMANDS = (
     "study_contact --parts poked --twins 2",
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
-    "study_kawabata --laws neo-hookean",
     "study_methods --starts 1 --methods reduced-space --workers 1",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
     "study_mistakes --groups video --only turned --seeds 1 --check-only",
-    "study_specimen_coverage --twins 2 --case 0",
     "study_starts --starts 1 --bodies cylinder",
     "study_table1 --methods reduced-space",
     "study_trust --twins 1 --faulty 1 --only none",
-    "benchmark_contact",
     "benchmark_jacobian --repeats 1",
-    "benchmark_shipped foam_cylinder --max-time-s 20",
+    "benchmark_shipped foam_cylinder",
 )
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from study_falling import FREE, TRUTH, TWIN_HZ, falling_block, noise_of
+from kit.falling import FREE, TRUTH, TWIN_HZ, falling_block, noise_of
 
 import collocation_sysid as cs
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kit.falling import DURATION_S, FREE, TRUTH, TWIN_HZ, falling_block, noise_of
 from kit.problems import hung_cube, measured
-from study_falling import DURATION_S, FREE, TRUTH, TWIN_HZ, falling_block, noise_of
 from study_hidden_errors import unplaced
 
 import collocation_sysid as cs
