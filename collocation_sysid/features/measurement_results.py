@@ -62,7 +62,7 @@ class PredictionErrors:
 
 
 def _forces_text(*sizes: float | None) -> str:
-    """Return RMS or σ of force [N] and torque [N m], without None and zero."""
+    """Zero and None are left out."""
     pairs = zip(sizes, ("N", "N m"), strict=True)
     return ", ".join(f"{short(size)} {unit}" for size, unit in pairs if size)
 

@@ -250,9 +250,7 @@ def copied_times_s(experiment: Experiment, other: Experiment) -> Iterator[tuple[
 
 
 def _shown_as(experiment: Experiment, gauge: CustomSensor) -> dict[str, Array]:
-    """Return the factors, (1, 1) or (S, 1), of a sensor's values to what a table states: moduli in
-    place of the stresses that stand for them. By name; NaN where a sample has no such value.
-    """
+    """Return factors, (1, 1) or (S, 1), to moduli that a table states in place of stresses."""
     if gauge.name == STRESS_NAME:
         moduli = moduli_of(experiment)
         if moduli and len(gauge.sample_times_s) == len(experiment.t_s):
@@ -320,7 +318,6 @@ def recorded_series(
 
 
 def _columns(measurement: Measurement, models: Iterable[Any]) -> Array:
-    """Return time, measured values and the values of each model, as one array."""
     measured = measurement.measured_values
     unknown = np.full_like(measured, np.nan)
     numbers = [measured, *(unknown if each is None else each for each in models)]

@@ -68,18 +68,7 @@ class CoarseStart(SmallerProblem):
 
     @classmethod
     def of(cls, problem: Problem, method: ReducedSpace) -> CoarseStart | None:
-        """Return the fitted experiments of a problem on coarser meshes and with fewer samples, or None if
-        the method's options, the sizes of the bodies and the numbers of samples do not call for a
-        coarse start.
-
-        Validation experiments and notes are left out, and small bodies keep their mesh; the problem is
-        not modified.
-
-        Raises
-        ------
-        NoStartError
-            If a body is large enough, but the problem cannot be transferred to a coarser mesh.
-        """
+        """Validation experiments and notes are left out, and small bodies keep their mesh."""
         fitted = [each for each in problem.experiments if not each.validation]
         if method.coarse_start != "auto":
             return None
@@ -150,15 +139,7 @@ class CoarseStart(SmallerProblem):
         )
 
     def given_collocation(self, problem: Problem, solution: Solution) -> Collocation:
-        """Return the program of the given problem with the parameters of a coarse solution as
-        guesses, within their bounds; of those that the coarse mesh does not determine, the guess of
-        the coarse solve.
-
-        Raises
-        ------
-        NoStartError
-            If a modulus is among them: the coarse mesh then does not describe the motion.
-        """
+        """A modulus that the coarse mesh does not determine gives no start."""
         undetermined = undetermined_names(solution)
         for name in filter(is_modulus, undetermined):
             raise NoStartError(f"the coarse mesh does not determine {symbol_of(name)}")
@@ -177,11 +158,7 @@ class CoarseStart(SmallerProblem):
         return replace(problem.collocation(), parameters=parameters.with_estimates(values))
 
     def start(self, collocation: Collocation, solution: Solution) -> Start:
-        """Return the start from a solution, with a simulated motion in place of one that is
-        interpolated in time; the latter where the simulation fails, and on coarser meshes.
-
-        The search needs several times as long to find a motion from interpolated samples.
-        """
+        """The search needs several times as long to find a motion from interpolated samples."""
         start = self._interpolated_start(associated_at_guess(collocation), solution)
         if self.relations or start.variables is None:
             return start
@@ -192,9 +169,6 @@ class CoarseStart(SmallerProblem):
         return replace(start, variables=start.collocation.pack(p, positions))
 
     def _interpolated_start(self, collocation: Collocation, solution: Solution) -> Start:
-        """Return the start with interpolated positions; nuisance parameters are limited to their
-        bounds.
-        """
         warm = WarmStart.of(solution)
         collocation = warm.apply_to_places(collocation)
         p, _ = warm.apply_to_nuisance(collocation)
@@ -245,10 +219,7 @@ class CoarseStart(SmallerProblem):
         return make_interp_spline(distance * np.arange(len(x)), x)(np.arange(count))
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
-        """Return positions (N, 3n) of the given body from those of the coarse one (N, 3m); nodes of
-        obstacle frames, which come last, are copied, and positions of an experiment whose body is
-        not coarsened are returned themselves.
-        """
+        """Return (N, 3n) from (N, 3m); nodes of obstacle frames, which come last, are copied."""
         relation = self.relations.get(experiment)
         if relation is None:
             return x
@@ -271,9 +242,6 @@ def sample_distance(experiment: Experiment) -> int:
 
 
 def _coarse_body(body: Body, problem: Problem) -> CoarseBody:
-    """Return a body of the problem on a coarser mesh, with the node sets of all experiments on the
-    same mesh.
-    """
     sets = [
         nodes
         for experiment in problem.experiments

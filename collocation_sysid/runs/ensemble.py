@@ -103,7 +103,6 @@ def draw_samples(
 
 
 def _with_derived(collocation: Collocation, drawn: Array) -> dict[str, float]:
-    """Return all parameters and derived moduli, by name, for values of the estimated ones."""
     items = zip(collocation.parameters.free, drawn.tolist(), strict=True)
     q = np.array([item.to_coordinate(value) for item, value in items])
     constants = (each.constants for each in collocation.transcriptions)
@@ -111,9 +110,7 @@ def _with_derived(collocation: Collocation, drawn: Array) -> dict[str, float]:
 
 
 def _is_admissible(values: Mapping[str, float]) -> bool:
-    """Return whether all values are finite, moduli are positive, and Poisson's ratio is that of a
-    stable material.
-    """
+    """Finite, with positive moduli, and Poisson's ratios of a stable material."""
     return all(
         np.isfinite(value)
         and (without_region(name) not in POSITIVE_MODULI or value > 0)

@@ -146,9 +146,7 @@ def expected_precision(
 
 
 def _exact_fit(collocation: Collocation, z: Array) -> tuple[LinearisedFit, Uncertainty]:
-    """Return the fit linearised at z as if all residuals were zero, and its uncertainty by noise of
-    the stated σ.
-    """
+    """Return fit and uncertainty as if all residuals were zero, by noise of the stated σ."""
     fit = linearise_fit(replace(collocation, huber=UNWEIGHTED), z)
     exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
     fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
@@ -282,7 +280,7 @@ def with_measurements(
 def _with_some_samples(
     collocation: Collocation, z: Array, distance: int
 ) -> tuple[Collocation, Array]:
-    """Return the program with every n-th sample, n being `distance`, and the noise of their mean."""
+    """Keep every n-th sample, n being `distance`, with the noise of their mean."""
     if distance == 1:
         return collocation, z
     experiments = []
@@ -391,7 +389,6 @@ def _held_longer(transcription: Transcription) -> Experiment | None:
 
 
 def _with_force_sensor(collocation: Collocation, z: Array, number: int, noise: float) -> Experiment:
-    """Return a fitted experiment with a force sensor at its first grasp."""
     experiments = [each.experiment for each in collocation.transcriptions]
     experiment = experiments[number]
     blank = Wrench(experiment.t_s, np.zeros((len(experiment.t_s), 3)), 1.0)
@@ -414,10 +411,7 @@ def _with_force_sensor(collocation: Collocation, z: Array, number: int, noise: f
 def _extended(
     collocation: Collocation, z: Array, experiments: Sequence[Experiment]
 ) -> tuple[Collocation, Array]:
-    """Return the program of fitted experiments of which some are changed or new, and its variables:
-    new nuisance parameters are zero, and new experiments are simulated, longer ones from the end of
-    the fitted motion on.
-    """
+    """New nuisance parameters are zero; new or longer experiments are simulated."""
     wide = replace(collocation, experiments=[*experiments])
     p, positions = collocation.unpack(z)
     by_name = dict(zip(collocation.parameter_names, p.tolist(), strict=True))

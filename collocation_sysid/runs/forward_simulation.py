@@ -117,11 +117,9 @@ def simulate_experiments(
 
 
 def _report_completed_share() -> Callable[[float], None]:
-    """Return a function that reports the share of a simulation to `counted_phase`."""
     completed = 0.0
 
     def report(share: float) -> None:
-        """Add the increase of the completed share to the counter of the phase."""
         nonlocal completed
         complete_steps(StepUnit.SIMULATION, share - completed)
         completed = share
@@ -368,13 +366,7 @@ def step_error(
 
 
 def _step_error_share(problem: Problem, transcription: Transcription) -> float | None:
-    """Return the share of the difference between forward simulation and fit that half the time step
-    would remove, from the orders of both schemes: that of the fit of `transcription`, and that of
-    the simulation by `problem.rollout`.
-
-    None if the simulation is not Newmark's or its step is not at most half as large; 1 for static
-    experiments.
-    """
+    """Half the step removes a share by the orders of both schemes; None unless it is comparable."""
     experiment = transcription.experiment
     options = problem.rollout
     if experiment.is_static:
@@ -389,7 +381,7 @@ def _step_error_share(problem: Problem, transcription: Transcription) -> float |
 
 
 def _step_s(problem: Problem, transcription: Transcription) -> float:
-    """Return the step of the forward simulation [s], by default finer than that of the fit."""
+    """Return the step of the simulation [s], by default finer than that of the fit."""
     is_smooth = sample_distance(transcription.experiment) >= SMOOTH_SAMPLES
     count = min(max(2 if is_smooth else 4, 2 * transcription.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or transcription.experiment.timestep_s / count

@@ -136,10 +136,7 @@ def _is_reason(few: Concern, refinement: Refinement | None) -> bool:
 
 
 def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
-    """Yield a concern about the estimated elastic constant whose change on a finer mesh is largest,
-    if that is more than `LARGEST_CHANGE` of its value. Constants on a linear scale do not count,
-    since they may be near zero, and of derived moduli only E: λ changes without limit near ν = ½.
-    """
+    """Constants on a linear scale may be near zero, and λ changes without limit near ν = ½."""
     if refinement is None:
         return
     bodies = dict.fromkeys(e.body for e in problem.experiments if e.specimen is None)
@@ -185,6 +182,5 @@ def _coarse_mesh_concerns(problem: Problem) -> Iterator[Concern]:
 
 
 def _elastic_names(body: Body) -> set[str]:
-    """Return the moduli and constants of the materials of a body, without regions."""
     constants = (constant.name for part in body.parts for constant in part.material.constants)
     return {*ELASTIC, *constants}

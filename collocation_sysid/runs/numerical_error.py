@@ -193,7 +193,6 @@ def solve_refined(
 def _errors_from_levels(
     levels: Sequence[RefinementLevel], problem: Problem, estimates: Mapping[str, Estimate]
 ) -> Refinement:
-    """Return the numerical errors of the estimates from the levels so far."""
     by_step, by_mesh = (
         [each.values for each in levels if each.refined == kind] for kind in REFINEMENTS
     )
@@ -211,7 +210,6 @@ def _errors_from_levels(
 def _solve_refined_problem(
     problem: Problem, start: WarmStart, what: str, watch: Watch | None
 ) -> Solution:
-    """Return the converged solution of a finer problem from the coarser answer."""
     method = ReducedSpace(ladder=(1.0,), tolerance=TOLERANCE)
     solution = solve(problem, method, watch=watch, start=start)
     if not solution.unless_interrupted().status.converged:
@@ -224,7 +222,6 @@ def _solve_refined_problem(
 
 
 def _level_summary(kind: str, level: int, solution: Solution) -> RefinementLevel:
-    """Return size, cost and estimates of a solved level."""
     transcriptions = solution.collocation.transcriptions
     return RefinementLevel(
         refined=kind,

@@ -144,10 +144,6 @@ def _scale(problem: Problem) -> ScaleReference | None:
 
 
 def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
-    """Yield up to four sentences on what the values refer to: the damping law of γ_r if a body that
-    moves has it, how moduli are scaled if no force is measured, the area by which forces of specimens
-    are divided, and the axis along which E is measured.
-    """
     problem = answer.problem
     parts = [part for each in problem.experiments if not each.is_static for part in each.body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
@@ -169,7 +165,6 @@ def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
 
 
 def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
-    """Return the statistics behind the error bars; None without error bars."""
     known = answer.uncertainty
     if known is None:
         return None
@@ -206,13 +201,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
 
 
 def _field_result(estimate: FieldEstimate) -> FieldResult:
-    """Return the summary of a field.
-
-    It has its resolution, the range of its values, the share of the volume and the number of modes
-    that the data determine, and the logarithm of the evidence of each correlation length of the
-    field relative to the chosen one. If a standard deviation is not finite, share and number are
-    None, and there is no evidence.
-    """
+    """Share and number of modes are None, without evidence, if a deviation is not finite."""
     modes = estimate.modes
     volumes_m3 = estimate.modes.volumes_m3
     ends = (float(estimate.value.min()), float(estimate.value.max()))
@@ -233,10 +222,6 @@ def _field_result(estimate: FieldEstimate) -> FieldResult:
 
 
 def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreement] | None:
-    """Return the estimates from single recordings, to first order, and their agreement, by scalar
-    parameter; None if this was not evaluated. Values are NaN for recordings that do not determine
-    the parameter.
-    """
     if answer.uncertainty is None or (scatter := answer.uncertainty.scatter) is None:
         return None
     q = answer.solution.q
@@ -258,7 +243,6 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
 
 
 def _fit_result(answer: SolvedProblem) -> FitResult:
-    """Return the residuals of each experiment and of all, with sentences on nuisance parameters."""
     solution = answer.solution
     experiments = {}
     for part in solution.parts:
@@ -295,12 +279,10 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
 
 
 def _sensor_errors(error: PredictionErrors) -> dict[str, Any]:
-    """Return the errors of all measurements but the markers, by name of the field."""
     return {key: value for key, value in vars(error).items() if key not in ("rms_m", "max_m")}
 
 
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
-    """Return the errors of all simulations, RMS over samples and the fitted maximum."""
     experiments = {}
     squares = []
     largest = []
@@ -318,7 +300,6 @@ def _forward_results(answer: SolvedProblem) -> ForwardResult:
 
 
 def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
-    """Return the errors of an experiment's simulation; if it failed, the reason."""
     fitted = experiment.name in answer.solution.rms_by_experiment_m
     simulated = answer.rollouts[experiment.name]
     if not isinstance(simulated, ForwardSimulation):
@@ -343,7 +324,6 @@ def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedE
 
 
 def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
-    """Return nuisance parameters but places of markers, by experiment and label."""
     deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, NuisanceResult]] = {}
     for part in answer.solution.parts:
@@ -378,7 +358,6 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 
 
 def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
-    """Yield sentences on nuisance parameters but places, with estimate and prior."""
     nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
     for row in (*part.transcription.experiment.nuisance.kinds, GAUGE):
@@ -402,10 +381,7 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
 def _nuisance_sentence(
     part: ExperimentIterate, components: Sequence[int], values: Array, answer: SolvedProblem
 ) -> str:
-    """Return a sentence with the size of a nuisance parameter, or of a vector of them, its standard
-    error if known, its prior, and, for kinds whose sentence has a place for it, whether it is at
-    its bound.
-    """
+    """Say whether it is at its bound for kinds whose sentence has a place for it."""
     nuisance = part.transcription.nuisance
     k = components[0]
     entry = nuisance.entries[k]

@@ -119,9 +119,7 @@ def _is_nearly_half(name: str, value: float) -> bool:
 def _negative_terms(
     solution: Solution, values: Mapping[str, float], ended: Container[str]
 ) -> dict[str, float]:
-    """Return the starts of the first exponents of Ogden's law that ended at a positive bound, and of
-    their factors: the usual exponent with a negative sign, and the same shear modulus.
-    """
+    """Give the usual exponents a negative sign, and the same shear modulus."""
     ogden = any(
         part.material.name.startswith("ogden-")
         for each in solution.collocation.transcriptions
@@ -140,10 +138,7 @@ def _negative_terms(
 def _widened(
     item: Parameter, values: Mapping[str, float], ended: Container[str], locks: bool
 ) -> Parameter:
-    """Return a parameter with the widest bounds in place of its default ones, of shares those that
-    ended at one; on a linear scale if it may be negative and ended at its lower bound, or starts
-    from a negative value.
-    """
+    """Widen default bounds; a parameter that may be negative is linear."""
     is_share = without_region(item.name) == SHARE.name
     if is_share and item.name not in ended:
         return item
@@ -162,13 +157,7 @@ def _widened(
 
 
 def _usual_poisson_start(solution: Solution) -> Start | None:
-    """Return the parameters at a solution, as guesses, with high Poisson's ratios replaced by the
-    usual one at the same Young's modulus.
-
-    A ratio is high above `NEARLY_INCOMPRESSIBLE`. Only ratios of regions count in which both
-    moduli, or the ratio alone, are estimated. Other estimated parameters have their estimates as
-    guesses. None if no ratio is high, or if a replaced value is not within its bounds.
-    """
+    """Keep Young's modulus, where a ratio above `NEARLY_INCOMPRESSIBLE` is estimated."""
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)
     free = {item.name: item for item in collocation.parameters.free}
@@ -191,10 +180,7 @@ def _usual_poisson_start(solution: Solution) -> Start | None:
 
 
 def _usual_modulus(name: str, young_pa: float) -> float:
-    """Return the starting value of the constant `name`, one of the `LAME` constants with its
-    region: `USUAL_POISSON` for a Poisson's ratio, or the modulus [Pa] that follows from it and from
-    Young's modulus `young_pa`.
-    """
+    """Return `USUAL_POISSON`, or the modulus [Pa] that follows from it and Young's modulus."""
     value = (
         USUAL_POISSON
         if without_region(name) == "poisson"
@@ -205,9 +191,7 @@ def _usual_modulus(name: str, young_pa: float) -> float:
 
 
 def _power_law_start(solution: Solution) -> Start | None:
-    """Return the start of `power_law_start`; None where there is none, and where the solution has
-    the same exponents or fits as well by the closed forms.
-    """
+    """None if the exponents are the same, or the closed forms fit as well."""
     collocation = solution.collocation
     start = power_law_start(collocation)
     if start is None:

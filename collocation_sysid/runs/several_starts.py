@@ -55,13 +55,7 @@ def robust_loss(solution: Solution) -> float:
 
 
 class _KnownMinimum(Exception):
-    """Arrival of a search at a minimum that is known.
-
-    Attributes
-    ----------
-    solution : Solution
-        Solution at that minimum.
-    """
+    """A search has arrived at a minimum that is known."""
 
     def __init__(self, solution: Solution) -> None:
         super().__init__()
@@ -74,8 +68,6 @@ def _until_known(method: Method, known: Sequence[Solution]) -> Method:
     def solve(
         collocation: Collocation, watch: Watch | None = None, start: Array | None = None
     ) -> Solution:
-        """Solve by the method; see `Method`."""
-
         def watch_for_known(line: Iteration) -> None:
             """Pass an entry of the history to `watch`, then compare it with the known solutions."""
             if watch is not None:
@@ -90,7 +82,6 @@ def _until_known(method: Method, known: Sequence[Solution]) -> Method:
 
 
 def _is_at(line: Iteration, solution: Solution) -> bool:
-    """Return whether an iterate is at the minimum of a solution, see `_until_known`."""
     last = solution.history[-1]
     return (
         line.share == 1.0

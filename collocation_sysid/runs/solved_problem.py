@@ -135,7 +135,6 @@ class SolvedProblem:
         }
 
     def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
-        """Return the estimate corrected for known errors, with uncertainties."""
         item = next(
             (each for each in self.solution.collocation.parameters.components if each.name == name),
             None,
@@ -651,7 +650,6 @@ class SolvedProblem:
         return pandas.DataFrame.from_dict(rows, orient="index")
 
     def _row(self, name: str) -> dict[str, float | str]:
-        """Return the row of an estimate in `to_frame`; NaN for unknown numbers."""
         each = self.estimates[name]
         combined = each.combined95 or (np.nan, np.nan)
         statistical = each.statistical95 or (np.nan, np.nan)
@@ -669,7 +667,6 @@ class SolvedProblem:
         }
 
     def _estimate(self, name: str) -> ReportedEstimate:
-        """Return the estimate with a name."""
         if name not in self.estimates:
             known = list(self.estimates)
             expected = f"expected one of {', '.join(known)}{hint_at(name, known)}"
@@ -695,7 +692,6 @@ class SolvedProblem:
 
 
 def _optional_package(name: str, purpose: str) -> Any:
-    """Return an installed package that only some methods need."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -703,7 +699,6 @@ def _optional_package(name: str, purpose: str) -> Any:
 
 
 def _or_nan(value: float | None) -> float:
-    """Return the value; NaN for None."""
     return np.nan if value is None else value
 
 

@@ -139,17 +139,13 @@ def solve(
 
 
 def _start_limit_s(problem: Problem, solver: Method) -> float:
-    """Return the longest time of the search for a start [s]: that of the method, or `START_S` where
-    none is stated and the elements are not made for the Poisson's ratio.
-    """
+    """`START_S` where none is stated and elements are not made for the Poisson's ratio."""
     limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else float("inf")
     return START_S if limit_s == UNLIMITED_S and _incompressible_remedy(problem) else limit_s
 
 
 def _incompressible_remedy(problem: Problem) -> str:
-    """Return a phrase for problems whose simulations are slow because the elements are not made for
-    a Poisson's ratio that is stated or guessed near one half; "" for others.
-    """
+    """Elements that are not made for a ratio near one half make simulations slow; else ""."""
     ratios = [
         item.guess
         for item in problem.parameters.components
@@ -170,7 +166,6 @@ def _solve_by(
     start: str | Path | WarmStart | None,
     scheduler: str | None,
 ) -> Solution:
-    """Return the solution of `solve` with a method."""
     if scheduler is not None and not isinstance(solver, ReducedSpace):
         raise InputError(
             f"{getattr(solver, 'name', solver)} cannot distribute its experiments to workers; "
@@ -192,7 +187,7 @@ def _solve_by(
 
 
 def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float] | None:
-    """Return the most likely correlation length [m] by field; None without a choice."""
+    """Lengths are in metres; None without a choice."""
     fields = {part.field for body in problem.bodies for part in body.parts if part.field}
     has_choice = any(len(field.field.lengths_m) > 1 for field in fields)
     if not has_choice or not solution.status.converged:
@@ -211,17 +206,7 @@ def _solve_from_smaller(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Solve a smaller problem first, with a tolerance of at least `COARSE_TOLERANCE`, and the given
-    one from there.
-
-    The result counts the iterations and evaluations on the given problem only, but the times of both
-    solves; the scan is that of the first. After an interruption of the first its point is returned.
-
-    Raises
-    ------
-    NoStartError
-        If one of the two searches fails, or the first gives no start.
-    """
+    """Count iterations on the given problem only, but the times of both solves."""
     rough = replace(solver, tolerance=max(solver.tolerance, COARSE_TOLERANCE))
     with search_activity(smaller.activity):
         try:
@@ -264,9 +249,7 @@ def _solve_once(
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
-    """Solve a problem with fixed correlation lengths, from guesses, a scan, or an earlier
-    solution.
-    """
+    """Solve with fixed correlation lengths, from guesses, a scan, or an earlier solution."""
     notes: list[str] = []
     if given_start is None and isinstance(solver, ReducedSpace):
         for kind in (CoarseStart, ThinnedStart):
@@ -343,7 +326,6 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
 
 
 def _feature_notes(solution: Solution) -> list[str]:
-    """Return the notes of all features on the fitted experiments, in their order."""
     parts = solution.parts
     lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
     return lost + [note for part in parts for feature in FEATURES for note in feature.notes(part)]
@@ -457,7 +439,6 @@ def _better_of(
 
 
 def _as_interrupted(solution: Solution) -> Solution:
-    """Return a copy of a solution whose further search was interrupted before an iterate."""
     return replace(solution, status=Status.INTERRUPTED, message=Status.INTERRUPTED.sentence)
 
 

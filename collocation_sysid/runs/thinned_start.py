@@ -39,10 +39,7 @@ class ThinnedStart(SmallerProblem):
 
     @classmethod
     def of(cls, problem: Problem, method: ReducedSpace) -> ThinnedStart | None:
-        """Return the problem with at most `THINNED_POINTS` unlabelled points in each sample of its
-        sensors, without notes; None if none of the fitted experiments has more than `MANY_POINTS` in
-        one. The problem is not modified.
-        """
+        """Keep `THINNED_POINTS` of each sample; None if no sample has more than `MANY_POINTS`."""
         experiments = [
             each
             if each.validation

@@ -153,9 +153,7 @@ def solution_concerns(
 
 
 def _outlier_counts(solution: Solution) -> tuple[int, int]:
-    """Return the numbers of samples beyond the threshold of a stated Huber loss, and of all samples;
-    points of depth cameras, which always have this loss because of edges, do not count.
-    """
+    """Points of depth cameras do not count, because edges always require this loss."""
     huber = solution.collocation.huber or np.inf
     wild = samples = 0
     for part in solution.parts:
@@ -208,7 +206,6 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 def _prediction_concerns(
     solution: Solution, rollouts: Mapping[str, ForwardSimulation | str]
 ) -> Iterator[Concern]:
-    """Yield fitted recordings whose simulation misses by more than the noise."""
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation) and solution.part_of(name) is not None:
             for misfit in rollout.misfits:
@@ -218,10 +215,7 @@ def _prediction_concerns(
 def _forward_concerns(
     name: str, rollout: ForwardSimulation | str, fitted: Mapping[str, Sequence[InstrumentMisfit]]
 ) -> Iterator[Concern]:
-    """Yield concerns about the forward simulation of an experiment: that it failed, or that it
-    misses measurements of any kind by more than the noise and the fit, of this experiment or, for
-    validation, of all. `fitted` are the misfits of the fitted experiments.
-    """
+    """A simulation failed, or misses measurements by more than the noise and the fit."""
     if not isinstance(rollout, ForwardSimulation):
         yield Concern("roll-out/failed", "doubtful", data={"experiment": name, "why": rollout})
         return

@@ -196,8 +196,6 @@ def equilibrium_shapes_m(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Best fit of one description of an image."""
-
     # Root mean square distance of the visible surface from the points, each at most the gate.
     distance_m: float
     # (3,): estimated error of the camera's pose.
@@ -207,22 +205,7 @@ class _Fit:
 
 
 class _ImageComparison:
-    """Comparison of the first image of a camera with shapes of the body.
-
-    Attributes
-    ----------
-    stated : MeasuredPixels
-        The image as stated.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    camera : DepthCameraModel
-    first : int
-        Index of the first image that has points.
-    shapes_m : sequence of (n, 3) arrays
-        Node positions [m].
-    """
+    """Comparison of the first image of a camera with shapes (n, 3) [m] of the body."""
 
     stated: MeasuredPixels
 
@@ -286,7 +269,6 @@ class _ImageComparison:
             yield Hypothesis("camera-pose", self.subject, data=data, strength=strength)
 
     def fit(self, image: MeasuredPixels) -> _Fit:
-        """Return the best fit of a description of the image among all shapes; cached."""
         if image in self.known:
             return self.known[image]
         cloud = ExactCloud(image.points_m)
@@ -301,7 +283,6 @@ class _ImageComparison:
         return self.known[image]
 
     def _fit_shape(self, cloud: ExactCloud, index: int, iterations: int) -> _Fit:
-        """Return the fit of points to one shape."""
         places_m, normals = self.surfaces[index]
         gate_m = self.camera.depth.gate_m
         size_m = self.camera.size_m
@@ -334,7 +315,6 @@ class _ImageComparison:
         return replace(fit, misfit=float(misfit))
 
     def _pose_deviations(self, fit: _Fit) -> Array:
-        """Return the pose error (6,) of a fit in standard deviations of its prior."""
         errors = np.concatenate([fit.turn_rad, fit.shift_m])
         weights = np.concatenate(
             [self.camera.prior_weights(DEPTH_TURN), self.camera.prior_weights(DEPTH_SHIFT)]
@@ -342,7 +322,6 @@ class _ImageComparison:
         return weights * errors
 
     def _mistakes(self) -> Iterator[Hypothesis]:
-        """Yield each common mistake with the image that corrects it."""
         image = self.stated
         size = np.array([image.columns - 1.0, image.rows - 1.0])
         u, v = image.pixels.T
@@ -378,5 +357,4 @@ class _ImageComparison:
         yield self._hypothesis("camera-rays", image.with_depths_of_ray_lengths())
 
     def _hypothesis(self, code: str, corrected: MeasuredPixels, **data: object) -> Hypothesis:
-        """Return a hypothesis with the image that corrects it, and data of its message."""
         return Hypothesis(code, self.subject, data=data, corrected=corrected, handicap=ONE_OF_MANY)

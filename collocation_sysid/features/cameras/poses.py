@@ -73,21 +73,18 @@ def _scaled(seeing: CameraDescription, factor: float) -> CameraDescription:
 
 
 def _rotated(seeing: CameraDescription, rotation: list[list[int]]) -> CameraDescription:
-    """Return a copy with the camera's frame rotated about its own axes."""
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3] @ np.array(rotation, dtype=float)
     return replace(seeing, pose=pose)
 
 
 def _with_transposed_rotation(seeing: CameraDescription) -> CameraDescription:
-    """Return the description with the rotation of the camera's pose transposed."""
     pose = seeing.pose.copy()
     pose[:3, :3] = pose[:3, :3].T
     return replace(seeing, pose=pose)
 
 
 def _with_factor(seeing: CameraDescription, factor: float) -> CameraDescription:
-    """Return a copy of the description with another factor of the points, in place of its own."""
     return replace(seeing, factor=factor)
 
 
@@ -192,25 +189,7 @@ def camera_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 class _CameraTrial:
-    """Test of other descriptions of one camera.
-
-    Attributes
-    ----------
-    declared : CameraDescription
-        Description as stated.
-    within_m : float
-        Points within this distance of the undeformed body may belong to it [m].
-    points_m, body_m : float
-        Median distances of the points and of the undeformed body from the camera [m].
-    collapsed : bool
-        Whether too few points are left to be near much of the body.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    depth : Depth
-        Depth camera of the experiment; the first sample with points is used.
-    """
+    """Test of other descriptions of one camera by the first sample with points."""
 
     declared: CameraDescription
     within_m: float
@@ -259,13 +238,7 @@ class _CameraTrial:
         return float(np.isfinite(nearest).mean())
 
     def best_corrections(self) -> list[tuple[str, ...]]:
-        """Return the combinations of one mistake, or else of two, whose correction makes the body
-        visible, best first, as tuples of keys of `MISTAKES` and `POWERS`.
-
-        All combinations whose share is at least `WELL`, and within `EQUIVALENT_MISFIT` of the best,
-        are returned, because a body that looks alike from two sides does not distinguish them.
-        Empty if none does.
-        """
+        """All that are about as good are returned: a body may look alike from two sides."""
         for count in (1, 2):
             alone = (POWERS,) if count == 1 else ()
             shares = {
@@ -279,6 +252,5 @@ class _CameraTrial:
         return []
 
     def _corrected(self, mistakes: tuple[str, ...]) -> CameraDescription:
-        """Return the stated description with mistakes corrected in turn."""
         undo = dict(chain.from_iterable(kind.items() for kind in (*MISTAKES, POWERS)))
         return reduce(lambda seeing, name: undo[name](seeing), mistakes, self.declared)

@@ -77,17 +77,7 @@ def camera_clock_hypotheses(part: ExperimentIterate) -> Iterator[Hypothesis]:
 
 
 class _MotionComparison:
-    """Comparison of the images of one camera with a motion of the surface.
-
-    Parameters
-    ----------
-    residual : DepthResidual
-        Measurement model of the camera.
-    positions_m : (T, n, 3) array
-        Nodes of the body at the times of the observable [m].
-    is_simulated : (S,) array of bool
-        Images within these times.
-    """
+    """Comparison of the images of one camera with a motion (T, n, 3) [m] of the surface."""
 
     def __init__(
         self, residual: DepthResidual, positions_m: Array, is_simulated: NDArray[np.bool_]
@@ -130,7 +120,6 @@ class _MotionComparison:
         yield from test.accepted(self._mistakes(subject))
 
     def _mistakes(self, subject: str) -> Iterator[Hypothesis]:
-        """Yield each common mistake, about the subject, with the times that correct it."""
         stated = self.stated
         reversed_order = ImageTimes(stated.images[::-1], stated.times_s)
         yield Hypothesis("camera-order", subject, data={}, corrected=reversed_order)

@@ -40,9 +40,7 @@ def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the mesh has unconnected parts, some of which no grasp holds;
-    nothing if all are held, without grasps, or with tendons.
-    """
+    """No grasp holds some of the parts; nothing is known without grasps, or with tendons."""
     cells = experiment.body.cells
     count = len(experiment.body.nodes_m)
     first = np.repeat(cells[:, 0], cells.shape[1] - 1)
@@ -61,12 +59,7 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that an obstacle contains more than `MOST_INSIDE` of the nodes of the
-    undeformed body at the first time.
-
-    If the obstacle is a plane with the whole body behind it, its normal is blamed
-    ("obstacle-normal"), else its place ("obstacle-place").
-    """
+    """Blame the normal of a plane with the whole body behind it, else the place of the obstacle."""
     nodes_m = experiment.rigid_positions(experiment.t_s[:1])[
         0, : len(experiment.body.nodes.points_m)
     ]

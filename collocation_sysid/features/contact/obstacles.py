@@ -70,13 +70,11 @@ def obstacle_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _diagonal_m(experiment: Experiment) -> float:
-    """Return the diagonal of the undeformed body [m]."""
     nodes_m = experiment.body.nodes.points_m
     return float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
 
 
 def _subject(experiment: Experiment, obstacle: Obstacle) -> str:
-    """Return the names of an obstacle and its experiment, for messages."""
     return f"obstacle '{obstacle.name}' of '{experiment.name}'"
 
 
@@ -87,12 +85,7 @@ def _noise_n(experiment: Experiment, forces: ObstacleForces) -> float:
 
 
 def _normal_and_tangential_n(obstacle: Obstacle, forces: ObstacleForces) -> tuple[Array, Array]:
-    """Return the component of the measured force on the body along the normal of a plane, positive
-    if the plane pushes, and the magnitude across it, (S,) each [N].
-
-    S counts the samples with all components of the force; others are left out. Both are empty for
-    other shapes.
-    """
+    """Return both (S,) at samples with all components; a plane pushes along its positive normal."""
     shape = obstacle.shape
     if not isinstance(shape, Plane):
         return np.zeros(0), np.zeros(0)
@@ -156,7 +149,6 @@ def _load_along_motion_n(
 def _outside_friction_cone(
     experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the friction of a plane is stated too small for its load."""
     if isinstance(obstacle.friction, str):
         return
     normal_n, tangential_n = _normal_and_tangential_n(obstacle, forces)
@@ -200,9 +192,6 @@ def _undriven_load(
 
 
 def _long_stroke(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that the motion of an obstacle is in another unit, because it is far
-    longer than the body; none for a motion.
-    """
     if not experiment.is_static:
         return
     stroke_m = _stroke_m(obstacle, experiment.t_s)
@@ -223,9 +212,7 @@ def _stroke_m(obstacle: Obstacle, times_s: Array) -> float:
 def _load_without_contact(
     experiment: Experiment, obstacle: Obstacle, forces: ObstacleForces
 ) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that an obstacle is elsewhere, because it has loads far from the
-    undeformed body, none deep inside, or loads without ever pressing.
-    """
+    """Loads are far from the undeformed body, or nothing ever presses."""
     spread = np.linspace(0, len(forces.t_s) - 1, min(len(forces.t_s), MOST_SAMPLES))
     samples = np.unique(spread.astype(int))
     forces_n = forces.forces_n[samples]

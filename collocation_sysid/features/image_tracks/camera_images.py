@@ -122,9 +122,6 @@ class CameraImages(CustomSensor):
     line_delay_sigma_s: float = key(NotNegative, default=0.0, kw_only=True)
 
     def _checked_times(self, where: str) -> Array:
-        """Return the times of the images; an `InputError` if there are none, they do not increase,
-        or the camera has no matrix.
-        """
         if self.camera.matrix is None:
             raise InputError(
                 f"the camera of {where} has no matrix; expected that of its calibration"
@@ -137,9 +134,7 @@ class CameraImages(CustomSensor):
         return times
 
     def _stated_unknowns(self) -> dict[str, float]:
-        """Return the stated standard deviations of the errors of the camera, by name; without those
-        that are zero.
-        """
+        """Return the stated standard deviations by name, without those that are zero."""
         pose = self.pose_sigma
         turn, shift = float(np.deg2rad(pose.turn_deg)), pose.shift_m
         if not self.has_known_pose:
@@ -168,7 +163,6 @@ class CameraImages(CustomSensor):
 
     @property
     def number_names(self) -> Sequence[str]:
-        """Names of the columns."""
         return self.columns
 
     @property
@@ -177,7 +171,6 @@ class CameraImages(CustomSensor):
         return self.name
 
     def unknown_label(self, name: str) -> str:
-        """Return the label of an unknown of the camera, with its unit."""
         row, axis = CAMERA_UNKNOWNS[name]
         return f"{row.label.format(which=self.camera_name, axis=axis)} [{row.unit}]"
 

@@ -135,7 +135,6 @@ def _track_hypothesis(
     rms: float,
     usual: float,
 ) -> Hypothesis:
-    """Return what is wrong with a track that deviates."""
     name = residual.sensor.names[k]
     known = np.flatnonzero(np.isfinite(measured).all(axis=1))
     strength = rms / max(usual, 1.0)

@@ -127,7 +127,6 @@ def _read_table(grid: Table) -> TrackFile:
 
 
 def _usual_columns(columns: Sequence[str]) -> list[str]:
-    """Return the names of columns with coordinates called u and v, and a likelihood."""
     usual = {name: "likelihood" for name in LIKELIHOODS}
     parts = [re.fullmatch(r"(?:(.+)[._])?([a-z]+)", name) for name in columns]
     if not any(part and part[2] == "z" for part in parts):
@@ -202,11 +201,7 @@ def _long_table(grid: Table, point: int, t_s: Array | None, frames: Array) -> Tr
 def _by_label(
     grid: Table, column: int, called: str, at: Array, pixels: Array, likelihood: Array | None
 ) -> tuple[list[str], Array, Array, Array | None]:
-    """Return the labels in a column, the S times or images `at` of the rows, each once, and pixels
-    (S, N, 2) and likelihoods (S, N) of the N points of all labels, from those of the rows.
-
-    A label that is repeated at one time is refused, `called` as its format says.
-    """
+    """Return each label and time once, with pixels (S, N, 2) and likelihoods (S, N)."""
     of_row = [str(label) for label in grid.cells[:, column]]
     number = {label: k for k, label in enumerate(dict.fromkeys(of_row))}
     label = np.array([number[each] for each in of_row])
@@ -332,7 +327,6 @@ def tracks_of_arrays(arrays: Mapping[str, Any]) -> TrackFile:
 
 
 def _with_distinct_names(tracks: TrackFile) -> TrackFile:
-    """Return the tracks; an `InputError` if two points have the same name."""
     counts = Counter(tracks.names)
     if twice := [name for name, count in counts.items() if count > 1]:
         raise InputError(f"{counts[twice[0]]} points are called {twice[0]!r}; expected one")
@@ -377,7 +371,7 @@ def _read_hdf5(file: Path) -> TrackFile:
 
 
 def _dataset(content: Any, name: str) -> Any:
-    """Return the array of a dataset of an HDF5 file, whose size is plausible."""
+    """Return an array of plausible size."""
     stored = content[name]
     size = stored.size * stored.dtype.itemsize
     require_plausible_size(name, stored.shape, size, stored.id.get_storage_size())
@@ -406,9 +400,7 @@ def _sleap_tracks(content: Any) -> TrackFile:
 
 
 def _sleap_labels(content: Any) -> TrackFile:
-    """Return the points of a file of labels of one video; points that a person placed have the
-    likelihood one, and precede predicted ones.
-    """
+    """Points that a person placed have the likelihood one, and precede predicted ones."""
     try:
         stated = json.loads(_text(content["metadata"].attrs["json"]))
         nodes = [each["name"] for each in stated["nodes"]]

@@ -244,18 +244,13 @@ class _FirstImages:
         return places_m, at_m, missed
 
     def places_m(self, errors: Array) -> dict[str, Array]:
-        """Return the places that were not known, with errors (6,) of the pose, by name."""
+        """Return the places that were not known, with errors (6,) of the pose."""
         places_m = self._on_surface(errors)[0]
         names = [str(self.tracks.names[k]) for k in self.points.tolist()]
         return {names[k]: places_m[k] for k in np.flatnonzero(self.is_free).tolist()}
 
     def pose_errors(self) -> Array:
-        """Return the errors (6,) of the pose, weighted by their priors, with which known points are
-        where they appear, and the rays of the others meet the body.
-
-        Of a pose that is off by many pixels, every residual would be beyond the threshold of Huber's
-        loss.
-        """
+        """Huber's loss is no help: a pose that is off by many pixels is beyond its threshold."""
         estimated = np.flatnonzero(self.sigmas)
         errors = np.zeros(6)
         used = ~self.is_left_out
@@ -381,17 +376,14 @@ class TrackedPlaces(Correspondences):
 
     @property
     def measured(self) -> ImageTracks:
-        """The tracks."""
         return self.tracks
 
     def with_start_values(self, phi: Array) -> Array:
-        """Return a copy of φ with the coordinates of the places and the aligned pose."""
         started = self._with_places(phi)
         started[self.pose_parameters] = self.start_pose
         return started
 
     def continued(self, phi: Array, previous: Correspondences) -> Array:
-        """Return φ with the coordinates of places that have left their elements."""
         assert isinstance(previous, TrackedPlaces)
         return phi if self.association is previous.association else self._with_places(phi)
 
@@ -481,9 +473,7 @@ class TrackedPlaces(Correspondences):
         return other.with_visibility(shapes_m, is_settled=other is self)
 
     def _with_faces_of(self, points_m: Array, shapes_m: Array) -> TrackedPlaces:
-        """Return the correspondences with places at points (N, 3) [m] in the planes of their faces,
-        and the first s shapes (s, n, 3) [m]; self if each is on its face, or cannot leave it.
-        """
+        """Return self if each place is on its face, or cannot leave it."""
         association = self.association
         corners = self._corners
         least = barycentric_in_triangles(points_m, corners[self.faces]).min(axis=1)
@@ -549,9 +539,7 @@ class TrackedPlaces(Correspondences):
 def _enterable_faces(
     experiment: Experiment, names: Sequence[str], poses: Mapping[str, Array], shapes_at: ShapesAt
 ) -> NDArray[np.bool_]:
-    """Return the faces (N, F) that look at every camera in its first image of each point; none for
-    points with a stated place.
-    """
+    """Return the faces (N, F) that look at every camera; none for points with a stated place."""
     surface = experiment.body.mesh.surface
     stated = stated_places(experiment)
     faces = np.array([np.full(len(surface), name not in stated) for name in names])
@@ -583,9 +571,7 @@ def _are_shared(experiment: Experiment, tracks: ImageTracks) -> NDArray[np.bool_
 
 
 def _nearest_faces(body: Body, places_m: Array, enterable: NDArray[np.bool_]) -> Index:
-    """Return the surface triangle (N,) of each place (N, 3); of those that meet there, one that
-    looks at the cameras.
-    """
+    """Return the triangle (N,) of each place; where several meet, one that looks at the cameras."""
     corners = body.nodes_m[body.mesh.surface]
     near_m = SAME_FACE * float(body.mesh.quality().edge_mean_m)
     faces = []
@@ -601,9 +587,7 @@ def _nearest_faces(body: Body, places_m: Array, enterable: NDArray[np.bool_]) ->
 def _on_faces(
     association: MarkerAssociation, centres_m: Array, faces: Index, moved: Index
 ) -> MarkerAssociation:
-    """Return the association centred at places (N, 3) [m], with the planes and elements of the faces
-    (N,) for the places with the indices `moved`.
-    """
+    """Centre the association at places (N, 3) [m], with the faces (N,) of those `moved`."""
     mesh = association.body.mesh
     corners = association.body.nodes_m[mesh.surface[faces]]
     axes, cells = association.axes.copy(), association.cells.copy()

@@ -114,10 +114,7 @@ def points_on_surface(
 
 
 def _nearest_in_view(origin: Array, direction: Array, triangles: Array) -> tuple[int, Array, float]:
-    """Return the triangle, barycentric coordinates (3,) in it, and sine of the angle to a ray, of
-    the point of a surface that is nearest in view; of the triangles that look at the origin, because
-    the others are behind them.
-    """
+    """Only triangles that look at the origin count, because the others are behind them."""
     ahead = direction / np.linalg.norm(direction)
     # Two axes across the ray, in which edges are straight at depth one.
     across = np.linalg.svd(ahead[None])[2][1:]
@@ -189,11 +186,7 @@ def is_behind(
 def _fitted_poses(
     points_m: Array, seen: Array, turns: Array, shifts: Array, least_m: float
 ) -> tuple[Array, Array, Array]:
-    """Return the rotations (m, 3, 3) and translations (m, 3) to which the method of Levenberg and
-    Marquardt converges from m of the k starts (the best, if none converges), and the RMS (m,) of the
-    differences of points (P, 3) at unit depth from the seen ones (P, 2); points are at least
-    `least_m` in front of the camera.
-    """
+    """Return the m converged starts (or the best) and the RMS (m,) of (P, 2) at unit depth."""
     # All starts at once: SciPy's `least_squares` from one after the other takes nine times as long.
 
     def differences(turns: Array, shifts: Array) -> tuple[Array, Array, Array]:

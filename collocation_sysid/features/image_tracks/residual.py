@@ -47,10 +47,7 @@ class ImageTrackResidual(CameraImagesResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images and points.
-
-        Its data are those of the camera, see `camera_data`, and the row of the point in the image.
-        """
+        """Data are those of `camera_data`, and the row of the point in the image."""
         times = self._times
         count = self.observable.vector_count
         samples = len(times)
@@ -62,17 +59,7 @@ class ImageTrackResidual(CameraImagesResidual):
         return RowStencil(places, np.concatenate([data, rows[None]]))
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the pixel (u, v) of one point, and zero.
-
-        Parameters
-        ----------
-        values : (3, times) SX
-            Positions of the point at the neighbouring grid times [m].
-        phi : SX
-            Nuisance parameters of the camera and of the track, in prior standard deviations.
-        data : SX
-            Data of the sample, see `_stencil`.
-        """
+        """Return the pixel (u, v) of one point, and zero."""
         count = values.shape[1]
         *camera, row = ca.vertsplit(data, np.cumsum([0, values.shape[1], 1, 1, 9, 3, 1]).tolist())
         own = phi * self.nuisance.scales[self.own_parameters[0]][:, None]
@@ -85,16 +72,14 @@ class ImageTrackResidual(CameraImagesResidual):
 
     @staticmethod
     def _walk(drift: ca.SX, share: ca.SX, duration: ca.SX) -> ca.SX:
-        """Return the drift (2,) of a track from its terms, u first, at a share of the duration."""
+        """Return the drift (2,) from its terms, u first."""
         angles = [(k + 0.5) * np.pi for k in range(WALK_TERMS)]
         terms = [np.sqrt(2) / angle * ca.sin(angle * share) for angle in angles]
         walk = ca.sqrt(duration) * ca.vertcat(*terms)
         return ca.vertcat(ca.dot(walk, drift[:WALK_TERMS]), ca.dot(walk, drift[WALK_TERMS:]))
 
     def numbers(self, predicted: Array) -> Array:
-        """Return predictions (S, N, 3) as pixels (S, 2N); NaN for measured ones that are not
-        compared, because the point is hidden, lost or not on the body.
-        """
+        """Return pixels (S, 2N); NaN where the point is hidden, lost or not on the body."""
         pixels = predicted[..., :2]
         if self.sensor.pixels is not None:
             is_hidden = np.isfinite(self.sensor.pixels) & ~self.is_compared[..., :2]
@@ -116,30 +101,22 @@ class ImageTrackResidual(CameraImagesResidual):
 
     @property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3N,) of the positions of the points, see `position_sigmas_m`."""
         rest_m = self.observable.association.prior_places_m
         return self.position_sigmas_m(rest_m, self.correspondences.translations, self.sigmas)
 
     @property
     def uncompared_count(self) -> int:
-        """Number of pixel coordinates of points on the body that are left out because the body
-        hides them.
-        """
         places = self.correspondences
         return 2 * int(np.sum(self.sensor.is_seen & places.is_placed & ~places.is_visible))
 
     # Correspondences --------------------------------------------------------------------------
 
     def reassociated(self, x: Array, phi: Array) -> TrackedPlaces:
-        """Return places and visible points for the shapes that the first rows reach."""
         return self.correspondences.followed(phi, self._shapes(x))
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
     ) -> TrackedPlaces:
-        """Find unknown places and poses with the first rows of a motion; later images keep the
-        body rigid.
-        """
         places = self.correspondences
         tracks, experiment = self.sensor, self.experiment
         if only_pose:
@@ -158,7 +135,6 @@ class ImageTrackResidual(CameraImagesResidual):
         )
 
     def correspondences_of(self, measured: ImageTracks, x: Array, phi: Array) -> TrackedPlaces:
-        """Return the correspondences of the same tracks in another experiment."""
         return replace(self.correspondences, tracks=measured).followed(phi, self._shapes(x))
 
 
@@ -199,7 +175,6 @@ class ImageTracksModel(CorrespondenceModel):
         ).reshape(len(tracks.names), -1)
 
     def first_correspondences(self) -> TrackedPlaces:
-        """Return the correspondences with the undeformed body in its grasps."""
         experiment = self.grid.experiment
 
         def shapes_at(t_s: Array) -> Array:
@@ -216,7 +191,6 @@ class ImageTracksModel(CorrespondenceModel):
     def residuals(
         self, association: Association, correspondences: Correspondences | None
     ) -> tuple[ImageTrackResidual]:
-        """Return the residual of the tracks."""
         assert isinstance(correspondences, TrackedPlaces)
         tracks, grid = self.measurement, self.grid
         places = replace(

@@ -197,18 +197,11 @@ def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[
 
 
 def _alternatives(likely: Sequence[_Tried]) -> str:
-    """Return the first mistakes of several that explain the tracks about equally well."""
     return ", or if ".join(mistake for _, _, mistake in likely[:MOST_NAMED])
 
 
 class _Trial:
-    """Comparison of the tracks of one camera with the body carried by its grasp.
-
-    Attributes
-    ----------
-    samples : (s,) array
-        Images in which places are compared; empty if none shows a point within the experiment.
-    """
+    """Comparison of the tracks of one camera with the body carried by its grasp."""
 
     def __init__(self, experiment: Experiment, tracks: ImageTracks) -> None:
         self.experiment, self.declared, self.body = experiment, tracks, experiment.body
@@ -250,9 +243,7 @@ class _Trial:
         return self._carried_m + shape[:, None] * down
 
     def size_px(self, camera: Camera) -> float:
-        """Return the size of the body in the first image [pixels]; infinite if a part of it is not
-        in front of the camera.
-        """
+        """Return the size in the first image; infinite if a part is not in front of the camera."""
         own = _in_camera(camera, self.tracks.sample_times_s[self.samples[:1]], self._carried_m[:1])
         if (own[..., 2] <= 0).any():
             return np.inf
@@ -274,10 +265,7 @@ class _Trial:
     def _attached(
         self, described: ImageTracks, sample: int, shape_m: Array
     ) -> dict[int, tuple[Index, Array, float]]:
-        """Return nodes, weights and the angle by which the ray misses the body, of each point seen
-        in an image in which the body has a shape (n, 3) [m]; without the points whose pixel has no
-        ray.
-        """
+        """Return nodes, weights and the angle of the miss of each point whose pixel has a ray."""
         camera, surface = described.camera, self.body.mesh.surface
         found: dict[int, tuple[Index, Array, float]] = {
             k: (*self.known[k], 0.0)
@@ -298,9 +286,7 @@ class _Trial:
         return found | dict(zip(free, attached, strict=True))
 
     def distance_px(self, described: ImageTracks) -> float:
-        """Return the median distance of the tracks from the body [pixels], with the sag for which
-        it is least.
-        """
+        """Return the median distance of the tracks from the body, with the best sag."""
         return min(self._distance_px(described, self._sagging_m(sag)) for sag in SAGS)
 
     def _distance_px(self, described: ImageTracks, shapes_m: Array) -> float:
@@ -326,9 +312,7 @@ class _Trial:
         return float(np.median(np.concatenate(distances)))
 
     def hidden_count(self, camera: Camera) -> int:
-        """Return how many points with known places are on faces that look away from a camera in all
-        compared images.
-        """
+        """Count points with known places on faces that look away in all compared images."""
         surface = self.body.mesh.surface
         corners = self.body.nodes_m[surface]
         t_s = self.tracks.sample_times_s[self.samples]
@@ -346,10 +330,7 @@ class _Trial:
     # Motion -----------------------------------------------------------------------------------
 
     def unlike(self, described: ImageTracks) -> float:
-        """Return the deviation of the motion of the points near the grasp from that of the grasp,
-        over the latter; NaN without such points or motion, or if too few images are within the
-        experiment.
-        """
+        """Return the relative deviation of motions near the grasp from its own; NaN without any."""
         within = self._within(described.sample_times_s)
         if len(within) < COVERED * len(self.within):
             return np.nan
@@ -383,9 +364,7 @@ class _Trial:
     def without(
         self, rows: Iterable[Deviation], measure: Callable[[ImageTracks], float]
     ) -> list[_Tried]:
-        """Return a measure of the tracks without each of some mistakes, these tracks and the clause
-        that states the mistake, the least measure first.
-        """
+        """Return measure, tracks and clause without each mistake, the least measure first."""
         place = self.experiment.readings.index(self.declared)
         found = [each for row in rows if (each := corrected_hypothesis(row, self.experiment))]
         others = [(each.corrected.readings[place], each.data["mistake"]) for each in found]
@@ -393,15 +372,13 @@ class _Trial:
         return sorted(tried, key=lambda each: np.nan_to_num(each[0], nan=np.inf))
 
     def mistakes(self) -> Iterator[Deviation]:
-        """Yield the common mistakes of images and, if it is stated, of the pose."""
+        """Yield mistakes of images and, if it is stated, of the pose."""
         yield from self._wrong_images()
         if self.declared.has_known_pose:
             yield from self._wrong_poses()
 
     def _mistake(self, mistake: str, has_pose: bool = True, **changes: Any) -> Deviation:
-        """Return the row of tracks that are described wrongly, as a clause states; without a pose,
-        that is fitted again.
-        """
+        """Without a pose, the pose is fitted again."""
 
         def without(_: Measurement) -> ImageTracks:
             other = replace(self.tracks, **changes)
@@ -410,9 +387,6 @@ class _Trial:
         return measurement_mistake("image-tracks", self.declared, without, mistake=mistake)
 
     def with_fitted_pose(self, described: ImageTracks) -> ImageTracks:
-        """Return the tracks with the pose, unless it is known, that shows the known points in one
-        image best; of those that do it nearly as well, that with which the motion is most alike.
-        """
         if described.has_known_pose:
             return described
         found = poses_of_tracks(described, self.stated, self.rest, self._rigid_m)
@@ -446,9 +420,7 @@ class _Trial:
             yield self._mistake(mistake, has_pose=False, pixels=np.stack([new_u, new_v], axis=-1))
 
     def wrong_pixels(self) -> Iterator[Deviation]:
-        """Yield pixels that are scaled, shifted or of another unit, which errors of the pose
-        resemble.
-        """
+        """Errors of the pose resemble pixels that are scaled, shifted or of another unit."""
         camera, stated = self.tracks.camera, np.asarray(self.tracks.pixels)
         matrix = camera.require_matrix()
         for scale in SCALES:
@@ -476,9 +448,7 @@ class _Trial:
             yield self._mistake(mistake, pixels=stated + by_px)
 
     def _shift_px(self) -> Array:
-        """Return the shift of all pixels (2,) that puts the middle of the tracks of the first image
-        on that of their places, or of the body if no place is known; NaN if it is not in front.
-        """
+        """Return the shift (2,) that puts the middle of the tracks on that of the body, or NaN."""
         sample = int(self.samples[0])
         known = [k for k in self.known if self.is_seen[sample, k]]
         shape_m = self._carried_m[0]
@@ -500,11 +470,9 @@ class _Trial:
             yield self._mistake(mistake, pixels=pixels)
 
     def image_count(self, described: ImageTracks) -> int:
-        """Return how many images are within the experiment."""
         return len(self._within(described.sample_times_s))
 
     def wrong_times(self) -> Iterator[Deviation]:
-        """Yield wrong orders, rates and delays of the images."""
         t_s = self.tracks.sample_times_s
         yield from self.reversed_order()
         for rate in RATES:
@@ -543,7 +511,6 @@ class _Trial:
 
 
 def _spread(samples: Index, most: int) -> Index:
-    """Return at most `most` of some indices, evenly spread."""
     if not len(samples):
         return samples
     return samples[np.unique(np.linspace(0, len(samples) - 1, most).astype(int))]
@@ -555,15 +522,13 @@ def _middle(pixels: Array) -> Array:
 
 
 def _in_camera(camera: Camera, t_s: Array, points_m: Array) -> Array:
-    """Return points (s, P, 3) in the world in the frame of the camera at times (s,) [m]."""
+    """Return points (s, P, 3) [m] in the frame of the camera at times (s,)."""
     rotations, translations = camera.pose_at(t_s)
     return np.einsum("sji,spj->spi", rotations, points_m - translations[:, None])
 
 
 def _projected(camera: Camera, t_s: Array, points_m: Array) -> Array:
-    """Return the pixels (s, P, 2) of points (s, P, 3) in the world; NaN for those that are not in
-    front of the camera.
-    """
+    """Return pixels (s, P, 2); NaN for points that are not in front of the camera."""
     own = _in_camera(camera, t_s, points_m)
     pixels = np.full((*own.shape[:2], 2), np.nan)
     front = own[..., 2] > 0

@@ -139,15 +139,11 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
     )
 
     def read_times_s(self, folder: RecordingFolder, where: str) -> Array:
-        """Return the times of all images [s]."""
         if not folder.must_read(self.file):
             return np.zeros(0)
         return self._read_file(folder, where)[1]
 
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> ImageTracks:
-        """Return the tracks within the times t_s (T,) of the experiment [s], and note how many
-        images are used.
-        """
         camera = self.camera.read(folder, f"{where}.camera")
         arguments: dict[str, Any] = {
             "name": self.name,
@@ -199,7 +195,6 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
             )
 
     def _names(self, content: TrackFile, where: str) -> list[str]:
-        """Return the names of the points that are used."""
         names = list(content.names) if self.points is None else self.points
         for key, stated in (("points", names), ("places_m", [*self.places_m])):
             absent = [name for name in stated if name not in content.names]
@@ -212,7 +207,6 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
         return names
 
     def _read_file(self, folder: RecordingFolder, where: str) -> tuple[TrackFile, Array]:
-        """Return the content of the file, and the times of its images [s]."""
         file = folder.require_existing(self.file, f"{where}.file", "a file of tracks")
         with located(where=f"{where}.file"):
             content = read_tracks(file)
@@ -233,7 +227,6 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
         return content, self.start_s + content.frames / self.frame_rate_hz
 
     def _require_size(self, camera: Camera, pixels: Array, where: str) -> None:
-        """Raise an `InputError` if the images do not have the size of the calibration."""
         size = camera.size_px
         if size is None:
             return

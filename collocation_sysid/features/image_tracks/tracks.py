@@ -90,7 +90,6 @@ class ImageTracks(CameraImages):
     drift_sigma_px: float = key(NotNegative, default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the tracks, and complete what every custom sensor has, in place."""
         where = f"the image tracks '{self.name}'"
         names = tuple(self.names)
         count = len(names)
@@ -125,36 +124,30 @@ class ImageTracks(CameraImages):
 
     @property
     def title(self) -> str:
-        """Tracks and name of the camera."""
         return f"the tracks of {self.name}"
 
     @property
     def samples_text(self) -> str:
-        """Tracks and name of the camera."""
         return f"the image tracks '{self.name}'"
 
     @property
     def instrument_text(self) -> str:
-        """Number of points and name of the camera."""
         return f"{len(self.names)} points in images of '{self.name}'"
 
     @property
     def identity(self) -> Any:
-        """Name of the camera and of the points."""
         return self.name, self.names
 
     def vectors(self, values: Array) -> Array:
-        """Return numbers (S, 2N) as pixels (S, N, 2)."""
         return values.reshape(len(values), -1, 2)
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
-        """Return a copy with other pixels (S, 2N) at the times `t_s` (S,) [s]."""
         count = len(self.names)
         pixels = None if values is None else np.asarray(values, dtype=float).reshape(-1, count, 2)
         return replace(self, t_s=t_s, pixels=pixels)
 
     def with_zeros_at(self, t_s: ArrayLike) -> Self:
-        """Return a copy without pixels at the times `t_s` (S,) [s]: zeros would be rays of places."""
+        """Return a copy without pixels: zeros would be rays of places."""
         return self.with_samples(t_s, None)
 
     @property
@@ -196,9 +189,6 @@ class ImageTracks(CameraImages):
         return np.array([stated[name][1] if name in stated else body_m for name in self.names])
 
     def unknown_rows(self, experiment: Experiment) -> Iterator[tuple[Deviation, str, float]]:
-        """Yield row, label and prior standard deviation of each unknown: of the camera, of the
-        drift of the tracks, and of the places, which cameras share by the names of the points.
-        """
         is_stated = self.has_known_pose and self.is_place_known.all()
         yield from self.camera_rows(experiment, IMAGE_REACH if is_stated else CAREFUL_REACH)
         if drift_px := self.drift_px(experiment):
@@ -210,9 +200,7 @@ class ImageTracks(CameraImages):
                     yield SURFACE_PLACE, label, float(sigma)
 
     def other_views(self, experiment: Experiment) -> Iterator[tuple[str, Self]]:
-        """Yield the camera at each of `VIEWS`, of which it sees as many points of the body, spread
-        over the visible surface, whose places are unknown; none for a camera that moves.
-        """
+        """Use `VIEWS` of visible points without places; none for a camera that moves."""
         if self.camera.poses is not None or not self.has_known_pose:
             return
         body = experiment.body

@@ -66,7 +66,7 @@ def read_masks(path: Path) -> list[Mask]:
 
 
 def _read_png(file: Path) -> Mask:
-    """Return the mask of a PNG: its alpha channel if that is no constant, else its brightness."""
+    """Use the alpha channel if that is no constant, else the brightness."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)

@@ -77,7 +77,6 @@ class Outlines(CameraImages):
     same_camera_as: str | None = key(Text | None, default=None)
 
     def __post_init__(self) -> None:
-        """Check the masks, and complete what every custom sensor has, in place."""
         where = f"the outlines '{self.name}'"
         times = self._checked_times(where)
         if not self.has_known_pose:
@@ -112,7 +111,6 @@ class Outlines(CameraImages):
         )
 
     def _checked(self, number: int, mask: Any, where: str) -> Mask | None:
-        """Return a mask as a read-only array."""
         if mask is None:
             return None
         what = f"the mask {number + 1} of {where}"
@@ -142,7 +140,6 @@ class Outlines(CameraImages):
         return made
 
     def _point_count(self, masks: Sequence[Mask | None]) -> int:
-        """Return the largest number of points of an outline."""
         lengths = [
             np.sum(mask[1:] != mask[:-1]) + np.sum(mask[:, 1:] != mask[:, :-1])
             for mask in masks
@@ -161,17 +158,14 @@ class Outlines(CameraImages):
 
     @property
     def title(self) -> str:
-        """Outlines and name of the camera."""
         return f"the outlines of {self.name}"
 
     @property
     def samples_text(self) -> str:
-        """Outlines and name of the camera."""
         return f"the outlines '{self.name}'"
 
     @property
     def instrument_text(self) -> str:
-        """Number of masks and name of the camera."""
         return f"{sum(mask is not None for mask in self.all_masks)} outlines in images of '{self.name}'"
 
     @property
@@ -180,7 +174,6 @@ class Outlines(CameraImages):
         return id(self)
 
     def series(self) -> Iterator[tuple[str, Array]]:
-        """Yield the pixels at the edges of all masks, by their number in the image."""
         edges = [
             np.flatnonzero(np.diff(mask.ravel())).astype(float)
             for mask in self.all_masks
@@ -189,9 +182,7 @@ class Outlines(CameraImages):
         yield self.title, np.concatenate([*edges, np.zeros(0)])
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
-        """Return a copy with the masks at those times of which any value is finite; at other times
-        than its own there is none.
-        """
+        """Keep masks at times with a finite value; at other times than its own there is none."""
         times = np.asarray(t_s, dtype=float)
         same = len(times) == len(self.sample_times_s) and np.allclose(times, self.sample_times_s)
         if not same or values is None:
@@ -205,17 +196,12 @@ class Outlines(CameraImages):
 
     @property
     def camera_name(self) -> str:
-        """Name of the tracks of the same camera, else of the outlines."""
         return self.same_camera_as or self.name
 
     def unknown_label(self, name: str) -> str:
-        """Return the label of an unknown, with its unit."""
         return f"edge of {self.name} [px]" if name == EDGE else super().unknown_label(name)
 
     def unknown_rows(self, experiment: Experiment) -> Iterator[tuple[Deviation, str, float]]:
-        """Yield row, label and prior standard deviation of each unknown: of the camera, which tracks
-        of the same camera share, and of the edges.
-        """
         yield from self.camera_rows(experiment, IMAGE_REACH)
         if self.edge_sigma_px:
             yield GAUGE, self.unknown_label(EDGE), self.edge_sigma_px
@@ -223,9 +209,7 @@ class Outlines(CameraImages):
     # Simulation -------------------------------------------------------------------------------
 
     def simulated_text(self, experiment: Experiment, positions_m: Array) -> str:
-        """Return the masks of a motion (T, n, 3) [m] at the samples of an experiment as run lengths
-        in JSON.
-        """
+        """Return masks of (T, n, 3) [m] as run lengths in JSON."""
         nearest = np.abs(np.asarray(experiment.t_s)[:, None] - self.sample_times_s).argmin(axis=0)
         masks = [
             mask_of(self, experiment, positions_m[k], float(t_s))

@@ -89,11 +89,9 @@ class OutlinePairs(Correspondences):
 
     @property
     def measured(self) -> Outlines:
-        """The masks."""
         return self.outlines
 
     def with_start_values(self, phi: Array) -> Array:
-        """Return a copy of φ, on which the pairs do not depend otherwise."""
         return phi.copy()
 
     def in_shapes(self, shapes_m: Array, errors: Mapping[str, float]) -> OutlinePairs:
@@ -134,7 +132,6 @@ class OutlinePairs(Correspondences):
     def _pair(
         self, k: int, mask: NDArray[np.bool_], view: OutlineView, shape_m: Array, into: dict
     ) -> None:
-        """Find the points of one image and their edges, in place."""
         points = outline_points(view, self.surface, shape_m[self.surface.nodes])
         if points is None:
             return
@@ -168,7 +165,6 @@ class OutlinePairs(Correspondences):
         into["is_compared"][k, place] = has_edge[used]
 
     def _view(self, k: int, errors: Mapping[str, float]) -> OutlineView:
-        """Return the view of one image of a camera with errors."""
         camera = self.outlines.camera
         matrix = camera.require_matrix().copy()
         matrix[:2, :2] *= 1 + errors.get("focal_error", 0.0)
@@ -206,9 +202,7 @@ class OutlinesResidual(CameraImagesResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all images: the nodes of each point at the neighbouring times; data of the
-        camera, shape functions, normal and edge.
-        """
+        """Nodes at neighbouring times; data of the camera, shape functions, normal and edge."""
         pairs, times = self.correspondences, self._times
         samples, points = pairs.is_compared.shape
         places = times[:, None, :, None] * self.observable.vector_count + pairs.nodes[:, :, None]
@@ -224,18 +218,7 @@ class OutlinesResidual(CameraImagesResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return how far a point of the outline is outside of the edge of the mask [pixels], and two
-        zeros.
-
-        Parameters
-        ----------
-        values : (3, times · v) SX
-            Positions of the nodes at the neighbouring grid times [m].
-        phi : SX
-            Nuisance parameters of the camera and of the edges, in prior standard deviations.
-        data : SX
-            Data of the point, see `_stencil`.
-        """
+        """Return how far the point is outside of the edge [pixels], and two zeros."""
         corners = self.correspondences.nodes.shape[2]
         times = values.shape[1] // corners
         sizes = [0, times, 1, 1, 9, 3, corners, 2, 2]
@@ -248,18 +231,15 @@ class OutlinesResidual(CameraImagesResidual):
 
     @property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3n,) of the positions of the nodes, see `position_sigmas_m`."""
         nodes_m = self.experiment.body.nodes_m
         sigmas = np.full(len(nodes_m), self.sensor.sigma_px)
         return self.position_sigmas_m(nodes_m, self.correspondences.translations, sigmas)
 
     def numbers(self, predicted: Array) -> Array:
-        """Return the distances (S, E); NaN where there is no edge."""
         compared = self.is_compared[: len(predicted), :, 0]
         return np.where(compared, predicted[..., 0], np.nan)
 
     def simulated(self, motion: SampledMotion, phi: Array) -> Array:
-        """Return the distances (S, E) of the outlines of a simulated motion."""
         other = self.at_samples(motion.t_s, motion.reaction_grid)
         pairs = other.reassociated(motion.observed.x, phi)
         followed = replace(
@@ -270,7 +250,6 @@ class OutlinesResidual(CameraImagesResidual):
     # Correspondences --------------------------------------------------------------------------
 
     def _errors(self, phi: Array) -> dict[str, float]:
-        """Return the errors of the camera at φ (k,), by the names of its unknowns."""
         places = self.own_parameters[0]
         values = (phi * self.nuisance.scales)[places].tolist()
         return dict(
@@ -278,9 +257,7 @@ class OutlinesResidual(CameraImagesResidual):
         )
 
     def _late_shapes(self, x: Array, errors: Mapping[str, float]) -> Array:
-        """Return the nodes (s, n, 3) [m] at the first images that rows x (rows, 3n) reach, when the
-        middle row of the image was exposed.
-        """
+        """Return nodes (s, n, 3) [m] when the middle row of each image was exposed."""
         sensor = self.sensor
         known = int(np.count_nonzero(self._times[:, -1] < len(x)))
         nodes_m = x.reshape(len(x), -1, 3)
@@ -308,16 +285,13 @@ class OutlinesResidual(CameraImagesResidual):
         return contours
 
     def reassociated(self, x: Array, phi: Array) -> OutlinePairs:
-        """Return the pairs for the shapes that the first rows reach."""
         errors = self._errors(phi)
         return self.correspondences.in_shapes(self._late_shapes(x, errors), errors)
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
     ) -> OutlinePairs:
-        """Return the pairs for the shapes that the first rows reach, of the last row if that is
-        none; the present ones with `only_pose`.
-        """
+        """Use the last row if the first reach none; the present pairs with `only_pose`."""
         if only_pose:
             return self.correspondences
         errors = self._errors(phi)
@@ -327,7 +301,6 @@ class OutlinesResidual(CameraImagesResidual):
         return self.correspondences.in_shapes(shapes_m, errors)
 
     def correspondences_of(self, measured: Outlines, x: Array, phi: Array) -> OutlinePairs:
-        """Return the pairs of the same masks in another experiment."""
         errors = self._errors(phi)
         own = replace(self.correspondences, outlines=measured)
         return own.in_shapes(self._late_shapes(x, errors), errors)
@@ -352,7 +325,6 @@ class OutlinesModel(CorrespondenceModel):
         return all_nodes(self.grid.experiment.body, len(self.grid.t_s))
 
     def first_correspondences(self) -> OutlinePairs:
-        """Return the correspondences with the undeformed body in its grasps."""
         experiment = self.grid.experiment
         at_s = np.clip(self.measurement.sample_times_s, *experiment.t_s[[0, -1]])
         shapes_m = experiment.rigid_positions(at_s)
@@ -361,7 +333,6 @@ class OutlinesModel(CorrespondenceModel):
     def residuals(
         self, association: Association, correspondences: Correspondences | None
     ) -> tuple[OutlinesResidual]:
-        """Return the residual of the outlines."""
         assert isinstance(correspondences, OutlinePairs)
         outlines, grid = self.measurement, self.grid
         samples, points = correspondences.is_compared.shape

@@ -61,9 +61,6 @@ class OutlinesSection(MeasurementSection, of=Outlines):
         return self._read_file(folder, where)[1]
 
     def read(self, folder: RecordingFolder, where: str, t_s: Array) -> Outlines:
-        """Return the masks within the times t_s (T,) of the experiment [s], and note how many are
-        used.
-        """
         if self.camera.pose == "unknown":
             raise InputError(
                 'found "unknown", but a body may have the same outline from several sides; expected '
@@ -91,7 +88,6 @@ class OutlinesSection(MeasurementSection, of=Outlines):
             return Outlines(t_s=at_s[is_used], masks=used, **arguments)
 
     def _read_file(self, folder: RecordingFolder, where: str) -> tuple[list[Mask], Array]:
-        """Return the masks of the file, and their times [s]."""
         path = folder.path / (self.file or "")
         if self.file is None or not path.is_dir():
             path = folder.require_existing(self.file, f"{where}.file", "a file of masks")

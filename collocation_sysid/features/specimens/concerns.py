@@ -88,9 +88,7 @@ def as_specimen_concerns(
 
 
 def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:
-    """Return what a concern is about in the words of the test: a sample with its strain; for a table
-    of moduli the table in place of its stress, and modulus and time or frequency of a sample.
-    """
+    """A table of moduli stands in place of its stress."""
     sample = data.get("number", 0) - 1
     names = {"sample": f"sample {sample + 1}"} if sample >= 0 else {}
     for key in ("of", "marker"):
@@ -112,7 +110,6 @@ def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[s
 
 
 def _place(t_s: Array, sample: int, moduli: Mapping[str, Array]) -> str:
-    """Return the time or the frequency of a sample (index) of a table of moduli."""
     if len(moduli) == 1:
         return f"{t_s[sample]:.4g} s"
     quarter_s = t_s[sample] - t_s[sample - 1]
@@ -120,7 +117,6 @@ def _place(t_s: Array, sample: int, moduli: Mapping[str, Array]) -> str:
 
 
 def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
-    """Return fitted laws, range of stretches or strains, and laws to compare with."""
     laws = list(
         dict.fromkeys(part.material.name for each in experiments for part in each.body.parts)
     )
@@ -133,9 +129,7 @@ def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
 
 
 def _changes_volume(experiment: Experiment) -> bool:
-    """Return whether the measured lateral stretches of a uniaxial test show a change of volume:
-    by the median over the larger half of the strains.
-    """
+    """Compare the median over the larger half of the strains."""
     if experiment.specimen is None or experiment.specimen.test != "uniaxial":
         return False
     for gauge in experiment.readings:

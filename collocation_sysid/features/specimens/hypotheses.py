@@ -262,7 +262,6 @@ def _young_pa(solution: Solution) -> float:
 
 
 def _young_text(solution: Solution) -> str:
-    """Return Young's modulus of small strain at a fit of specimens, with its unit."""
     young_pa = _young_pa(solution)
     factor, unit = readable_stress([young_pa])
     return f"E = {factor * young_pa:.3g} {unit}"
@@ -271,7 +270,7 @@ def _young_text(solution: Solution) -> str:
 def _refit(
     solution: Solution, experiments: Sequence[Experiment], iterations: int
 ) -> Solution | None:
-    """Return the fit of other experiments from a solution's parameters; None on failure."""
+    """Return the fit from a solution's parameters; None on failure."""
     method = ReducedSpace(max_iterations=iterations, tolerance=TOLERANCE)
     try:
         refit = method(replace(solution.collocation, experiments=tuple(experiments)))
@@ -287,12 +286,7 @@ def _is_explained(
     tested: Hypothesis,
     stated_misfit: float,
 ) -> bool:
-    """Return whether the data are as expected from noise if one mistake is corrected.
-
-    The residuals of all specimens must be at most `MISFIT` times sigma, with the number of
-    estimated parameters considered, those of each stress uncorrelated, the nuisance parameters
-    plausible (`PLAUSIBLE_NUISANCE`), and χ² smaller by at least `DECISIVE`.
-    """
+    """Residuals below `MISFIT` σ, uncorrelated, plausible nuisances, and `DECISIVE` less χ²."""
     chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
     corrected = tested.deviation and corrected_hypothesis(tested.deviation, chosen[index])
     if not corrected:
@@ -323,7 +317,6 @@ def _is_correlated(residuals: Array) -> bool:
 
 
 def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
-    """Return a specimen with at most `most_samples` samples, evenly chosen."""
     count = len(experiment.t_s)
     chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
     readings = [
@@ -354,7 +347,6 @@ def _initial_slope(experiment: Experiment) -> float:
 
 
 def _misfit(parts: Sequence[ExperimentIterate]) -> float:
-    """Return the RMS of residuals and nuisance parameters in σ, without NaN."""
     count = sum(len(residuals) for part in parts for residuals in _residuals(part))
     return float(np.sqrt(_square_sum(parts) / max(1, count)))
 
@@ -377,7 +369,6 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
 
 
 def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Hypothesis]:
-    """Yield each common mistake that is possible, with its correction, untested."""
     for row in likely_mistakes(experiment, other_slopes_pa):
         if hypothesis := corrected_hypothesis(row, experiment):
             yield hypothesis
@@ -407,7 +398,6 @@ def likely_mistakes(
 
 
 def _other_kinds(experiment: Experiment) -> Iterator[Deviation]:
-    """Yield the rows of other kinds of test that measurements of a specimen can be from."""
     assert experiment.specimen is not None
     strain, _ = specimen_strains(experiment)
     kinds = CONFUSED_TESTS.get(experiment.specimen.test, ())
@@ -424,9 +414,7 @@ def _mistake(name: str, corrected: Callable[[Experiment], Correction]) -> Deviat
 
 
 def _of_engineering_stress(experiment: Experiment) -> Correction:
-    """Return the experiment with engineering stresses computed from true ones. Stresses in unloading
-    are smaller than in loading, like engineering in place of true stresses.
-    """
+    """Stresses in unloading are smaller, like engineering in place of true stresses."""
     assert experiment.specimen is not None
     strain, _ = specimen_strains(experiment)
     areas = area_ratios(experiment.specimen, strain)
@@ -436,7 +424,7 @@ def _of_engineering_stress(experiment: Experiment) -> Correction:
 
 
 def _of_ratios(experiment: Experiment) -> Correction:
-    """Return the experiment with strains in percent divided by 100."""
+    """Divide strains in percent by 100."""
     deformation = experiment.specimen
     assert deformation is not None
     strain, _ = specimen_strains(experiment)
@@ -457,7 +445,7 @@ def _of_area(experiment: Experiment, what: str, factor: float) -> Correction:
 
 
 def _of_another_kind(experiment: Experiment, test: str) -> Correction:
-    """Return the numbers as of another test; None if it cannot have all."""
+    """None if the other test cannot have all numbers."""
     assert experiment.specimen is not None
     if experiment.specimen.held or (
         test == "simple-shear" and "stretch" in experiment.specimen.columns
@@ -503,7 +491,6 @@ def _of_undeformed_gap(experiment: Experiment) -> Correction:
         return None
 
     def corrected(grasp: Grasp) -> Grasp:
-        """Return a grasp with its shift along the direction of shear as without pre-stretch."""
         if int(grasp.nodes[0]) not in deformation.displaced_nodes():
             return grasp
         shifts_m = grasp.poses.positions_m / [deformation.scale, 1.0, 1.0]
@@ -513,7 +500,6 @@ def _of_undeformed_gap(experiment: Experiment) -> Correction:
 
 
 def _without_placeholder(experiment: Experiment, name: str) -> Correction:
-    """Return the experiment without a measurement that is all zero."""
     (gauge,) = (each for each in experiment.readings if each.name == name)
     values = gauge.measured_values[np.isfinite(gauge.measured_values)]
     if not (values == (1.0 if name == LATERAL_NAME else 0.0)).all():
@@ -533,7 +519,6 @@ def area_ratios(deformation: HomogeneousDeformation, strain: Array) -> Array | N
 
 
 def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
-    """Return the experiment with stresses multiplied by factors (T,)."""
     readings = [
         replace(gauge, values=gauge.measured_values * factors[:, None])
         if gauge.unit == STRESS_UNIT and len(gauge.sample_times_s) == len(factors)
@@ -544,10 +529,7 @@ def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
 
 
 def _strained(experiment: Experiment, factor: float) -> Experiment:
-    """Return the experiment with prescribed strains multiplied by a factor."""
-
     def scaled(grasp: Grasp) -> Grasp:
-        """Return a grasp with its positions multiplied by the factor."""
         return replace(
             grasp, poses=replace(grasp.poses, positions_m=factor * grasp.poses.positions_m)
         )
@@ -556,10 +538,7 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
 
 
 def _compressed(experiment: Experiment, is_widening: bool) -> Correction:
-    """Return a copy of the experiment with strains and stresses of the opposite sign, and lateral
-    strains, if the file has these and not stretches, on which no sign acts; unless `is_widening`:
-    if they are positive in the file where the specimen becomes wider.
-    """
+    """Reverse lateral strains too, unless they are positive where the specimen becomes wider."""
     deformation = experiment.specimen
     assert deformation is not None
     strain, _ = specimen_strains(experiment)

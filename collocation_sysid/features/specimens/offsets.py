@@ -118,9 +118,7 @@ def _remaining_squares(matrix: Array, residual: Array) -> float:
 
 
 def _offsets(matrix: Array, residual: Array, count: int) -> tuple[Array, Array]:
-    """Return the offsets (k,) [Pa] of the measured stresses, less the predicted, and their standard
-    errors at unit noise; the last `count` columns of the matrix (n, p) are those of the offsets.
-    """
+    """Return offsets (k,) [Pa], measured less predicted, and standard errors at unit noise."""
     scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     inverse = np.linalg.pinv(matrix / scale)
     step = -(inverse @ residual) / scale

@@ -209,7 +209,7 @@ def has_inertial_wrenches(experiment: Experiment) -> bool:
 
 
 def _column_means(values: Array) -> Array:
-    """Return the mean (6,) without NaN; NaN for a column without values."""
+    """NaN is ignored."""
     is_measured = np.isfinite(values)
     counts = is_measured.sum(axis=0)
     sums = np.nansum(values, axis=0)
@@ -217,11 +217,11 @@ def _column_means(values: Array) -> Array:
 
 
 def _centred(values: Array) -> Array:
-    """Return columns without their means; NaN is ignored."""
+    """NaN is ignored."""
     return values - _column_means(values)
 
 
 def _rms(values: Array) -> float:
-    """Return the root mean square of the values that are not NaN; NaN without any."""
+    """NaN is ignored."""
     finite = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(finite**2))) if finite.size else np.nan

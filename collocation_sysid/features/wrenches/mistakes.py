@@ -165,7 +165,6 @@ def wrench_mistakes(collocation: Collocation) -> tuple[list[Hypothesis], list[st
 
 
 def _misses(part: ExperimentIterate) -> bool:
-    """Whether a wrench sensor's RMS residual exceeds `NOISE_LEVEL` σ."""
     return any(
         float(np.sum(sensor.residuals(observation, part.phi) ** 2))
         > NOISE_LEVEL**2 * sensor.is_compared.reshape(-1, 6).sum()
@@ -174,7 +173,7 @@ def _misses(part: ExperimentIterate) -> bool:
 
 
 def _markers_misfit(part: ExperimentIterate) -> float:
-    """Return the RMS of the markers' residuals in σ; 0 without samples."""
+    """RMS of the markers' residuals in σ; 0 without samples."""
     ((markers, positions),) = part.residuals_of(MarkerResidual)
     residuals = markers.residuals(positions, part.phi)
     return float(
@@ -187,7 +186,6 @@ def _markers_misfit(part: ExperimentIterate) -> float:
 def _from_markers(
     collocation: Collocation, transcriptions: Sequence[Transcription], method: ReducedSpace
 ) -> list[ExperimentIterate]:
-    """Return a fit to markers alone, without nuisance parameters of wrenches."""
     if not transcriptions:
         return []
     without_wrenches = [
@@ -207,7 +205,6 @@ def _from_markers(
 
 
 def _with_tools(part: ExperimentIterate, estimated: ExperimentIterate) -> ExperimentIterate:
-    """Return an experiment with the masses and centres of the tools of another iterate of it."""
     tools = part.transcription.nuisance.indices_of_rows(*TOOL)
     phi = np.array(part.phi)
     phi[tools] = estimated.phi[tools]
@@ -215,7 +212,6 @@ def _with_tools(part: ExperimentIterate, estimated: ExperimentIterate) -> Experi
 
 
 def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
-    """Return the hypotheses for all wrench sensors, fitted to markers alone."""
     hypotheses: list[Hypothesis] = []
     for part in parts:
         forced = part.reactions
@@ -225,22 +221,7 @@ def _of_parts(parts: Sequence[ExperimentIterate]) -> list[Hypothesis]:
 
 
 class _OneSensor:
-    """Comparison of one wrench sensor with the prediction from the markers.
-
-    Attributes
-    ----------
-    scale_known : bool
-        Whether densities or loads determine the size of the prediction.
-
-    Parameters
-    ----------
-    part : ExperimentIterate
-        The experiment, fitted to its markers alone.
-    sensor : WrenchResidual
-        Measurement model of the sensor.
-    forced : ReactionForces
-        Predicted reaction forces.
-    """
+    """Comparison of one wrench sensor with the prediction from the markers."""
 
     scale_known: bool
 
@@ -285,14 +266,10 @@ class _OneSensor:
             yield Hypothesis("wrench-tare", of, strength=float(largest / LARGEST_TARE))
 
     def _with_tare(self, tare: float | None) -> Experiment:
-        """Return the experiment as stated, with another prior of the tares."""
         return replace(self.declared, nuisance=replace(self.declared.nuisance, tare=tare))
 
     def misfit(self, trial: Experiment) -> float:
-        """Return the root mean square of the residuals of a description in standard deviations,
-        with the best tares and, if the scale is unknown, the best factor of the prediction that
-        is not negative; infinite without samples.
-        """
+        """Fit the best tares and, if the scale is unknown, a factor that is not negative."""
         measured, predicted = self._scaled_by_sigma(trial)
         if not np.isfinite(measured).any():
             return np.inf
@@ -300,9 +277,7 @@ class _OneSensor:
         return float(np.sqrt(np.nanmean((measured - factor * predicted) ** 2)))
 
     def _scaled_by_sigma(self, trial: Experiment) -> tuple[Array, Array]:
-        """Return samples and prediction (S, 6) of a description over the standard deviations of the
-        noise, without what its tare explains; NaN in the same places.
-        """
+        """Return (S, 6) over σ, without what the tare explains; NaN in the same places."""
         wrench = trial.wrenches[self._place]
         sigmas = wrench.sample_sigmas
         predicted = np.where(wrench.is_measured, self._predicted(wrench), np.nan) / sigmas
@@ -325,10 +300,7 @@ class _OneSensor:
         return self._known[at]
 
     def _gain(self, columns: slice) -> float:
-        """Return the positive factor with which the samples of some columns (slice) fit best,
-        relative to the other columns if the scale of the prediction is unknown; NaN if there is
-        none.
-        """
+        """Fit relative to the other columns if the scale is unknown; NaN if there is no factor."""
         measured, predicted = self._scaled_by_sigma(self.declared)
         slope = _slope(measured[:, columns], predicted[:, columns])
         # A common factor cannot be told where the scale is unknown, that of one kind can.
@@ -338,11 +310,7 @@ class _OneSensor:
         return 1 / slope if slope > 0 else np.nan
 
     def _point_shift_m(self) -> Array:
-        """Return the shift (3,) of the torques' reference point with which they fit best [m]; zero
-        if unknown.
-
-        About a point shifted by d, a torque is smaller by d × f.
-        """
+        """About a point shifted by d, a torque is smaller by d × f; zero if unknown."""
         measured, predicted = self._scaled_by_sigma(self.declared)
         if not np.isfinite(measured[:, TORQUES]).any():
             return np.zeros(3)
@@ -371,14 +339,12 @@ class _OneSensor:
         return shift_m
 
     def _hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis of each common mistake, untested."""
         subject = f"the wrench of '{self.part.transcription.experiment.name}'"
         for row, handicap in self._mistakes():
             if (found := corrected_hypothesis(row, self.declared)) is not None:
                 yield replace(found, subject=subject, handicap=handicap)
 
     def _mistakes(self) -> Iterator[tuple[Deviation, float]]:
-        """Yield each common mistake with the handicap of its hypothesis."""
         wrench = self.sensor.wrench
 
         def mistake(
@@ -437,10 +403,7 @@ class _OneSensor:
 
 
 def _without_tare(values: Array, tare: float) -> Array:
-    """Return columns (S, c) in standard deviations, without the offset that a tare with a prior of
-    `tare` standard deviations explains: none for 0. NaN is ignored. Columns without a value stay
-    NaN.
-    """
+    """Leave out the offset that a tare of prior `tare` σ explains; NaN is ignored."""
     is_measured = np.isfinite(values)
     prior_weight = 1 / tare**2 if tare else np.inf
     return values - np.nansum(values, axis=0) / np.maximum(
@@ -455,11 +418,7 @@ def _slope(measured: Array, predicted: Array) -> float:
 
 
 def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
-    """Return a copy of the wrench with the values of some columns multiplied by a factor.
-
-    The standard deviation of forces or torques among the columns is multiplied by the absolute
-    factor if that is above 1, and not decreased.
-    """
+    """Multiply σ of forces or torques, too, if the absolute factor is above 1."""
     values: Array = np.array(wrench.values)
     values[:, columns] *= factor
     larger = max(1.0, abs(factor))

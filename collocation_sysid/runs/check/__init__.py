@@ -187,7 +187,6 @@ def quick_check(problem: Problem) -> QuickCheck:
 
 
 def _quick_fields(problem: Problem, positions_m: Mapping[str, Array]) -> dict[str, Any]:
-    """Return the arguments of `QuickCheck` by name."""
     bodies = _bodies(problem)
     edges_m = {name: body.edges_m[1] for body in bodies for name in body.experiments}
     experiments = problem.experiments
@@ -323,9 +322,7 @@ def check_problem(
 def _expected_combinations(
     problem: Problem, collocation: Collocation, z: Array
 ) -> tuple[Combination, ...]:
-    """Return the combinations of constants that are determined although a constant alone is not, at
-    the variables z, with what would determine the constants; empty if they cannot be computed.
-    """
+    """Return an empty tuple if the combinations cannot be computed."""
     if not collocation.nq:
         return ()
     deviations = problem.assumed_deviations
@@ -337,7 +334,7 @@ def _expected_combinations(
 
 
 def _views_notes(collocation: Collocation, z: Array) -> list[str]:
-    """Return `views_note` as a list of one; empty without it, or if it cannot be computed."""
+    """Return `views_note` as a list; empty if it cannot be computed."""
     if not collocation.nq:
         return []
     try:
@@ -360,18 +357,13 @@ def expected_search_s(problem: Problem) -> float | None:
 
 
 def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:
-    """Return the estimated time [s] to fit the first `samples` samples, each counted as one time
-    step, to the markers alone; `total_s` is the time to simulate the complete recordings [s] of
-    `collocation`.
-    """
+    """Return the estimated time [s] of the first samples by markers alone, one time step each."""
     share = min(1.0, samples / _grid_rows(collocation))
     return FIT_SIMULATIONS * total_s * share
 
 
 def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
-    """Return the fields of `QuickCheck` and the totals of `CheckResult` for simulations at the
-    guess.
-    """
+    """Return the fields of `QuickCheck`, and the totals of `CheckResult`."""
     positions_m = {}
     for part in collocation.iterates(z):
         at_samples = part.x[part.transcription.sample_rows]
@@ -388,14 +380,13 @@ def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> d
 
 
 def _grid_rows(collocation: Collocation) -> int:
-    """Return the number of times of the grids of all fitted experiments together."""
     return sum(transcription.grid_times for transcription in collocation.transcriptions)
 
 
 def _program_fields(
     problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
 ) -> dict[str, Any]:
-    """Return size of the program and cost of the methods, as fields of `CheckResult`."""
+    """Return size of the program and cost of the methods."""
     lifted = with_lifted_variables(collocation)
     jacobian, hessian = nonzeros(problem, lifted)
     # Reduced space as the file has it, whichever method is chosen.
@@ -423,10 +414,7 @@ def _program_fields(
 
 
 def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
-    """Return the natural modes at the guess of each fitted experiment that moves, in their order,
-    with the scheme and step of the collocation; static and held out experiments are left out. Every
-    parameter must have a guess.
-    """
+    """Static and held out experiments are left out."""
     scheme = as_scheme(collocation.scheme)
     guesses = problem.parameters.guesses
     return tuple(
@@ -441,7 +429,7 @@ def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesChe
 def _concerns(
     problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
-    """Return the expected problems, the likeliest mistakes first."""
+    """Return the likeliest mistakes first."""
     experiments = problem.experiments
     parameters = problem.parameters
     bodies = findings.bodies
@@ -467,9 +455,6 @@ def _concerns(
 
 
 def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
-    """Return the finding of each body at the guess, with the names of its experiments; every
-    parameter must have a guess.
-    """
     guesses = problem.parameters.guesses
     names = [tuple(e.name for e in problem.experiments if e.body is b) for b in problem.bodies]
     specimens = {e.name for e in problem.experiments if e.specimen is not None}
@@ -490,9 +475,6 @@ def _bodies(problem: Problem) -> tuple[BodyCheck, ...]:
 
 
 def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
-    """Return the concerns of a body; unless it is the only body (`alone`), their data name its
-    experiments under "of".
-    """
     of = f"in the body of {', '.join(map(repr, body.experiments))}"
     named = (replace(each, data={"of": of, **each.data}) for each in body.concerns)
     return body.concerns if alone else tuple(named)

@@ -147,9 +147,7 @@ def bending_concerns(
 
 
 def _covariance(mesh: TetMesh) -> Array:
-    """Return the mean of (x − x̄)(x − x̄)ᵀ over the undeformed volume of a mesh, (3, 3) [m²], with
-    its centroid x̄.
-    """
+    """Return the mean of (x − x̄)(x − x̄)ᵀ over the undeformed volume (3, 3) [m²], and x̄."""
     shares = mesh.volumes_m3 / mesh.volume_m3
     corners = mesh.points_m[mesh.tetrahedra]
     corners = corners - shares @ corners.mean(axis=1)
@@ -160,7 +158,6 @@ def _covariance(mesh: TetMesh) -> Array:
 
 
 def _areas(triangles: Array) -> Array:
-    """Return the areas (k,) [m²] of triangles given by their corners (k, 3, 3) [m]."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.linalg.norm(normals, axis=1) / 2
 
@@ -287,18 +284,13 @@ def check_body(
 
 
 def _rest_shape(body: Body) -> str | None:
-    """Return the kind of the stated rest shape, "stress_free" or "under_gravity"; None if none is
-    stated.
-    """
     if body.rest_shape is None:
         return None
     return "stress_free" if body.scan_conditions is None else "under_gravity"
 
 
 def _rest_shape_change_m(body: Body, theta: Array) -> float:
-    """Return the largest distance of the mesh of a body from its stress-free shape [m]: 0 if the
-    mesh is that shape, NaN if none can be computed at the constants `theta` (k,).
-    """
+    """Return the largest distance [m], NaN if no stress-free shape can be computed."""
     if body.inverse_equilibrium is None:
         return 0.0
     if body.rest_shape_failure(theta) is not None:
@@ -308,19 +300,14 @@ def _rest_shape_change_m(body: Body, theta: Array) -> float:
 
 
 def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
-    """Yield a concern for each field, by name of the constant, whose shapes represent less than the
-    share `LEAST_FIELD_VARIANCE` of the prior variance.
-    """
+    """Shapes represent less than `LEAST_FIELD_VARIANCE` of the prior variance."""
     for name, field in fields.items():
         if field.share < LEAST_FIELD_VARIANCE:
             yield Concern("field/shapes", data={"name": name, **vars(field)})
 
 
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
-    """Return E [Pa] and ν at small strain of each part, then the constants of the body without
-    coefficients of fields, by name with the region; stated moduli replace computed ones. `theta`
-    (k,) are the constants.
-    """
+    """Return E [Pa] and ν of each part, then the constants; stated moduli replace computed ones."""
     moduli = {}
     for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
         young, poisson = engineering_constants(*lame)
@@ -374,9 +361,7 @@ def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck
 
 
 def _check_grasp(name: str, points_m: Array, grasp: Grasp, mean_edge_m: float) -> GraspCheck:
-    """Return number and bounding box of the nodes that a grasp prescribes, and how many nodes are
-    so close to a face of the box that rounding may decide.
-    """
+    """Count also nodes so close to a face of the box that rounding may decide."""
     nodes = grasp.nodes
     grasped_m = points_m[nodes]
     free_m = np.delete(points_m, nodes, axis=0)

@@ -104,9 +104,7 @@ def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
 
 
 def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
-    """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of a
-    problem with guesses, as int array (2,), by laying out its program without lifted variables.
-    """
+    """Return nonzeros (2,) of the Jacobian and of the Hessian's upper triangle, without lifting."""
     collocation = problem.collocation()
     structures = (collocation.jacobian_structure, collocation.hessian_structure)
     return np.array([len(indices) for _, indices in structures])

@@ -110,9 +110,7 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
 
 
 def _difference_step(collocation: Collocation) -> float:
-    """Return the step of the differences in the scaled variables z: `STEP`, or a small share of the
-    narrowest gap over which the pressure of an obstacle rises.
-    """
+    """Steps are in scaled z: `STEP`, or a share of the narrowest gap in which pressure rises."""
     widths_m = [
         term.law_of_contact.largest_width_m
         for transcription in collocation.transcriptions
@@ -122,9 +120,7 @@ def _difference_step(collocation: Collocation) -> float:
 
 
 def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: float) -> float:
-    """Return the relative error of a gradient along a random direction, at a random point near z,
-    from central differences.
-    """
+    """Return the relative error along a random direction near z, from central differences."""
     point = z + 1e-3 * rng.normal(size=len(z))
     direction = rng.normal(size=len(z))
     return _deviation(
@@ -133,12 +129,7 @@ def _slope_error(function, gradient, z: Array, rng: np.random.Generator, step: f
 
 
 def _deviation(function, exact: Array, point: Array, direction: Array, step: float) -> float:
-    """Return the largest deviation of an exact derivative from fourth-order central differences,
-    relative to the largest magnitude in `exact`.
-
-    If `exact` is zero, the result is 0 for equal differences, else huge; it is NaN if a value is
-    not finite.
-    """
+    """Return the largest deviation relative to `exact`, by fourth-order central differences."""
     after, before, two_after, two_before = (
         function(point + k * step * direction) for k in (1, -1, 2, -2)
     )

@@ -144,9 +144,6 @@ def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Conce
         return []
 
     def marker_data(marker: MarkerCheck, distance_m: float | None = 0.0) -> dict[str, Any]:
-        """Return the data of a concern about a marker; `distance_m` [m] is None or 0 if it does not
-        matter.
-        """
         by_mm = 1e3 * (distance_m or 0.0)
         frames = recording.frames
         named = {"marker": marker.name, "experiment": recording.experiment}

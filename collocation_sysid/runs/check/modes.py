@@ -131,10 +131,7 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
 def _reference_state(
     experiment: Experiment, is_prescribed: NDArray[np.bool_], time_s: float, theta: Array
 ) -> tuple[Array, str]:
-    """Return positions about which the body oscillates, and the name of this state: the equilibrium
-    if nodes are held and it can be found ("rest state"), else the undeformed shape, placed rigidly
-    ("undeformed shape").
-    """
+    """Return the equilibrium if nodes are held and it can be found, else the placed shape."""
     if is_prescribed.any():
         try:
             solver = NewtonSolver(experiment, prescribed=is_prescribed)
@@ -147,9 +144,7 @@ def _reference_state(
 def _mode_findings(
     modes: Modes, experiment: Experiment, scheme: Scheme, step_s: float
 ) -> tuple[ModeCheck, ...]:
-    """Return frequency, samples and steps per period, damping ratio, and the errors of the scheme
-    in period and damping, for each mode, lowest first.
-    """
+    """Return errors of the scheme in period and damping, for each mode, lowest first."""
     findings = []
     for frequency, ratio in zip(modes.frequencies_hz, modes.damping_ratios, strict=True):
         omega = 2 * np.pi * frequency
@@ -171,17 +166,12 @@ def _mode_findings(
 
 
 def _oscillating_damping_ratio(damping_ratio: float) -> float:
-    """Return the damping ratio of an oscillating mode; 0 for an overdamped one.
-
-    The scheme's change of the damping of an overdamped mode does not matter.
-    """
+    """Return 0 for an overdamped mode, whose numerical damping does not matter."""
     return damping_ratio if damping_ratio < 1 else 0.0
 
 
 def _damping_limit(mode: ModeCheck) -> float:
-    """Return the largest numerical damping ratio that is accepted for a mode: a share of its own
-    damping ratio, or a small absolute value if that is larger.
-    """
+    """Return a share of the mode's damping ratio, or a small absolute value if that is larger."""
     return max(DAMPING_SHARE * mode.damping_ratio, LEAST_DAMPING_LIMIT)
 
 
@@ -207,11 +197,7 @@ def mode_concerns(motion: ModesCheck) -> list[Concern]:
 
 
 def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
-    """Return at most one concern about the scheme and the step at the first mode `mode`.
-
-    It is that the scheme adds or takes too much damping; otherwise, that there are fewer than
-    `FEW_STEPS` steps per period. The list is empty if neither is the case.
-    """
+    """Too much damping, or else too few steps per period (`FEW_STEPS`)."""
     first = _first_mode_data(motion, mode)
     added = mode.numerical_damping_ratio
     if abs(added) > _damping_limit(mode):
@@ -232,9 +218,6 @@ def _grid_concerns(motion: ModesCheck, mode: ModeCheck) -> list[Concern]:
 
 
 def _first_mode_data(motion: ModesCheck, mode: ModeCheck) -> dict[str, Any]:
-    """Return the name of the experiment of `motion` and the frequency of `mode` [Hz], as data of a
-    concern under the keys "experiment" and "frequency_hz".
-    """
     return {"experiment": motion.experiment, "frequency_hz": mode.frequency_hz}
 
 
@@ -271,16 +254,11 @@ def mode_notes(motion: ModesCheck) -> list[str]:
 
 
 def _step_remedy(motion: ModesCheck) -> str:
-    """Return the remedy for too few steps as a sentence without an end: a setting of the substeps,
-    or a higher rate if too many would be needed.
-    """
     if motion.substeps_needed is None:
         return "record at a higher rate"
     return f"set transcription.{_substeps_setting(motion)}"
 
 
 def _substeps_setting(motion: ModesCheck) -> str:
-    """Return the setting of the substeps that are needed, "substeps = 4" for example, without its
-    table; `motion.substeps_needed` must not be None.
-    """
+    """Return for example "substeps = 4"; `motion.substeps_needed` must not be None."""
     return f"substeps = {motion.substeps_needed}"
