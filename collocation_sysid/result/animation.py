@@ -341,7 +341,6 @@ class FilmFigure:
         height_mm: float,
         figure_height_mm: float,
     ) -> Line2D:
-        """Draw marker errors over time; return the line of the current time."""
         t_s = self.replay.t_s - self.replay.t_s[0]
         place = (
             left_mm + 12,
@@ -367,7 +366,6 @@ class FilmFigure:
         return panel.axvline(0.0, color=BLACK, lw=0.8)
 
     def _draw_annotations(self, axes: Axes, camera: ParallelCamera, mm_per_m: float) -> None:
-        """Draw the axis directions, the scale bar and the legend below the body into `axes`."""
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
         markers = ["measured", "behind the body"] if len(self.replay.marker_names) else []
@@ -423,9 +421,7 @@ def _with_even_pixels(height_mm: float) -> float:
 
 
 def _frame_writer(fps: float, ffmpeg: str | None) -> AbstractMovieWriter:
-    """Return the writer of frames with `fps` frames per second: for GIF if `ffmpeg` is None, else
-    for H.264; the path of ffmpeg has to be in matplotlib's ``animation.ffmpeg_path`` then.
-    """
+    """Write GIF if `ffmpeg` is None, else H.264 by matplotlib's ``animation.ffmpeg_path``."""
     if ffmpeg is None:
         return PillowWriter(fps=fps)  # type: ignore[arg-type]
     # What every browser plays.

@@ -63,7 +63,6 @@ def full_check_tables(findings: CheckResult, details: bool = False) -> list[Show
 
 
 def _joined(tables: Sequence[Table]) -> Table:
-    """Return tables of the same columns as one without a title."""
     return replace(tables[0], title="", rows=tuple(row for each in tables for row in each.rows))
 
 
@@ -78,7 +77,6 @@ def _note_count(notes: Sequence[str]) -> list[Shown]:
 
 
 def _check_verdict(findings: CheckResult) -> Line:
-    """Return the conclusion of a check: valid, wrong derivatives, or a suspect description."""
     if not findings.derivatives_agree:
         return Line(
             "The derivatives do not agree with finite differences at the guess: check your own "
@@ -96,11 +94,7 @@ def _check_verdict(findings: CheckResult) -> Line:
 
 
 def _point_masses(body: BodyCheck) -> str:
-    """Return the point masses of a body's experiments as text [g] to follow the body's own mass.
-
-    If all experiments have the same mass, the text also has the total; otherwise it names the
-    experiment of each. Empty if there are no point masses.
-    """
+    """Return masses [g] to follow the body's own, with the total if all experiments agree."""
     masses = body.point_masses_kg
     if not masses:
         return ""
@@ -113,9 +107,7 @@ def _point_masses(body: BodyCheck) -> str:
 
 
 def _body_section(body: BodyCheck, details: bool) -> Table:
-    """Return the table "Body": size, volume, mass, mesh, with `details` element quality, the rest
-    shape if the mesh was made under gravity, and fields; what is not known of its origin is asked.
-    """
+    """What is not known of the body's origin is asked."""
     if body.is_homogeneous:
         names = ", ".join(f"'{name}'" for name in body.experiments)
         return labelled("Specimens", {"homogeneous": f"{names}; exact, without a mesh"})
@@ -147,7 +139,6 @@ def _body_section(body: BodyCheck, details: bool) -> Table:
 
 
 def _rest_shape(body: BodyCheck) -> str:
-    """Return how far the stress-free shape differs from the mesh, or that none was found."""
     if np.isnan(body.rest_shape_change_m):
         return (
             "the mesh was made under gravity; no stress-free shape was found at the guess: give "
@@ -160,7 +151,6 @@ def _rest_shape(body: BodyCheck) -> str:
 
 
 def _motion_rows(findings: CheckResult) -> dict[str, str]:
-    """Return a table row with the first mode of the first moving recording; empty if none moves."""
     first = next((m.first_mode for m in findings.motions if m.first_mode), None)
     if first is None:
         return {}
@@ -172,7 +162,6 @@ def _motion_rows(findings: CheckResult) -> dict[str, str]:
 
 
 def _motion_section(findings: CheckResult) -> list[Shown]:
-    """Return the table of natural modes; empty if all experiments are static."""
     if not findings.motions:  # equilibria only
         return []
     motion, *others = findings.motions
@@ -205,10 +194,7 @@ def _motion_section(findings: CheckResult) -> list[Shown]:
 
 
 def _measurements_section(findings: QuickCheck, details: bool) -> Table:
-    """Return the table of at most `SHOWN_RECORDINGS` recordings with samples, markers and grasps,
-    and of the air densities of all. Without `details`, grasps that are described in the same words
-    appear once.
-    """
+    """Show `SHOWN_RECORDINGS`; without `details`, each described grasp once."""
     rows = {}
     for recording in findings.recordings[:SHOWN_RECORDINGS]:
         kind = ", validation" if recording.validation else ""
@@ -236,9 +222,7 @@ def _measurements_section(findings: QuickCheck, details: bool) -> Table:
 
 
 def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
-    """Return table rows with a sentence on each grasp of an experiment, by label; several grasps
-    are numbered from 1. Empty without grasps.
-    """
+    """Several grasps are numbered from 1."""
     own = [grasp_sentence(grasp) for grasp in holds if grasp.experiment == experiment]
     if len(own) == 1:
         return {f"grasp of '{experiment}'": own[0]}
@@ -246,17 +230,14 @@ def _grasp_rows(experiment: str, holds: Iterable[GraspCheck]) -> dict[str, str]:
 
 
 def _air_description(density_kg_m3: float) -> str:
-    """Return how the model contains air of a density [kg/m³]; zero is a vacuum."""
+    """Zero is a vacuum."""
     if not density_kg_m3:
         return "none (as in a vacuum)"
     return f"{density_kg_m3:.4g} kg/m³ (buoyancy, added mass and drag)"
 
 
 def _marker_summary(recording: RecordingCheck) -> str:
-    """Return how many markers a recording has, how many samples are missing, the marker farthest
-    from the body with its distance [mm], and the other instruments, in words; without markers the
-    instruments alone.
-    """
+    """Name the marker farthest from the body [mm]; without markers the instruments alone."""
     if not recording.markers:
         besides = "" if recording.test else ", no markers"
         return f"{', '.join(recording.instruments)}{besides}"
@@ -282,7 +263,6 @@ def _marker_summary(recording: RecordingCheck) -> str:
 
 
 def _guess_rows(findings: CheckResult) -> dict[str, str]:
-    """Return table rows with the guess of each body and the deviation from the markers there."""
     rows = {
         "guess" if len(findings.bodies) == 1 else f"guess of '{body.experiments[0]}'": ", ".join(
             f"{symbol_of(name)} {quantity(value, unit_of(name), digits=3)}"
@@ -308,7 +288,6 @@ def _cost_text(cost: MethodCost) -> str:
 
 
 def _solve_brief(findings: CheckResult) -> Table:
-    """Return guesses, first mode, determined combinations and expected cost."""
     rows = _guess_rows(findings) | _motion_rows(findings)
     if findings.combinations:
         best, *others = findings.combinations
@@ -321,7 +300,6 @@ def _solve_brief(findings: CheckResult) -> Table:
 
 
 def _solve_section(findings: CheckResult) -> Table:
-    """Return guesses, problem size, cost of each method, and derivative errors."""
     rows = _guess_rows(findings)
     for number, each in enumerate(findings.combinations, start=1):
         which = f" {number}" if len(findings.combinations) > 1 else ""

@@ -64,7 +64,6 @@ class NotebookFigure(Figure):
     """Figure that a notebook shows, with or without pyplot."""
 
     def savefig(self, *arguments: Any, **options: Any) -> None:
-        """Write the figure with `own_settings`; see `Figure.savefig`."""
         with own_settings():
             super().savefig(*arguments, **options)
 
@@ -75,9 +74,7 @@ class NotebookFigure(Figure):
         return png.getvalue(), {"width": round(96 * self.get_figwidth())}
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw the figure without warnings about letters that the font lacks, as in a marker's
-        name.
-        """
+        """Letters that the font lacks, as in a marker's name, give no warnings."""
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
             super().draw(renderer)

@@ -102,7 +102,6 @@ def cells_below_faces(tetrahedra: NDArray[Any], faces: NDArray[Any]) -> NDArray[
 
 
 def _missing_frames(run: str | Path, experiment: str) -> InputError:
-    """Return the error for an experiment of a run without frames."""
     return InputError(
         f"experiment '{experiment}' of this run has no {FRAMES_FILE}: only fitted experiments "
         "have frames",
@@ -118,7 +117,6 @@ def _frames_of_fit(run: str | Path, replay: MotionRecord) -> list[tuple[float, P
 
 
 def _damaged_frames_refused(run: Path) -> AbstractContextManager[None]:
-    """Return a context in which errors from damaged frames become an InputError on the run."""
     return damage_refused(
         run, f"{FRAMES_FILE} or one of its frames", remedy="solve the problem again"
     )

@@ -63,7 +63,6 @@ def captioned_pictures(run: Path) -> list[Picture]:
     pictures: list[Picture] = []
 
     def kind(file: Path) -> str:
-        """Return the key of `PICTURE_CAPTIONS` with which a name begins; "" if none."""
         return next(k for k in order if file.stem.startswith(k))
 
     for file in sorted(own_pictures(run), key=lambda file: (order.index(kind(file)), file.name)):

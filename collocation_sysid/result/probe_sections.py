@@ -139,7 +139,6 @@ def is_first_to_correct(result: Result) -> bool:
 
 
 def _shown_estimates(result: Result) -> list[str]:
-    """Return the estimates that the table of probes shows, at most `MAX_ESTIMATES`."""
     known = [n for n, each in result.estimates.items() if each.statistical95]
     first = [name for name in known if name in STIFFNESS_NAMES[:1]]
     return [*first, *(n for n in known if n in result.parameters and n not in first)][
@@ -148,10 +147,7 @@ def _shown_estimates(result: Result) -> list[str]:
 
 
 def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
-    """Return the change of an estimate in percent of its value, with its signed ratios to the half
-    widths of the statistical and of the combined interval in parentheses, of which unknown ones are
-    left out; "–" for None.
-    """
+    """Ratios are to the half widths of the statistical and of the combined interval."""
     if move is None:
         return "–"
     shares = ", ".join(
@@ -161,17 +157,11 @@ def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
 
 
 def _change_text(move: EstimateChange, value: float) -> str:
-    """Return the change of an estimate as text, in percent of `value` unless that is zero."""
     return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
 
 
 def _conclusions(result: Result) -> Iterator[str]:
-    """Yield sentences on the significant probes, or that there is none.
-
-    First come windows and recordings that disagree with the rest, then relaxed assumptions: the one
-    that reduces χ² most, and the others as alternatives. After a deeper check the most important
-    assumption that the data do not determine follows.
-    """
+    """Name windows and recordings first, then the assumption that reduces χ² most."""
     significant = [probe for probe in result.probes if probe.sentences]
     assumptions = _found_assumptions(result)
     relaxed = [p for p in assumptions if is_possible(p)]
@@ -224,18 +214,11 @@ def _conclusions(result: Result) -> Iterator[str]:
 
 
 def _named_change(probe: Probe, result: Result, name: str) -> str:
-    """Return symbol and change of an estimate in a refit, such as "λ +1.20 %"."""
     return f"{symbol_of(name)} {_change_text(probe.moves[name], result.estimates[name].value)}"
 
 
 def _most_important_assumption(result: Result) -> Iterator[str]:
-    """Yield a sentence on the most important assumption that the data do not determine, if there is
-    one.
-
-    The data do not determine an assumption if a probe estimated it without a significant result.
-    Of these assumptions the sentence names the one with the largest share in the budget of the
-    first parameter whose budget contains any, stiffnesses before other parameters.
-    """
+    """Name the largest share in the budget of the first parameter, stiffnesses first."""
     significant = {assumption_name(name) for p in result.probes for name in p.sentences}
     undetermined = {
         assumption_name(p.name) for p in result.probes if p.kind == "assumption"

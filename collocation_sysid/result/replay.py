@@ -397,12 +397,7 @@ def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> ND
 
 
 def _require_shapes(arrays: Mapping[str, Any]) -> None:
-    """Raise a `ValueError` if sizes, types or values of arrays from a file are inconsistent.
-
-    `arrays` are by name as in `ARRAY_LAYOUT`, where None means that an optional array is missing;
-    those that every `MotionRecord` has are not checked for presence and must not be None. Under
-    each group of `GROUP_PREFIXES` is a mapping of name to array, which may be empty.
-    """
+    """Optional arrays are None if they are missing; others must not be None."""
     sizes: dict[str, int] = {}
     for key, (kinds, letters) in ARRAY_LAYOUT.items():
         if (array := arrays.get(key)) is None:

@@ -84,9 +84,7 @@ def write_run(
 
 
 def _kept_elsewhere(solved: SolvedProblem, error: InputError, frames: bool) -> InputError:
-    """Write a run that could not be written (`error`) into a folder for temporary files, and return
-    the error whose message names it; if that fails, too, the error unchanged.
-    """
+    """Return the error unchanged if the temporary folder cannot be written, either."""
     for content in (partial(_write_folder, frames=frames), _write_answer):
         with suppress(InputError, OSError):
             folder = Path(mkdtemp(prefix="collocation-sysid-run-"))
@@ -102,7 +100,6 @@ def _kept_elsewhere(solved: SolvedProblem, error: InputError, frames: bool) -> I
 
 
 def _write_answer(solved: SolvedProblem, place: Path) -> None:
-    """Write ``result.json``, and ``problem.toml`` if the problem has a file, into a folder."""
     (place / RESULT_FILE).write_text(_result_text(build_result(solved)), encoding="utf-8")
     origin = solved.problem.origin
     if origin is not None:
@@ -110,7 +107,6 @@ def _write_answer(solved: SolvedProblem, place: Path) -> None:
 
 
 def _write_folder(solved: SolvedProblem, folder: Path, frames: bool) -> None:
-    """Write the folder of a run, see `write_run`, without pictures."""
     with replaced_folder(folder) as place:
         _write_answer(solved, place)
         if solved.refinement is not None and solved.refinement.levels:
@@ -162,7 +158,6 @@ def draw_run(
 
 
 def _result_text(result: Result) -> str:
-    """Return the text of ``result.json``."""
     return as_json(result) + "\n"
 
 
@@ -197,7 +192,6 @@ def write_pictures(
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
-    """Return the cell data that all frames share, by name."""
     data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
@@ -321,7 +315,6 @@ def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
 
 
 def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
-    """Return the estimates (E, 4) of each field of a body, by name."""
     estimates = {}
     for part in body.parts:
         if part.field is not None:
@@ -333,10 +326,7 @@ def _field_estimates(finished: SolvedProblem, body: Body) -> dict[str, Array]:
 
 
 def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
-    """Return the estimated places (M, 3) [m] of the markers of an experiment on the undeformed
-    body, in the order of its marker names; None for a validation experiment whose forward
-    simulation failed.
-    """
+    """Return places (M, 3) [m]; None for a validation experiment whose simulation failed."""
     if experiment in finished.places:
         places = [place.position_m for place in finished.places[experiment].values()]
         return np.array(places).reshape(-1, 3)
@@ -347,11 +337,7 @@ def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
 
 
 def _trajectory_arrays(replays: Sequence[MotionRecord]) -> dict[str, Array]:
-    """Return the arrays of trajectory.npz by name, see `MotionRecord.to_arrays`.
-
-    The name of the experiment and a slash precede the names of its arrays, except if it is the only
-    fitted one.
-    """
+    """Names have the experiment and a slash in front, unless it is the only fitted one."""
     alone = sum(replay.positions_m is not None for replay in replays) == 1
     arrays = {}
     for replay in replays:

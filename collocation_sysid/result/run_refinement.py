@@ -95,7 +95,6 @@ def refine_run(
         answer = WarmStart.from_result(before, run)
 
     def keep(refinement: Refinement) -> Result:
-        """Write a refinement and the updated result into the folder, and return the latter."""
         after = with_refinement(before, refinement, parameters=problem.parameters)
         with replaced_file(levels_file) as levels, replaced_file(file) as draft:
             levels.write_text(as_json(refinement) + "\n", encoding="utf-8")
@@ -132,9 +131,6 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
     optimum = _estimates_at_optimum(before, parameters)
 
     def corrected(values: Mapping[str, ReportedEstimate]) -> dict[str, ReportedEstimate]:
-        """Return estimates by name, corrected where the refinement measured their error, otherwise
-        unchanged.
-        """
         return {
             name: _corrected_estimate(
                 name,
@@ -162,7 +158,6 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
 
 
 def _estimates_at_optimum(result: Result, parameters: Parameters) -> dict[str, Estimate]:
-    """Return the estimates before the correction, by name, without fields."""
     return {
         name: each.at_optimum(name, linear=name in parameters.linear_names)
         for name, each in result.estimates.items()
@@ -176,10 +171,7 @@ def _corrected_estimate(
     error: DiscretisationError,
     parameters: Parameters,
 ) -> ReportedEstimate:
-    """Return an estimate corrected for its measured discretisation error: value, known correction,
-    and the statistical and combined intervals with their standard errors change, everything else
-    stays as before.
-    """
+    """Statistical and combined intervals change, everything else stays as before."""
     linear, bounds = parameters.scale_and_bounds(name)
     combined = combine(
         name,
@@ -196,10 +188,7 @@ def _corrected_estimate(
 def _updated_shares(
     shares: Mapping[str, float], before: ReportedEstimate, after: ReportedEstimate
 ) -> dict[str, float]:
-    """Return the contributions to an estimate's variance with the measured discretisation error,
-    largest first; they sum to one. Without a combined standard error before or after they are
-    unchanged.
-    """
+    """Shares sum to one, largest first."""
     if not before.combined_std_error or not after.combined_std_error:
         return dict(shares)
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
@@ -215,7 +204,7 @@ def _updated_shares(
 
 
 def _known_levels(file: Path, names: Iterable[str]) -> list[RefinementLevel]:
-    """Return the levels that an earlier call finished, with values of `names` alone."""
+    """Return levels of an earlier call, with values of `names` alone."""
     if not file.is_file():
         return []
     require_own(file)

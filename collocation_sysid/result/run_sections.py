@@ -164,7 +164,6 @@ def verdict_section(
 
 
 def _deeper_check_advice(result: Result) -> list[Line]:
-    """Return the recommendation of a deeper check where it is worthwhile, else an empty list."""
     return [Line(DEEPER_CHECK_ADVICE, "quiet")] if is_deeper_check_worthwhile(result) else []
 
 
@@ -237,10 +236,7 @@ def stated_as_undetermined(result: Result) -> set[str]:
 
 
 def _undetermined_sentence(result: Result) -> list[str]:
-    """Return a sentence that names the estimates whose interval is wider than their value, without
-    those that a reason of the verdict names, with the largest contribution to each variance; empty
-    if there is no such estimate.
-    """
+    """Estimates that a reason of the verdict names are left out."""
     stated = stated_as_undetermined(result)
     sources = []
     for name, shares in result.budget.items():
@@ -259,7 +255,6 @@ def _undetermined_sentence(result: Result) -> list[str]:
 
 
 def _coverage_sentence(result: Result) -> str:
-    """Return what combined intervals contain, and which numerical error they do not."""
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
@@ -274,10 +269,7 @@ def _coverage_sentence(result: Result) -> str:
 
 
 def _largest_contributions(result: Result) -> list[str]:
-    """Return the main sources of uncertainty of the estimates whose uncertainty is mostly
-    systematic, that is whose combined standard uncertainty exceeds `SYSTEMATIC_RATIO` times the
-    statistical one.
-    """
+    """Combined uncertainties exceed `SYSTEMATIC_RATIO` times the statistical ones."""
     ratios = {
         name: each.combined_std_error / each.statistical_std_error
         for name, each in result.estimates.items()
@@ -361,7 +353,6 @@ def estimate_row(result: Result, name: str) -> tuple[str, ...]:
 
 
 def _combination_text(result: Result, name: str) -> str:
-    """Return the best determined combination of a parameter with others; "" if there is none."""
     for each in result.combinations:
         if name in each.determined.names and not each.is_lone:
             return f"only {each.determined.label} {each.precision()}".rstrip()
@@ -369,12 +360,12 @@ def _combination_text(result: Result, name: str) -> str:
 
 
 def _deviation_text(deviation: float | None) -> str:
-    """Return a standard deviation as text; "" if it is None, that is unknown."""
+    """None is unknown."""
     return "" if deviation is None else two_digits(deviation)
 
 
 def _readable_unit(result: Result, name: str) -> tuple[float, str]:
-    """Return factor and name of the unit of an estimate in tables; all moduli have the same unit."""
+    """Return factor and name; all moduli have the same unit."""
     if unit_of(name) != "Pa":
         return 1.0, unit_of(name)
     return readable_stress(
@@ -424,7 +415,7 @@ def refinement_table(result: Result) -> Table | Line:
 
 
 def _interval_text(ends: tuple[float, float] | None, factor: float, deviation: float | None) -> str:
-    """Return scaled ends of an interval to the place of a deviation; "" for None."""
+    """Return scaled ends to the place of a deviation; "" for None."""
     if ends is None:
         return ""
     low, high = (rounded(factor * end, deviation) for end in ends)
@@ -464,14 +455,12 @@ def fit_section(result: Result) -> TitledParts:
 
 
 def _elapsed_text(elapsed: Elapsed) -> str:
-    """Return times such as "search 1.2 s, checks 3.4 s"."""
     parts = {"search": elapsed.search, "checks": elapsed.checks, "pictures": elapsed.pictures}
     known = (f"{part} {time_s:.1f} s" for part, time_s in parts.items() if time_s is not None)
     return ", ".join(known)
 
 
 def _iterations_text(result: Result) -> str:
-    """Return iterations, time [s], and shares of linear algebra and evaluations."""
     timing = result.timing_s
     return (
         f"{result.iterations} iterations in {timing.total:.1f} s of the search "
@@ -480,11 +469,7 @@ def _iterations_text(result: Result) -> str:
 
 
 def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str]:
-    """Yield lines on how far a forward simulation is from the measurements.
-
-    If it failed, the only line says why. For a validation experiment, the errors with nuisance
-    parameters fitted to it and of copied measurements follow for comparison.
-    """
+    """Copied measurements, and nuisance parameters fitted to it, compare with a validation."""
     kind = "forward simulation" if simulated.fitted else "validation"
     if simulated.failed is not None:
         yield f"{kind} '{name}': failed: {simulated.failed}"
@@ -515,7 +500,6 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
 
 
 def _deviations_text(deviations: Mapping[str, float] | None) -> str:
-    """Return nuisance parameters with their size in standard deviations in words; "" if none."""
     return listed(
         f"'{name}' at {size:+.2g} standard deviations" for name, size in (deviations or {}).items()
     )
@@ -535,7 +519,6 @@ def notes_section(result: Result) -> TitledParts:
 
 
 def _cards(result: Result) -> Cards:
-    """Return the most important stiffness, or the first estimate, and the misfits."""
     values = result.estimates
     fit = result.fit
     simulated = result.rollout
@@ -573,9 +556,6 @@ def remedy_lines(concerns: Iterable[Concern]) -> Iterator[Line]:
 
 
 def _error_bars(result: Result) -> Iterator[Shown]:
-    """Yield a sentence on the model of the errors, their noise level and the reduced χ², if there
-    are error bars, and the table of variances, if there is a budget.
-    """
     if (known := result.uncertainty) is not None:
         yield (
             f"Error bars for {known.errors} errors, noise level {known.noise}; reduced χ² "
@@ -586,7 +566,6 @@ def _error_bars(result: Result) -> Iterator[Shown]:
 
 
 def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield a table of the estimated places [mm] of each experiment."""
     explanation = (
         "Positions on the undeformed body in millimetres, each with its standard error. "
         "Positions that were not given have a prior as wide as the body."
@@ -608,7 +587,6 @@ def _marker_place_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
-    """Yield a table of the other nuisance parameters in readable units."""
     explanation = (
         "Estimated for this recording alone, together with the parameters; the prior has a mean "
         "of zero."
@@ -627,9 +605,6 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
 
 
 def _residual_tables(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table with the diagnosis of each marker's residuals, and a headed table of the
-    largest marker errors; a table without rows is left out.
-    """
     if result.residuals:
         rows = tuple(
             (
@@ -674,9 +649,7 @@ def _largest_errors(run: Path) -> list[tuple[float, float, str]]:
 
 
 def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
-    """Yield a table of the problem and software versions, and the copy of the problem file as it
-    was run, if the run folder has one; a copy that is a link to elsewhere is left out.
-    """
+    """A copy of the problem file that is a link to elsewhere is left out."""
     rows = content(result.problem) | content(result.provenance)
     listed_rows = ((key, each if isinstance(each, list) else [each]) for key, each in rows.items())
     yield Table(
@@ -688,9 +661,7 @@ def _provenance_parts(result: Result, run: Path) -> Iterator[Shown]:
 
 
 def _size_text(value: float | None, unit: str) -> str:
-    """Return a value in `unit` as text in a readable unit, see `in_readable_unit`, such as "1.2 mm"
-    for 0.0012 in "m"; a unit that `in_readable_unit` does not know is kept, and None becomes "–".
-    """
+    """Return "1.2 mm" for 0.0012 in "m"; unknown units are kept, and None becomes "–"."""
     factor, shown = in_readable_unit(1.0, unit)
     # No powers of ten for the sizes of bodies.
     digits = 2 if value is None or abs(factor * value) < 99.5 else 4

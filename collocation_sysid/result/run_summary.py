@@ -134,7 +134,6 @@ def _brief(result: Result) -> list[Shown]:
 
 
 def _further_reasons(result: Result) -> Iterator[Line]:
-    """Yield the number of reasons of the verdict beyond those shown, if there are any."""
     if (count := len(result.trust.concerns) - SHOWN_REASONS) > 0:
         further = "1 further reason" if count == 1 else f"{count} further reasons"
         yield Line(f"  {further}, less grave: in the report, and with --details", "quiet")
@@ -153,7 +152,6 @@ def _details(result: Result) -> list[Shown]:
 
 
 def _estimates(result: Result) -> Iterator[Shown]:
-    """Yield the table of estimates, a line with the fixed parameters, and one for each field."""
     values = result.estimates
     shown = [
         name for name in values if name in result.parameters or without_region(name) in SHOWN_MODULI
@@ -184,15 +182,12 @@ def _estimates(result: Result) -> Iterator[Shown]:
 
 
 def _has_mesh(result: Result) -> bool:
-    """Return whether a body with a mesh was fitted, and not homogeneous specimens alone."""
+    """Return false for homogeneous specimens alone."""
     return any(each.test is None for each in result.fit.experiments.values())
 
 
 def _limit(result: Result) -> Iterator[str]:
-    """Yield a sentence on the combination that is determined in place of its constants, and one on
-    what limits the answer and what to measure: for the estimates that are not determined, or else
-    for the most important stiffness.
-    """
+    """Name what to measure for undetermined estimates, or else for the most important stiffness."""
     if result.combinations:
         best, *others = result.combinations
         more = f" (and {len(others)} more: see --details)" if others else ""
@@ -237,12 +232,10 @@ def effect_of_remedy(result: Result, name: str) -> str:
 
 
 def _basis(result: Result) -> list[str]:
-    """Return one line on what the values refer to."""
     return ["; ".join(result.basis)] if result.basis else []
 
 
 def _fit(result: Result) -> Iterator[Shown]:
-    """Yield the quality of fits and simulations: a line for one, a table for several."""
     fitted = result.fit.experiments
     simulated = result.rollout.experiments
     quality = []
@@ -276,7 +269,6 @@ def _fit(result: Result) -> Iterator[Shown]:
 
 
 def _fit_errors(fitted: FittedExperiment) -> str:
-    """Return the residuals of a recording in words."""
     errors = PredictionErrors(
         rms_m=fitted.rms_m if fitted.samples else None,
         wrench_rms_n=fitted.wrench_rms_n,
@@ -288,7 +280,6 @@ def _fit_errors(fitted: FittedExperiment) -> str:
 
 
 def _simulation_text(simulated: SimulatedExperiment) -> str:
-    """Return the errors of a simulation; of a validation those of a copy, too."""
     if simulated.failed is not None:
         return f"failed: {simulated.failed}"
     own = copy_fields(PredictionErrors, simulated)

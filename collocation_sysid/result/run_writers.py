@@ -85,9 +85,7 @@ def write_vtu(
 def _checked_arrays(
     kind: str, data: Mapping[str, ArrayLike], count: int, path: str | Path
 ) -> dict[str, NDArray]:
-    """Return data as arrays with names escaped for XML; booleans, which VTK does not have, become
-    8-bit integers, and other types are neither converted nor checked.
-    """
+    """VTK has no booleans, which become integers of 8 bits."""
     arrays = {name: np.asarray(values) for name, values in data.items()}
     for name, array in arrays.items():
         if array.ndim not in (1, 2) or len(array) != count:
@@ -276,16 +274,12 @@ def replaced_folder(
 
 
 def _resolved_parent(path: Path) -> Path:
-    """Return the absolute path with all links resolved, except a link at `path` itself."""
+    """Resolve all links except one at `path` itself."""
     return path.resolve() if path.name in ("", "..") else path.parent.resolve() / path.name
 
 
 def _remove_stale(target: Path) -> None:
-    """Remove the temporary folders in which killed processes of this machine prepared `target`.
-
-    They are beside `target`, with its name in theirs; those of other targets remain. On Windows
-    nothing is removed, because it cannot be known whether a process with that number runs.
-    """
+    """Windows does not tell whether a process with a number runs: nothing is removed there."""
     if os.name != "posix":
         return
     for folder in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
@@ -296,7 +290,6 @@ def _remove_stale(target: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
-    """Return whether a process with this number is running on this machine."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -398,7 +391,6 @@ def require_only_written(folder: Path) -> None:
 
 
 def _replace_folder(new: Path, target: Path, backup: Path) -> None:
-    """Rename `new` to `target`; an existing one is removed by way of `backup`."""
     if not target.exists():
         new.rename(target)
         return

@@ -77,7 +77,6 @@ class Heartbeat:
             self._thread.join()
 
     def _run(self) -> None:
-        """Show lines until `stop` is called; the body of the thread."""
         began = time.monotonic()
         passed_s = 0.0
         while not self._ended.wait(max(self._first_s, ELAPSED_GROWTH * passed_s)):
@@ -219,7 +218,6 @@ class SolveProgress(Watched):
         self._state = describe
 
     def _update_activity(self, activity: str, line: str = "") -> None:
-        """Show the current activity in the display, and print `line` if verbose and not empty."""
         if activity != self._doing:
             self._activity_began_s = time.monotonic()
         self._doing = activity
@@ -229,7 +227,6 @@ class SolveProgress(Watched):
         self._redraw()
 
     def _redraw(self) -> None:
-        """Show the last iterations and the current activity on a terminal."""
         table = on_terminal(_iteration_table(self._lines))
         self.update(Group(table, _RefreshedText(self._activity_with_time)))
 
@@ -265,7 +262,6 @@ class _RefreshedText:
 
 
 def _remaining_time(elapsed_s: float, share: float) -> str:
-    """Return the remaining time of an activity in words."""
     if elapsed_s < FIRST_REMAINING_S or share <= 0:
         return ""
     remaining_s = elapsed_s * (1 - share) / share
@@ -275,7 +271,6 @@ def _remaining_time(elapsed_s: float, share: float) -> str:
 
 
 def _iteration_table(lines: list[Iteration]) -> Shown:
-    """Return the table of the last iterations; "" if `lines` is empty."""
     if not lines:
         return ""
     heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")

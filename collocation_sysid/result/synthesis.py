@@ -106,7 +106,6 @@ class Recipe:
 def _share_of_experiment(
     progress: Callable[[float], None] | None, index: int, count: int
 ) -> Callable[[float], None] | None:
-    """Return a function that reports one simulation of `count` to `progress`."""
     if progress is None:
         return None
     return lambda share: progress((index + share) / count)
@@ -237,13 +236,7 @@ def _write_tables(
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write the CSV tables of an experiment: simulated measurements with noise, and poses.
-
-    The measurements are those of markers, force sensors and custom sensors; on a test bench, tables
-    of displacement and load replace those of poses and force sensors. A specimen has one table, of
-    its stresses. Components that a force sensor does not measure are left out or NaN. Images of
-    cameras are not written.
-    """
+    """Benches have tables of displacement and load; images of cameras are not written."""
     if experiment.specimen is not None or isinstance(section, SpecimenSection):
         stated = section if isinstance(section, SpecimenSection) else None
         _write_specimen(
@@ -314,7 +307,6 @@ def _write_specimen(
     rng: np.random.Generator,
     recipe: Recipe,
 ) -> None:
-    """Write the table of a specimen with simulated stresses and noise; see `_write_tables`."""
     assert experiment.specimen is not None
     values = {}
     for gauge, read in zip(experiment.readings, trajectory.custom_sensor_values, strict=True):
@@ -327,7 +319,7 @@ def _write_specimen(
 
 
 def _wrench_layouts(section: ExperimentSection | None) -> list[ForceSensorSection]:
-    """Return the tables of force sensors, grasps before obstacles."""
+    """Grasps precede obstacles."""
     moved = section.moved_sections if section is not None else []
     return [each.sensor for each in moved if each.sensor is not None]
 
@@ -355,7 +347,6 @@ def _refuse_foreign(problem: Problem, place: Path, files: Iterable[Path]) -> Non
 
 
 def _experiment_sections(problem: Problem) -> dict[str, ExperimentSection | SpecimenSection]:
-    """Return the table of each experiment by name; empty without a file."""
     if (origin := problem.origin) is None:
         return {}
     file = ProblemFile.model_validate(parse_toml(origin.text, origin.path))
@@ -395,7 +386,7 @@ def _numbered_key(kind: str, index: int) -> str:
 
 
 def _require_separate_files(problem: Problem, names: Sequence[Mapping[str, str]]) -> None:
-    """Refuse experiments that read the same file, because a simulation writes one for each."""
+    """A simulation writes one file for each experiment."""
     owners: dict[str, str] = {}
     for experiment, files in zip(problem.experiments, names, strict=True):
         for name in files.values():

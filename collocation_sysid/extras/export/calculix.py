@@ -82,7 +82,6 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ...]]:
-    """Return the deck, and what it does not express."""
     static = body.experiment.is_static
     limits = replace(
         CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
@@ -135,14 +134,12 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
 
 
 def _step_times_s(body: IdentifiedBody) -> Array:
-    """Return the times [s] of the steps: all static samples, else the first."""
+    """All static samples, else the first [s]."""
     return body.experiment.t_s[: None if body.experiment.is_static else 1]
 
 
 def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) -> str:
-    """Return the obstacles as cards, which precede the steps: a tetrahedron under each facet, a
-    common material, and a contact pair for each obstacle; empty without obstacles.
-    """
+    """Make a tetrahedron under each facet, and a contact pair for each obstacle."""
     deck = ""
     tetrahedra = body.body.mesh.tetrahedra
     element_numbers = np.arange(len(body.body.cells)) + 1
@@ -180,9 +177,7 @@ def _step_card(
     is_linear: bool,
     totals: str,
 ) -> str:
-    """Return the text of one step: prescribed nodes and obstacles at their places at `t_s`,
-    gravity, and the node loads of the first sample; `totals` is the option of printed forces.
-    """
+    """Node loads are those of the first sample; `totals` is the option of printed forces."""
     displacements_m = [body.experiment.prescribed_displacements([t_s])[1][0] - body.nodes_m]
     displacements_m += [wall.points_at_m(t_s) - wall.start_points_m for wall in obstacles]
     rows = np.concatenate(displacements_m)
@@ -210,19 +205,12 @@ def _step_card(
 
 
 def _format_values(*values: float) -> str:
-    """Return numbers for a line of the deck, separated by commas, with 12 digits: CalculiX cuts off
-    a number after 20 characters, even within its exponent.
-    """
+    """CalculiX cuts off a number after 20 characters, even within its exponent: 12 digits."""
     return ",".join(f"{float(value):.12g}" for value in values)
 
 
 def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]:
-    """Return the card of a material, without its density, and a sentence on what the card does not
-    express ("" if nothing).
-
-    A material that CalculiX does not have becomes the neo-Hookean one of the same λ and μ at small
-    strain.
-    """
+    """Other materials become neo-Hookean of the same λ and μ at small strain."""
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
     if region.material in ("st-venant-kirchhoff", "linear"):
@@ -331,10 +319,7 @@ def _fibre_sections(
     name: str,
     directions: Sequence[Sequence[float]] = (),
 ) -> str:
-    """Return an orientation, an element set and a section for each direction of the fibres of a
-    part. Local axes for CalculiX are the normal of the fibres, across them, and against them. With
-    the local directions of Abaqus they are the axes of the fibres.
-    """
+    """CalculiX has the normal, across and against the fibres; Abaqus the axes of the fibres."""
     cards = ""
     keyword = "SYSTEM=RECTANGULAR"
     tail = ""
@@ -355,10 +340,7 @@ def _fibre_sections(
 
 
 def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
-    """Return the card of Ogden's law or of the foam.
-
-    The energy of a term in the card is 2μ/α² (Σ λ^α − 3): μ is ½ μ_p α_p of Ogden's law.
-    """
+    """The energy of a term is 2μ/α² (Σ λ^α − 3): μ is ½ μ_p α_p of Ogden's law."""
     terms = region.power_terms
     if region.material.startswith("ogden"):
         keyword = "HYPERELASTIC,OGDEN"

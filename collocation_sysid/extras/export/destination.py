@@ -162,10 +162,7 @@ def parse_destination(
 
 
 def _require_replaceable(file: Path) -> None:
-    """Raise `InputError`, naming the file, if it exists and this program did not write it or it was
-    changed since, or if it is a folder or a link, even one to nowhere. A file that does not exist
-    is accepted.
-    """
+    """A file of others, a changed one, a folder or a link is refused."""
     if file.is_dir() and not file.is_symlink():
         raise InputError("this is a folder; expected a file to write", file, where="--to")
     if (file.exists() or file.is_symlink()) and not is_written_here(file):

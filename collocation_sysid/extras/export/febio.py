@@ -117,7 +117,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _material(number: int, region: IdentifiedRegion, fibres: FibreLaw | None, axes: Array) -> str:
-    """Return the material of one domain, whose fibres have the axes (3, 3)."""
+    """Fibres have the axes (3, 3)."""
     law = LAWS.get(region.material, "neo-Hookean")
     constants = {"density": region.density_kg_m3, "E": region.young_pa, "v": region.poisson}
     if fibres is None:
@@ -131,9 +131,7 @@ def _material(number: int, region: IdentifiedRegion, fibres: FibreLaw | None, ax
 
 
 def _fibre_solids(region: IdentifiedRegion, fibres: FibreLaw, axes: Array) -> Iterable[str]:
-    """Yield the components of a mixture that are fibres. The density of a mixture is the sum of those
-    of its components, which is 1 where none is stated.
-    """
+    """The density of a mixture is the sum of those of its parts, which is 1 by default."""
     c = region.constants
     directions = region.fibre_directions(fibres.families)
     along = directions @ axes.T
@@ -172,7 +170,6 @@ def _law(tag: str, law: str, constants: dict[str, float], names: str = "", insid
 
 
 def _lines(tag: str, numbers: Iterable[int], rows: Array | Index) -> str:
-    """Return an element with an id for each row of numbers."""
     return "".join(
         f'      <{tag} id="{number}">{",".join(map(repr, row))}</{tag}>\n'
         for number, row in zip(numbers, rows.tolist(), strict=True)
@@ -185,7 +182,6 @@ def _node_set(name: str, nodes: Sequence[int] | Index) -> str:
 
 
 def _prescribed(body: IdentifiedBody) -> tuple[str, str]:
-    """Return node sets and boundary conditions: one for each axis and displacement."""
     moved_m = np.round(body.prescribed_m - body.nodes_m, 12)
     sets, conditions = "", ""
     for axis, name in enumerate("xyz"):
@@ -201,7 +197,7 @@ def _prescribed(body: IdentifiedBody) -> tuple[str, str]:
 
 
 def _loads(body: IdentifiedBody) -> tuple[str, str]:
-    """Return node sets and loads: forces on nodes, and the weight, which FEBio subtracts."""
+    """FEBio subtracts the weight."""
     sets, loads = "", ""
     for k, node in enumerate(np.flatnonzero(body.node_loads_n.any(axis=1))):
         sets += _node_set(f"loaded_{k}", [int(node)])

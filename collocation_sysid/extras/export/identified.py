@@ -256,7 +256,6 @@ class IdentifiedBody:
         simulated_m: Array | None,
         title: str,
     ) -> IdentifiedBody:
-        """Build from the result of a run."""
         body = corrected.body
         obstacles = tuple(
             replace(o, friction=values[o.friction]) if isinstance(o.friction, str) else o
@@ -463,7 +462,6 @@ class IdentifiedBody:
 
 
 def _read_run(folder: Path, allow_code: bool) -> tuple[Result, WarmStart, Problem, Collocation]:
-    """Return the result of a run folder, its estimates, and its problem and program at these."""
     result = Result.read(folder)
     answer = WarmStart.from_result(result, folder)
     home = result.problem_folder(
@@ -516,12 +514,10 @@ def read_draws(
 
 
 def _not_fitted(experiment: str, names: Sequence[str]) -> str:
-    """Return the message that an experiment is none of the fitted ones, whose `names` it lists."""
     return f"no experiment {experiment!r} was fitted; expected one of {', '.join(names)}"
 
 
 def _require_stress_free(problem: Problem) -> None:
-    """Raise an `InputError` if the mesh of a body was made under gravity."""
     if any(body.scan_conditions is not None for body in problem.bodies):
         raise InputError(
             "the mesh was made under gravity, but simulators assume a stress-free mesh; "
@@ -532,10 +528,7 @@ def _require_stress_free(problem: Problem) -> None:
 
 
 def _warnings(result: Result) -> tuple[str, ...]:
-    """Return reasons not to use the numbers of a result without care, as sentences without a
-    period: it did not converge, its verdict is not good, fields are averaged, parameters are at a
-    bound. Empty if there are none.
-    """
+    """Return reasons, as sentences without a period."""
     warnings = []
     if not result.converged:
         warnings.append("the run did not converge")

@@ -100,12 +100,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _grasp_xml(body: IdentifiedBody) -> str:
-    """Return the XML of each grasp, numbered from 0: a mocap body "hand0", and the free body
-    "grasp0", welded to it by `_weld_xml`, that carries the nodes, both at the pose of the first
-    sample; empty without grasps.
-
-    The second body is needed because nodes of an elastic flex cannot be attached to a mocap body.
-    """
+    """The second body is needed: nodes of an elastic flex cannot be attached to a mocap body."""
     lines = ""
     mass = body.node_mass_kg.sum() * CARRIER_MASS_RATIO
     size = np.ptp(body.nodes_m, axis=0).max()
@@ -122,12 +117,7 @@ def _grasp_xml(body: IdentifiedBody) -> str:
 
 
 def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
-    """Return the XML of each obstacle, a mocap body "obstacle0", … with friction at the pose of the
-    first sample; empty without obstacles.
-
-    Contact is as stiff as the timestep `step_s` [s] allows. Each solid is smaller by the thickness
-    of the flex's skin, so that contact begins at the true surface.
-    """
+    """Solids are smaller by the skin, so that contact begins at the true surface."""
     lines = ""
     skin = RELATIVE_SKIN_RADIUS * _mean_edge_m(body)
     for k, each in enumerate(body.obstacles):
@@ -144,7 +134,6 @@ def _obstacle_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _geom_attributes(solid: Solid) -> str:
-    """Return type, size, position and rotation of a solid, without rounded edges."""
     shape = Primitive.from_solid(solid)
     turn = values_as_text(shape.rotation.as_quat(scalar_first=True))
     size = values_as_text(shape.size_m) if len(shape.size_m) else "0 0 1"
@@ -152,10 +141,7 @@ def _geom_attributes(solid: Solid) -> str:
 
 
 def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
-    """Return the XML of the constraints between the mocap bodies of the grasps and the bodies that
-    carry grasped nodes; empty without grasps. They are as stiff as the timestep `step_s` [s]
-    allows.
-    """
+    """Welds are as stiff as the timestep `step_s` [s] allows."""
     return "".join(
         f'<weld body1="hand{k}" body2="grasp{k}" relpose="0 0 0 1 0 0 0" '
         f'solref="{2 * step_s!r} 1" solimp="0.9999 0.9999 0.001"/>\n'
@@ -164,16 +150,12 @@ def _weld_xml(body: IdentifiedBody, step_s: float) -> str:
 
 
 def _pose_at(grasp: Grasp, t_s: float) -> tuple[Array, Array]:
-    """Return position (3,) [m] and unit quaternion (w, x, y, z) of a grasp or obstacle at a time
-    `t_s` [s], interpolated between its poses, or up to half a sample beyond them continued or held,
-    see `PoseSequence.at`. A single pose holds at all times.
-    """
+    """Return position (3,) [m] and unit quaternion (w, x, y, z), see `PoseSequence.at`."""
     rotations, positions = grasp.poses.at([t_s])
     return positions[0], np.roll(Rotation.from_matrix(rotations[0]).as_quat(), 1)
 
 
 def _node_xml(body: IdentifiedBody) -> str:
-    """Return each free node as a body on three slides, "node0", "node1", …"""
     lines = ""
     mass = body.total_node_mass_kg
     for n in np.flatnonzero(~body.is_node_prescribed):
@@ -191,12 +173,7 @@ def _node_xml(body: IdentifiedBody) -> str:
 
 
 def _flex_xml(body: IdentifiedBody) -> str:
-    """Return the XML of a flex for each region: node positions [m] relative to their bodies, linear
-    elements, elastic constants, damping, and contact with obstacles only.
-
-    Bodies are named "node0", …, except those of grasped nodes, "grasp0", …, whose positions are
-    those in the undeformed body. The thickness of the skin follows the mean edge of the mesh.
-    """
+    """Positions of grasped nodes are those in the undeformed body; the skin follows the mesh."""
     names = np.array([f"node{n}" for n in range(len(body.nodes_m))], dtype=object)
     places = np.zeros_like(body.nodes_m)
     for k, grasp in enumerate(body.experiment.grasps):
@@ -218,13 +195,12 @@ def _flex_xml(body: IdentifiedBody) -> str:
 
 
 def _mean_edge_m(body: IdentifiedBody) -> float:
-    """Return the mean length of the edges between corners of the undeformed tetrahedra [m]."""
     ends = body.body.nodes_m[body.body.mesh.edges]
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
 
 
 def _keyframe_xml(body: IdentifiedBody) -> str:
-    """Return the key frame "start": poses, displacements and velocities."""
+    """Return the key frame "start"."""
     free = ~body.is_node_prescribed
     shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
     started = body.experiment.initial_velocities_m_s
@@ -285,7 +261,6 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
 
 
 def _import_mujoco() -> ModuleType:
-    """Return the module mujoco."""
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -334,7 +309,7 @@ def _compare_first_frequency(
 
 
 def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> PredictionComparison:
-    """Return the comparison of the RMS deformation over the recording in MuJoCo and here [m]."""
+    """Compare the RMS deformation over the recording [m]."""
     e = body.experiment
     free = ~body.is_node_prescribed
     data = mujoco.MjData(model)
@@ -375,14 +350,7 @@ def _compare_motion(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Pre
 def _set_grasp_state(
     body: IdentifiedBody, mujoco: ModuleType, data: Any, time_and_step_s: tuple[float, float]
 ) -> None:
-    """Set pose and velocity of the bodies that carry grasped nodes, and the pose of obstacles, in
-    `data`, in place.
-
-    Grasped bodies are free: that of grasp k has entries 7 k … 7 k + 6 of `qpos` and 6 k … 6 k + 5
-    of `qvel`. Obstacles are mocap bodies, after those of the grasps in `mocap_pos` and
-    `mocap_quat`; the mocap bodies of the grasps are not changed. After the last sample all stay at
-    its pose.
-    """
+    """Grasp k has 7 k … of `qpos`, 6 k … of `qvel`; obstacles follow in `mocap_pos`."""
     t_s, step_s = time_and_step_s
     last_s = float(body.experiment.t_s[-1])
     turning = np.zeros(3)
@@ -396,5 +364,5 @@ def _set_grasp_state(
 
 
 def _rms_length(vectors: Array) -> float:
-    """Return the root mean square length of vectors (…, 3)."""
+    """Vectors are (…, 3)."""
     return float(np.sqrt((vectors**2).sum(axis=-1).mean()))

@@ -114,10 +114,7 @@ def model(device=None):
 def _shared_contact(
     obstacles: Sequence[FacetedObstacle],
 ) -> tuple[float, float, float, tuple[str, ...]]:
-    """Return the contact constants that Newton has once for all obstacles of a soft body: friction
-    coefficient, stiffness of a node [N/m], and radius of particles, half the width δ of the
-    pressure law [m]; and a sentence if obstacles differ in these constants. Zeros without any.
-    """
+    """Return friction, stiffness [N/m], radius ½ δ [m], and a sentence if obstacles differ."""
     constants = {
         "friction": [float(wall.obstacle.friction) for wall in obstacles],
         "stiffness": [wall.node_stiffness_n_m for wall in obstacles],
@@ -185,7 +182,6 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _obstacle_data(obstacle: Obstacle, t_s: float) -> dict[str, Any]:
-    """Return shape, size, place and friction of an obstacle for the JSON file."""
     shape = Primitive.from_solid(obstacle.shape)
     place_m, turn = shape.pose_at(obstacle, t_s)
     sizes = shape.size_m if len(shape.size_m) else np.zeros(2)

@@ -166,10 +166,7 @@ class Facets:
         return normals @ points_m.T - np.einsum("fk,fk->f", corners[:, 0], normals)[:, None]
 
     def _oriented_outwards(self) -> Facets:
-        """Return a copy of the facets with the corners of each triangle ordered counter-clockwise
-        as seen from outside: from the side of its plane on which the last point, behind all facets,
-        is not.
-        """
+        """The last point is behind all facets."""
         corners = self.points_m[self.triangles]
         inwards = (
             np.einsum("fk,fk->f", self.points_m[-1] - corners[:, 0], _unit_normals(corners)) > 0
@@ -185,9 +182,7 @@ def _unit_normals(corners: Array) -> Array:
 
 
 def _hull_points(shape: Primitive, rounding_m: float, tolerance_m: float) -> Array:
-    """Return points (p, 3) of a solid that are the furthest along some direction; their hull is the
-    solid, with round surfaces replaced by facets.
-    """
+    """The hull of the points (p, 3) is the solid, with facets in place of round surfaces."""
     radius_m = rounding_m if shape.kind == "box" else shape.size_m[0]
     wide = float(
         np.clip(4 * np.sqrt(tolerance_m / max(radius_m, tolerance_m)), *FACET_WIDTH_LIMITS_RAD)

@@ -98,10 +98,7 @@ def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = No
 
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
-    """Return the von Mises stress (T, F) [Pa] on the F triangles of the surface of an experiment,
-    at each sample that of the nearest frame; None if the run has no frames of it or damaged ones,
-    or the experiment was not fitted.
-    """
+    """Return (T, F) [Pa] of the nearest frame; None if there are none."""
     if replay.positions_m is None:  # only fitted experiments have frames
         return None
     try:
@@ -111,7 +108,7 @@ def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
 
 
 def _limits(stresses: Sequence[Array | None]) -> tuple[float, float]:
-    """Return the common ends of the colour scale [Pa]; 0 and 1 if none is known."""
+    """0 and 1 if none is known [Pa]."""
     known = [each for each in stresses if each is not None and np.isfinite(each).any()]
     if not known:
         return 0.0, 1.0
@@ -153,17 +150,7 @@ def vertex_colours(
 
 
 class _Recording:
-    """File of a recording.
-
-    Parameters
-    ----------
-    file : Path
-        The file to write.
-    result : Result
-        Content of ``result.json``, for the summary and the parameters.
-    replays : sequence of MotionRecord
-        Experiments that will be written; they determine the layout and the time span.
-    """
+    """Write a recording, whose layout and time span follow from all replays."""
 
     def __init__(self, file: Path, result: Result, replays: Sequence[MotionRecord]) -> None:
         rr: Any = import_module("rerun")
@@ -179,12 +166,11 @@ class _Recording:
         self._write_parameters(result, np.array(span_s))
 
     def close(self) -> None:
-        """Write what is buffered and close the file."""
         self.stream.flush()
         self.stream.disconnect()
 
     def _layout(self, replays: Sequence[MotionRecord]) -> Any:
-        """Return the blueprint: bodies beside curves and the summary."""
+        """Bodies are beside curves and the summary."""
         views: Any = import_module("rerun.blueprint")
         bodies = [views.Spatial3DView(origin=self._path(e.name), name=e.name) for e in replays]
         curves = [
@@ -199,11 +185,10 @@ class _Recording:
         return views.Blueprint(views.Horizontal(views.Tabs(*bodies), right))
 
     def _path(self, *parts: str) -> str:
-        """Return an entity's path from escaped parts: names may have any characters."""
+        """Names may have any characters."""
         return self.rr.new_entity_path(list(parts))
 
     def _write_parameters(self, result: Result, span_s: Array) -> None:
-        """Write parameters with combined intervals as constant curves."""
         for name, each in result.estimates.items():
             curves = {"value": each.value}
             if each.combined95 is not None:
@@ -216,10 +201,7 @@ class _Recording:
     def write_experiment(
         self, replay: MotionRecord, stress: Array | None, limits: tuple[float, float]
     ) -> None:
-        """Write the motion of an experiment into the recording: the deforming surface, grasped
-        nodes, markers (measured, fitted, simulated), points of depth cameras, obstacles, residuals
-        and measured forces, each if it exists.
-        """
+        """Write what exists of an experiment."""
         name = replay.name
         self.stream.log(self._path(name), self._up_axis(replay.up), static=True)
         self._write_surface(replay, stress, limits=limits)
@@ -264,9 +246,7 @@ class _Recording:
     def _write_surface(
         self, replay: MotionRecord, stress: Array | None, limits: tuple[float, float]
     ) -> None:
-        """Write the deforming surface, and, if the stress is known, the curve of the largest stress
-        on it; samples with a position that is not finite have no surface.
-        """
+        """Samples with a position that is not finite have no surface."""
         rr = self.rr
         shapes_m = replay.shapes_m
         assert shapes_m is not None
@@ -314,7 +294,6 @@ class _Recording:
         self._send(path, t_s, columns=columns, counts=[len(each) for each in there])
 
     def _write_obstacles(self, replay: MotionRecord) -> None:
-        """Write the outlines of obstacles at each sample; without obstacles nothing."""
         if replay.obstacles_m is None:
             return
         path = self._path(replay.name, "obstacles")
@@ -325,7 +304,6 @@ class _Recording:
         self.stream.reset_time()
 
     def _write_residuals(self, replay: MotionRecord) -> None:
-        """Write the distances [mm] of fitted or simulated markers."""
         model_m = replay.rolled_out_m if replay.markers_m is None else replay.markers_m
         if model_m is None:
             return
@@ -335,7 +313,6 @@ class _Recording:
             self._write_curve(path, replay.t_s, values=values)
 
     def _write_forces(self, replay: MotionRecord) -> None:
-        """Write forces and torques, measured, fitted and simulated."""
         for number, columns in enumerate(replay.wrenches, 1):
             t_s = columns[:, 0]
             values = columns[:, 1:].reshape(len(t_s), 3, len(COMPONENTS))
@@ -356,7 +333,7 @@ class _Recording:
             self._send(path, t_s[is_finite], columns=columns, counts=None)
 
     def _send(self, path: str, t_s: Array, columns: Any, counts: Sequence[int] | None) -> None:
-        """Send columns at times (T,); `counts` are rows per time, one by default."""
+        """Counts are rows per time, one by default."""
         times = [self.rr.TimeColumn(TIMELINE, duration=t_s)]
         data = columns if counts is None else columns.partition(counts)
         self.stream.send_columns(path, times, data)

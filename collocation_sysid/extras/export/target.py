@@ -150,7 +150,6 @@ class TargetCapabilities:
         return [*sentences, *self._load_limitations(body)]
 
     def _load_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield what of loads on nodes the simulator cannot express."""
         e = body.experiment
         if e.forces and self.node_forces:
             yield self.node_forces
@@ -168,7 +167,6 @@ class TargetCapabilities:
             )
 
     def _obstacle_limitations(self, body: IdentifiedBody) -> Iterator[str]:
-        """Yield sentences on what the simulator cannot express of the obstacles of a body."""
         for each in body.obstacles:
             if getattr(each.shape, "rounding_m", 0.0) and not self.has_rounded_edges:
                 yield f"{each.name}: its edges are not rounded"
@@ -182,11 +180,7 @@ class TargetCapabilities:
 
 
 def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
-    """Yield a sentence for each property of a body that no target can express; none for others.
-
-    These are actuators, air, custom forces, and grasps that begin or end within the recording.
-    Moving grasps are not among them.
-    """
+    """Moving grasps are expressed by some targets."""
     e = body.experiment
     times = body.experiment.t_s
     if e.specimen is not None:

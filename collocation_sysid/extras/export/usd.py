@@ -109,21 +109,19 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
 
 def _rate_hz(t_s: Array) -> float:
-    """Return the time codes per second, so that each sample at `t_s` (T,) [s] has one, on average
-    where samples are uneven; `SINGLE_RATE_HZ` for fewer than two samples.
-    """
+    """Return time codes per second, on average where samples are uneven."""
     return (len(t_s) - 1) / float(np.ptp(t_s)) if len(t_s) > 1 else SINGLE_RATE_HZ
 
 
 def _tilt_deg(gravity_m_s2: Array) -> float:
-    """Return the angle between gravity (3,) and −z, from 0 to 180 [°]; 0 without gravity."""
+    """From 0 to 180 [°]; 0 without gravity."""
     downwards = -gravity_m_s2[2]
     across = np.linalg.norm(gravity_m_s2[:2])
     return float(np.degrees(np.arctan2(across, downwards))) if gravity_m_s2.any() else 0.0
 
 
 def _import_usd() -> Any:
-    """Return `Gf`, `Sdf`, `Usd`, `UsdGeom`, `UsdPhysics`, `UsdShade` and `Vt` in one object."""
+    """Return all modules in one object."""
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
     except ImportError as error:
@@ -133,7 +131,6 @@ def _import_usd() -> Any:
 
 
 def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
-    """Add the tetrahedra, masses, materials and simulated motion of the body to the stage."""
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
     mesh = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh")
@@ -172,7 +169,7 @@ def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Arr
 
 
 def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
-    """Return the mass of each tetrahedron, region after region, without points."""
+    """Region after region, without points."""
     edges = [np.diff(body.nodes_m[each], axis=1) for each in cells]
     volumes = [np.abs(np.linalg.det(each)) / 6 for each in edges]
     pairs = zip(body.regions, volumes, strict=True)
@@ -180,7 +177,7 @@ def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
 
 
 def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
-    """Add a region's material under /World/Materials/`name`, and return it."""
+    """Add a region's material under /World/Materials/`name`."""
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
     prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
@@ -203,7 +200,7 @@ def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> 
 
 
 def _bind_material(pxr: Any, prim: Any, material: Any) -> None:
-    """Bind a physics material to a prim; those of descendants prevail."""
+    """Those of descendants prevail."""
     binding = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
     binding.Bind(material, pxr.UsdShade.Tokens.weakerThanDescendants, "physics")
 
@@ -217,9 +214,7 @@ def _set_token(pxr: Any, prim: Any, name: str, text: str) -> None:
 def _add_gripper(
     pxr: Any, stage: Any, number: int, grasp: Grasp, body: IdentifiedBody, start_positions_m: Array
 ) -> None:
-    """Add a kinematic rigid body that follows the poses of a grasp to the stage, in place, as
-    /World/Gripper_NUMBER, and attach the nodes to it that the grasp holds along all axes.
-    """
+    """Attach the nodes to /World/Gripper_NUMBER that the grasp holds along all axes."""
     path = f"/World/Gripper_{number}"
     gripper = pxr.UsdGeom.Xform.Define(stage, path)
     pxr.UsdPhysics.RigidBodyAPI.Apply(gripper.GetPrim()).CreateKinematicEnabledAttr(True)
@@ -247,7 +242,7 @@ def _add_gripper(
 
 
 def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s: Array) -> None:
-    """Place a prim over times [s]; its default pose is that of the first row."""
+    """The default pose is that of the first row."""
     codes = (_rate_hz(t_s) * t_s).tolist()
     wxyz = rotations.as_quat(scalar_first=True)
     place = prim.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble)
@@ -261,12 +256,7 @@ def _set_poses(pxr: Any, prim: Any, positions_m: Array, rotations: Rotation, t_s
 def _add_obstacle(
     pxr: Any, stage: Any, path: str, obstacle: Obstacle, body: IdentifiedBody
 ) -> None:
-    """Add an obstacle with its friction to the stage, in place: its shape at or under `path`, and
-    its material as /World/Materials/NAME with the last name in `path`.
-
-    It is a kinematic rigid body, with a pose for each sample of `body`, if it has more than one
-    pose; otherwise it stays at its pose of the first sample. Rounded edges are left out.
-    """
+    """Rounded edges are left out."""
     shape = Primitive.from_solid(obstacle.shape)
     t_s = body.experiment.t_s
     frame = path
@@ -306,10 +296,7 @@ def _add_obstacle(
 
 
 def _unique_prim_names(names: Sequence[str]) -> list[str]:
-    """Return names that USD accepts, a different one for each of `names`, in the same order: other
-    characters than letters, digits and "_" are replaced by "_", and "_" is added where two would
-    agree.
-    """
+    """Return different names that USD accepts, in the same order."""
     unique: list[str] = []
     for name in names:
         text = re.sub(r"[^A-Za-z0-9_]", "_", name)
@@ -343,7 +330,6 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     """
 
     def add_to(builder: Any) -> None:
-        """Add the stage to a builder of Newton."""
         # Grippers are left out, since Newton would simulate them too.
         builder.add_usd(str(folder / STAGE_FILE), ignore_paths=["/World/Gripper_.*"])
 

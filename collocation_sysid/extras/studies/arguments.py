@@ -78,7 +78,6 @@ def read_truth(
 
 
 def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
-    """Return the file, and its values by name, of a source of true values."""
     if "=" in item:
         pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
@@ -105,7 +104,6 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
 
 
 def _positive_value(name: str, value: Any, source: Path | None) -> float:
-    """Return a value as a positive, finite float."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):

@@ -99,7 +99,6 @@ def find_disagreements(rows: Sequence[Row], chosen: Row) -> list[Disagreement]:
 def _disagreement(
     name: str, values: Mapping[str, float], budget_line: Mapping[str, object] | None
 ) -> Disagreement:
-    """Return the disagreement of one parameter."""
     if budget_line is None:
         return Disagreement(name, values, chosen_budget=None, combined95=None, share=0.0)
     line = BudgetLine(**budget_line)  # type: ignore[arg-type]

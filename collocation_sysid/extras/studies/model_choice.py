@@ -101,10 +101,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
 
 
 def _model_row(label: str, fits: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Return the row of a model from its fits, without the columns that compare models
-    ("independent", "delta_aic", "log_ratio", "log_ratio_error", "chosen"); see `model_rows` for the
-    others.
-    """
+    """Columns that compare models are missing, see `model_rows`."""
     complete_fit = fits.get("", {})
     predictions = {name: fit.get("prediction") or {} for name, fit in fits.items() if name}
     evidence = complete_fit.get("evidence")
@@ -166,12 +163,7 @@ def _add_ratios(rows: Sequence[Row]) -> None:
 
 
 def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
-    """Return the standard error of the logarithmic ratio of a row's prediction error to the best
-    one; 0 for the best.
-
-    It is the larger of the errors from the scatter between blocks in time and from the scatter
-    between recordings; NaN if there is only one block in total.
-    """
+    """Take the larger scatter, of blocks in time or recordings; NaN for a single block."""
     if row is best:
         return 0.0
     pairs = [(row["blocks"][name], best["blocks"][name]) for name in best["blocks"]]
@@ -184,7 +176,6 @@ def _log_ratio_error(row: Row, best: Row, logs: Sequence[float]) -> float:
 
 
 def _best_prediction(rows: Sequence[Row]) -> Row | None:
-    """Return the converged model that predicts held-out data best, or None."""
     predicted = [r for r in rows if r["converged"] and r["held_out_rms"]]
     return min(predicted, key=lambda r: r["held_out_rms"], default=None)
 
@@ -299,12 +290,6 @@ def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:
-    """Return a sentence with the names of the held-out recordings that the model `row` does not
-    predict, and by how much its AIC is lower than that of the `chosen` model, if that is more than
-    `NO_SUPPORT`.
-
-    Both are rows of `model_rows` of converged models, whose "delta_aic" must not be None.
-    """
     without = " and ".join(f"'{name}'" for name, rms in row["predictions"].items() if not rms)
     sentence = f"{row['model']} does not predict {without}"
     if (more := chosen["delta_aic"] - row["delta_aic"]) <= NO_SUPPORT:
@@ -316,12 +301,7 @@ def _failed_prediction(row: Row, chosen: Row) -> str:
 
 
 def _comparison(chosen: Row, rival: Row) -> str:
-    """Return the comparison of the chosen model with its closest rival, in words, without a period:
-    their prediction errors, numbers of parameters, and AIC.
-
-    Both are rows of `model_rows` of converged models that predict all held-out data:
-    "held_out_rms", "log_ratio", "log_ratio_error" and "delta_aic" must not be None.
-    """
+    """Both rows must predict all held-out data."""
     prediction = f"its prediction error for held-out samples is {_prediction_text(chosen)}"
     ratio, error = _log_ratio_between(chosen, rival)
     more = chosen["free"] - rival["free"]
@@ -337,10 +317,7 @@ def _comparison(chosen: Row, rival: Row) -> str:
 
 
 def _ratio_text(ratio: float, error: float) -> str:
-    """Return the ratio of two prediction errors as text, with its standard error if its logarithm
-    is positive and exceeds `LIKELY` standard errors, otherwise with the interval of `SURE` standard
-    errors, as a ratio that may be one.
-    """
+    """Give the interval of `SURE` errors unless the logarithm exceeds `LIKELY` errors."""
     if ratio > LIKELY * error:
         return f"{exp(ratio):.3g} times as large (±{100 * error:.2g} %)"
     low = exp(ratio - SURE * error)
@@ -349,7 +326,6 @@ def _ratio_text(ratio: float, error: float) -> str:
 
 
 def _prediction_text(row: Row) -> str:
-    """Return a known prediction error as text, such as "0.52 mm"."""
     factor, unit = display_unit(row["unit"])
     return f"{factor * row['held_out_rms']:.3g} {unit}"
 
@@ -362,25 +338,13 @@ def display_unit(unit: str) -> tuple[float, str]:
 
 
 def _log_ratio_between(chosen: Row, rival: Row) -> tuple[float, float]:
-    """Return the logarithm of the ratio of the rival's prediction error to the chosen model's,
-    positive if the chosen one predicts better, and its standard error: the larger of those of both
-    models relative to the best one.
-
-    Both are rows of `model_rows` that predict all held-out data: their "log_ratio" and
-    "log_ratio_error" must not be None.
-    """
+    """Return the logarithm, positive if the chosen one is better, and its standard error."""
     ratio = rival["log_ratio"] - chosen["log_ratio"]
     return ratio, max(rival["log_ratio_error"], chosen["log_ratio_error"])
 
 
 def _certainty(chosen: Row, rival: Row) -> str:
-    """Return a sentence on how certain the choice between the chosen model and its closest rival
-    is.
-
-    It is significant if both the predictions (in standard errors, `SURE`) and AIC (`NO_SUPPORT`)
-    favour the chosen model clearly, likely if both do less clearly (`LIKELY`, `SUPPORT`); otherwise
-    the sentence says which of them does not.
-    """
+    """Predictions and AIC must both favour the chosen model (`SURE`, `NO_SUPPORT`)."""
     ratio, error = _log_ratio_between(chosen, rival)
     support = rival["delta_aic"] - chosen["delta_aic"]
     if ratio > SURE * error and support > NO_SUPPORT:
@@ -551,7 +515,6 @@ def fit_record(problem: Problem, method: str, test_name: str) -> dict[str, Any]:
 
 
 def _complete_record(problem: Problem, method: str) -> dict[str, Any]:
-    """Return the record of a fit to all recordings, with budget."""
     began_s = time.perf_counter()
     finished = solve_and_check(problem, method, seek_causes=False)
     solution = finished.solution
@@ -573,7 +536,6 @@ def _complete_record(problem: Problem, method: str) -> dict[str, Any]:
 
 
 def _solution_record(solution: Solution) -> dict[str, Any]:
-    """Return the part of a record that every solution has, see `fit_record`."""
     return {
         "status": solution.status.value,
         "converged": solution.status.converged,
@@ -586,9 +548,7 @@ def _solution_record(solution: Solution) -> dict[str, Any]:
 
 
 def _names_at_bounds(solution: Solution) -> dict[str, str]:
-    """Return "lower" or "upper" by the name of each free parameter that ended at this bound, as the
-    intervals define it: within `AT_BOUND` of the bound in the coordinates of the solver.
-    """
+    """Return "lower" or "upper" by name, within `AT_BOUND` in the coordinates of the solver."""
     parameters = solution.collocation.parameters
     at_bound: dict[str, str] = {}
     for item, coordinate, lower, upper in zip(
@@ -628,11 +588,7 @@ def reserve_test_data(problem: Problem, name: str) -> tuple[Problem, float]:
 def _prediction_error(
     experiment: Experiment, rollout: ForwardSimulation, start_s: float
 ) -> dict[str, Any]:
-    """Return RMS, number of samples and sums of squares by block, of held-out measurements against
-    a simulation.
-
-    The measurements are those of `judged_residuals`; "unit" says which. Missing ones (NaN) do not count.
-    """
+    """Return RMS, number of samples and sums of squares by block; missing ones do not count."""
     residuals = judged_residuals(experiment, rollout.predicted)
     is_test_sample = residuals.t_s > start_s
     squares = np.where(residuals.is_counted, np.nansum(residuals.values**2, axis=2), 0.0)[

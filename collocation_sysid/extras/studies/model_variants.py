@@ -72,7 +72,7 @@ def parse_dampings(text: str) -> tuple[str, ...]:
 
 
 def _parse_names(text: str, known_names: Iterable[str], option: str) -> tuple[str, ...]:
-    """Return names from text separated by commas, each once, in the order of the text."""
+    """Return names separated by commas, each once, in the order of the text."""
     names = unique_items(text)
     for name in names or ("",):
         require_among(name, known_names, where=option, count="some")
@@ -269,12 +269,11 @@ def file_variants(problems: Sequence[Problem], overrides: Sequence[str]) -> list
 
 
 def _measured_counts(problem: Problem) -> dict[str, int]:
-    """Return how many numbers each fitted recording has, by name."""
     return {e.name: measured_count(e) for e in problem.experiments if not e.validation}
 
 
 def _measured_text(measured: Mapping[str, int]) -> str:
-    """Return "'swing' (600 numbers) and 'press' (80 numbers)"."""
+    """Return for example "'swing' (600 numbers) and 'press' (80 numbers)"."""
     return " and ".join(f"'{name}' ({count} numbers)" for name, count in measured.items())
 
 
@@ -307,12 +306,7 @@ def _require_region(
 def _law_changes(
     body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
 ) -> dict[str, Any]:
-    """Return changed values of the problem by dotted key, such as "object.material", that give a
-    material or damping law to a region, or for None to all parts.
-
-    For all parts the laws of the body are set, and those of regions are removed, so that they
-    follow the body. With regions, "object.region" is the complete list of their tables.
-    """
+    """Return the complete list of tables "object.region"; laws of the body remove others."""
     regions = [dict(each) for each in body.get("region", [])]
     for each in regions:
         if region is None:
@@ -329,13 +323,7 @@ def _law_changes(
 def _with_material(
     parameters: Mapping[str, Any], material: str, region: str | None
 ) -> dict[str, Any]:
-    """Return a copy of a problem's `[parameters]` for a body with another material.
-
-    A part with its own constants keeps constants of its own; the others share theirs. Constants
-    that the new material does not have are left out. Those that it needs are added with a guess of
-    the same shear modulus, or for a scan if that is unknown; see `_with_part_material` for when
-    shared constants are enough.
-    """
+    """Constants start from the same shear modulus, or for a scan if that is unknown."""
     of_any = {c.name for each in MATERIALS.values() for c in each.constants} | {*ELASTIC}
     fronts = {
         name[: -len(without_region(name))] for name in parameters if without_region(name) in of_any
@@ -350,15 +338,7 @@ def _with_material(
 def _with_part_material(
     parameters: Mapping[str, Any], prefix: str, material: str, of_any: set[str]
 ) -> dict[str, Any]:
-    """Return a copy of the parameters with another material in the part whose constants have this
-    prefix.
-
-    - the shear modulus, if the material has it, and the part has neither it nor Young's modulus;
-      those that parts share count only if the part has no constants of its own at all,
-    - Poisson's ratio, if the material has a compressibility, for which the part neither has nor
-      shares a constant (`VOLUMETRIC`),
-    - each other constant of the material that the part does not have itself, even if it is shared.
-    """
+    """Shared constants count where the part has none of its own, and for compressibility."""
     own = [constant.name for constant in MATERIALS[material].constants]
     possible = {*own, *elastic_names(MATERIALS[material])}
     mine = {prefix + name for name in of_any}
@@ -382,7 +362,6 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
     """Return the shear modulus [Pa] of guesses or fixed values; None if unknown."""
 
     def guess(name: str) -> float:
-        """Return the guess or fixed value of a constant; NaN if it has none."""
         value = parameters.get(prefix + name, parameters.get(name))
         if isinstance(value, Mapping):
             value = value.get("fixed", value.get("guess"))
@@ -407,9 +386,7 @@ def _shear_pa(parameters: Mapping[str, Any], prefix: str) -> float | None:
 
 
 def _starting_guess(name: str, shear_pa: float | None) -> dict[str, Any]:
-    """Return the table of the constant `name`: with a guess that gives the shear modulus `shear_pa`
-    [Pa], or empty, for a scan, if that is None or the constant has no usual value.
-    """
+    """Return a table with the guess of a shear modulus [Pa], or empty for a scan."""
     if shear_pa is None:
         return {}
     usual = usual_value(name, 2 * (1 + USUAL_POISSON) * shear_pa, poisson=USUAL_POISSON)
@@ -436,7 +413,7 @@ def _with_memory(
     tables: Sequence[Mapping[str, Any]],
     times_s: tuple[float, float],
 ) -> dict[str, Any]:
-    """Return parameters with share and time of each branch, known ones kept."""
+    """Known branches are kept."""
     names = [each["name"] for each in tables]
     removed_names = {name for name in old if name not in names}
     unchanged = {

@@ -258,13 +258,7 @@ def fitted_recordings(problem: Problem) -> list[str]:
 def _planned_run(
     path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
-    """Return the run of a file with its overrides, with a key that depends on all that decides its
-    result.
-
-    The key is a hash of the content of the file (with only the solver's options for this method),
-    the start, for a comparison of models the held-out recording, the data files, and the version of
-    this package; not of the path.
-    """
+    """The key is a hash of all that decides the result, not of the path."""
     method = method or file.solver.method
     start = more.get("start", 0)
     guess = {
@@ -289,10 +283,7 @@ def _planned_run(
 
 
 def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
-    """Return SHA-256 hashes, by the name as it is written, of the files that the content of a
-    problem names, so that changed data give another run. A topic of a log with several files has
-    their hashes, separated by spaces. Names of missing files and of folders are left out.
-    """
+    """Changed data give another run; missing files and folders are left out."""
     hashes = {}
     for text in _texts(content):
         with suppress(OSError, ValueError):  # a text that is no file's name
@@ -303,7 +294,7 @@ def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
 
 
 def _texts(content: Any) -> Iterator[str]:
-    """Yield all texts in nested mappings, lists and tuples; keys are not included."""
+    """Keys are not included."""
     if isinstance(content, str):
         yield content
     elif isinstance(content, Mapping):

@@ -127,9 +127,7 @@ def model_figure(rows: Sequence[Row]) -> Figure | None:
 
 
 def _model_ends(row: Row, panel: str) -> tuple[float, float, float] | None:
-    """Return low end, value and high end of a model in a panel of `model_figure`; None if the model
-    has no such value.
-    """
+    """Return low end, value and high end; None if the model has no such value."""
     if panel == "prediction":
         if row["log_ratio"] is None or not np.isfinite(row["log_ratio_error"]):
             return None

@@ -128,9 +128,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
 
 
 def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
-    """Return the columns of the estimated parameters of a run: first ``guess_NAME`` of all, then
-    for each ``value_NAME``, and ``error_NAME`` if its truth is known.
-    """
+    """First ``guess_NAME`` of all, then ``value_NAME`` and ``error_NAME`` of each."""
     row: Row = {}
     estimates = {} if result is None else result.parameters
     for name, guess in run.guess.items():
@@ -173,10 +171,7 @@ def method_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def _method_summary(method: str, rows: Sequence[Row]) -> Row:
-    """Return the summary of the runs of one method.
-
-    Runs with the status "missing" are not counted.
-    """
+    """Runs with the status "missing" are not counted."""
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
     low, high = wilson_interval(successes, len(done))

@@ -97,7 +97,7 @@ def execute(
 def _attempt(
     planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
 ) -> Record:
-    """Execute a run once, in a process with one thread, and return its record."""
+    """Execute a run once, in a process with one thread."""
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
         file = Path(place) / "record.json"
         with open(Path(place) / "stderr", "w+b") as stderr:
@@ -231,7 +231,6 @@ class RunStore:
         return record
 
     def _file(self, key: str) -> Path:
-        """Return the file of the record with this key, which need not exist."""
         return self.folder / f"{key}.json"
 
 
@@ -318,7 +317,7 @@ def run_all(
 
 
 def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """Return the record of a finished future; a lost worker is a crash."""
+    """A lost worker is a crash."""
     try:
         return future.result()
     except Exception as error:
@@ -334,17 +333,12 @@ def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> R
 
 @contextmanager
 def _thread_executor(limits: RunOptions) -> Iterator[Executor]:
-    """Context with an executor of threads, which wait for processes on this machine: as many at
-    once as `limits` states, else one for each available thread.
-
-    The end of the context waits for submitted runs; only `stop` ends running ones.
-    """
+    """The end waits for submitted runs; only `stop` ends running ones."""
     worker_count = limits.workers or available_threads()
     stop = threading.Event()
     with ThreadPoolExecutor(worker_count) as executor:
 
         def submit(run: PlannedRun) -> Future:
-            """Start a run and return the future of its record."""
             return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
 
         yield submit, worker_count, stop.set
@@ -352,24 +346,18 @@ def _thread_executor(limits: RunOptions) -> Iterator[Executor]:
 
 @contextmanager
 def _cluster_executor(limits: RunOptions) -> Iterator[Executor]:
-    """Context with an executor on the workers of the scheduler in `limits`, one run at once for
-    each of their threads.
-
-    `stop` tells running runs to end, through an event of the cluster; the end of the
-    context alone does not stop them. It waits for submitted runs, and closes the connection.
-    """
+    """The end waits for submitted runs; `stop` ends them through an event of the cluster."""
     flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
     with connected(limits.scheduler) as client:
         stop = distributed().Event(flag, client=client)
         with client.get_executor(pure=False) as executor:
 
             def submit(run: PlannedRun) -> Future:
-                """Start a run and return the future of its record."""
                 return executor.submit(_execute_on_worker, run.as_dict(), limits.time_limit_s, flag)
 
             yield submit, max(1, sum(client.nthreads().values())), stop.set
 
 
 def _execute_on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
-    """Execute a run in a process of its own on a worker, and return its record, see `execute`."""
+    """Execute a run in a process of its own on a worker."""
     return execute(planned, time_limit_s, is_stopped=distributed().Event(flag).is_set)

@@ -79,9 +79,7 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tip_error_m(finished: Run) -> float | None:
-    """Return the largest error [m] of the marker farthest from the grasp in the forward simulation
-    of the first experiment; None without markers, measurements or a simulation.
-    """
+    """Return the largest error [m] of the marker farthest from the grasp in a simulation."""
     experiment = finished.solution.collocation.transcriptions[0].experiment
     markers = experiment.markers
     rollout = finished.rollouts[experiment.name]
@@ -98,6 +96,6 @@ def _tip_error_m(finished: Run) -> float | None:
 
 
 def _end_with_study() -> None:
-    """Wait until stdin is closed, and end the process at once with code 1, without any clean-up."""
+    """Wait until stdin is closed, and end the process at once, without any clean-up."""
     os.read(0, 1)  # returns when the other end is closed
     os._exit(1)

@@ -236,10 +236,7 @@ def model_tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def _ratio_text(row: Row) -> str:
-    """Return the ratio of a model's prediction error to the best one as text, with its standard
-    error; "–" if "log_ratio" is None, because not all held-out data were predicted. `row` is one of
-    `model_rows`.
-    """
+    """Return "–" if not all held-out data were predicted."""
     if row["log_ratio"] is None:
         return "–"
     times = exp(row["log_ratio"])
@@ -248,9 +245,7 @@ def _ratio_text(row: Row) -> str:
 
 
 def _bounded_value(row: Row, name: str) -> str:
-    """Return the value of a parameter in a row of `model_rows` as text, followed by "(at lower
-    bound)" or "(at upper bound)" if it ended there; "–" if the model has no such parameter.
-    """
+    """Return "–" if the model has no such parameter."""
     number = _number_text(row["parameters"].get(name), form=".4g")
     bound = row["at_bound"].get(name)
     return f"{number} (at {bound} bound)" if bound else number
@@ -259,22 +254,17 @@ def _bounded_value(row: Row, name: str) -> str:
 def _table(
     title: str, names: Mapping[str, Cell], numbers: Mapping[str, Cell], rows: Sequence[Row]
 ) -> Table:
-    """Return a table with a line for each row and a column for each cell."""
     columns = {**names, **numbers}
     cells = tuple(tuple(cell(row) for cell in columns.values()) for row in rows)
     return Table(title, tuple(columns), rows=cells, names=len(names))
 
 
 def _number_cell(name: str, factor: float = 1, form: str = ".2g") -> Cell:
-    """Return the cell of a number, see `_number_text`."""
     return lambda row: _number_text(row[name], factor, form)
 
 
 def _number_text(value: float | None, factor: float = 1, form: str = ".2g") -> str:
-    """Return `value` times the factor as text; a dash "–" for None.
-
-    With the default format ".2g", magnitudes from 100 on are rounded to whole numbers.
-    """
+    """Magnitudes from 100 on are rounded to whole numbers in ".2g"; None is "–"."""
     if value is None:
         return "–"
     value *= factor

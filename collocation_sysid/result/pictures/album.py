@@ -156,7 +156,7 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
 
 
 def _infinities_as_nan(markers_m: Array | None) -> Array | None:
-    """Return markers with NaN in place of infinities, where a method diverged."""
+    """A method that diverged has infinities."""
     return None if markers_m is None else np.where(np.isfinite(markers_m), markers_m, np.nan)
 
 

@@ -138,7 +138,6 @@ def depth_picture(rows: Array, unit: str = "") -> Figure:
 
 
 def _sentence_figure(text: str) -> Figure:
-    """Return a small figure that has only the sentence `text`."""
     figure = Figure(
         figsize=(MAX_PANEL_SHARE * PAGE_MM / MM_PER_INCH, TITLE_HEIGHT_INCH), layout="constrained"
     )
@@ -171,7 +170,6 @@ def _new_panels(points: Array, times: Array, rows: int) -> tuple[NDArray[np.obje
 def _draw_panel(
     axes: Axes, image_points: Array, values: Array, lines: Array, colour: str, style: dict[str, Any]
 ) -> PathCollection:
-    """Draw points and outlines, and return the points; outlines far from all points are cut off."""
     drawn = axes.scatter(*image_points.T, c=values, linewidths=0, zorder=1, **style)
     # Of more faces thinner ones, or these would hide the points.
     thin = min(0.5, THICK_LINE_ROWS / max(1, len(lines)))

@@ -139,9 +139,7 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
 
 
 def _draw_pair(axes: Axes, outline: Array, half_width: float, half_height: float) -> None:
-    """Draw a region with the outline (points, 2), about the origin, filled into `axes`, and a cross
-    of half widths `half_width` and `half_height`, all as deviations of logarithms.
-    """
+    """All sizes are deviations of logarithms."""
     axes.fill(*outline.T, facecolor=to_rgba(SKY, 0.35), edgecolor=BLUE, lw=1.0)
     for line in ([[-half_width, half_width], [0, 0]], [[0, 0], [-half_height, half_height]]):
         axes.plot(*line, color=BLACK, lw=0.8, solid_capstyle="butt")
@@ -173,11 +171,9 @@ class _DeviationAxis:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Ends of the axis, symmetric about zero."""
         return -self.reach, self.reach
 
     def axis_label(self, name: str) -> str:
-        """Return the label of the axis of the parameter `name`."""
         return symbol_as_mathtext(name) + self.unit
 
 

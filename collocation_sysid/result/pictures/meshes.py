@@ -128,9 +128,7 @@ def mesh_picture(replay: MotionRecord) -> Figure:
 
 
 def _legend_lines(replay: MotionRecord, marks: set[str]) -> list[list[Line2D]]:
-    """Return the lines of the legend of a mesh, without empty ones: grasped nodes and markers, the
-    kinds of `marks` that were drawn (keys of `MARK_STYLES`), and the parts if there are several.
-    """
+    """Return non-empty lines; `marks` are the keys of `MARK_STYLES` that were drawn."""
     entries = ["grasped"] if replay.is_prescribed.any() else []
     if len(replay.marker_names):
         entries += ["markers", "behind the body"]
@@ -148,7 +146,6 @@ def _legend_lines(replay: MotionRecord, marks: set[str]) -> list[list[Line2D]]:
 def _draw_declared_positions(
     axes: Axes, view: SheetView, places_m: Array, declared_m: Array
 ) -> set[str]:
-    """Mark markers whose estimated place differs from the stated one, or that have no stated place."""
     estimated_mm = view.to_sheet_mm(places_m)
     declared_mm = view.to_sheet_mm(declared_m)
     drawn = set[str]()
@@ -174,12 +171,7 @@ def _are_named_in_front(
     nodes_m: Array,
     surface: Triangles,
 ) -> NDArray[np.bool_]:
-    """Return for each marker (M,) whether its name is written in the front view, else in the one
-    from behind.
-
-    It is the view in which the marker is not hidden; if it is hidden in both or in none, the nearer
-    one.
-    """
+    """Return (M,): the view in which the marker is not hidden, or else the nearer one."""
     hidden = [camera.are_hidden(places_m, nodes_m, surface=surface) for camera in (front, behind)]
     is_in_front = (
         front.coordinates_to_viewer_m(places_m) >= front.coordinates_to_viewer_m(nodes_m).mean()

@@ -180,18 +180,12 @@ def _axes_boxes(row: int, axis: int, height: float, head: float) -> tuple[Box, B
 
 
 def _column_width_mm() -> float:
-    """Return the width of one of the three columns [mm]."""
     layout = TRACK_LAYOUT
     return (PAGE_MM - layout.first_margin_mm - layout.last_margin_mm - 2 * layout.column_gap_mm) / 3
 
 
 def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> list[int]:
-    """Return the indices of at most `count` markers with the largest RMS residuals, in their
-    original order.
-
-    Residuals are those of the first model; without a model, or if there are not more markers, the
-    first markers are returned.
-    """
+    """Return `count` markers with the largest RMS residuals of the first model, in their order."""
     if measured_m.shape[1] <= count or not models_m:
         return list(range(min(count, measured_m.shape[1])))
     squares = np.nansum((models_m[0] - measured_m) ** 2, axis=(0, 2))
@@ -320,9 +314,7 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
 
 
 def _shown_numbers(measured: Array, predicted: Array, units: Sequence[str]) -> list[int]:
-    """Return which of the numbers of a sensor are drawn: those that are measured (S, m) and do not
-    vanish in both the measurements and the predictions (k, m), beside others of the same unit.
-    """
+    """Return numbers that are measured and do not vanish beside others of the same unit."""
     is_measured = np.asarray(np.isfinite(measured).any(axis=0))
     squares = np.nansum(measured**2, axis=0) / np.maximum(1, np.isfinite(measured).sum(axis=0))
     rms = np.sqrt(squares)

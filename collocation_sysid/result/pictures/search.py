@@ -95,7 +95,7 @@ def _continuation_stages(history: Sequence[Iteration]) -> list[slice]:
 def _mark_continuation_stages(
     panels: Sequence[Axes], history: Sequence[Iteration], stages: Sequence[slice]
 ) -> None:
-    """Mark the iterations at which the fit takes in more time steps: loss and error increase there."""
+    """Mark where the fit takes in more time steps: loss and error increase there."""
     if len(stages) < 2:
         return
     for part in stages:
@@ -114,12 +114,7 @@ def _draw_parameters(
     names: Sequence[str],
     truth: Mapping[str, float] | None,
 ) -> None:
-    """Draw the named parameters over the iterations into `axes`, relative to their true or final
-    values.
-
-    A reference of zero counts as 1, and ratios that are not positive are left out. Without
-    iterations only the axes and the line at 1 are drawn.
-    """
+    """A reference of zero counts as 1, and ratios that are not positive are left out."""
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
     for k, name in enumerate(names if history else ()):

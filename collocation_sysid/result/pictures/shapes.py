@@ -143,12 +143,7 @@ def shapes_picture(
 
 
 def _draw_colour_bar(axes: Axes, field: SurfaceField, samples: Index) -> Array:
-    """Draw the colour bar of a field into `axes`, and return the colours (k, F, 3), from 0 to 1, at
-    samples with indices (k,); grey where the field is NaN.
-
-    The scale begins at zero if the smallest value is small relative to the largest, and is the same
-    for all samples; NaN does not count.
-    """
+    """Return colours (k, F, 3) at samples (k,); the scale is the same for all, grey for NaN."""
     values = field.values_at(samples)
     low = np.nanmin(values)
     high = np.nanmax(values)
@@ -254,12 +249,10 @@ def field_shapes(
 def _surface_field(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
 ) -> SurfaceField:
-    """Return a field of the elements on the boundary triangles of an experiment."""
     elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 
     def at(samples: Index) -> Array:
-        """Return the values (k, F) on the boundary triangles at samples with indices (k,)."""
         assert replay.shapes_m is not None
         return elements.evaluate_at(replay.shapes_m[samples])[field][:, cells]
 

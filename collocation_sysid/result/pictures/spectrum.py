@@ -101,9 +101,7 @@ def spectral_density(tracks_m: Array, rate_hz: float) -> tuple[Array, Array]:
 
 
 def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
-    """Draw lines at the natural frequencies (k,) [Hz] below `limit_hz` into `axes`, numbered from 1
-    at the top, with one entry of the legend; neighbours that are too near share a number label.
-    """
+    """Number the modes from 1 at the top; neighbours that are too near share a label."""
     shown = natural_hz[natural_hz < limit_hz]
     for group in _neighbour_groups(shown, 0.05 * limit_hz):
         for hertz in shown[group]:
@@ -119,8 +117,6 @@ def _draw_modes(axes: Axes, natural_hz: Array, limit_hz: float) -> None:
 
 
 def _neighbour_groups(ascending: Array, gap: float) -> list[NDArray[np.int64]]:
-    """Return groups of indices of ascending values, in which neighbours are nearer to each other
-    than `gap`; every value is in one group.
-    """
+    """Return groups of indices, in which neighbours are nearer to each other than `gap`."""
     breaks = np.flatnonzero(np.diff(ascending) >= gap) + 1
     return [group for group in np.split(np.arange(len(ascending)), breaks) if len(group)]
