@@ -70,12 +70,8 @@ def load_array(path: str | Path) -> NDArray[Any]:
 
 
 def _require_size(content: IO[bytes], size: int, compressed: int, name: str) -> None:
-    """Refuse an array if its header states more than is plausible.
-
-    It is refused if it is larger than its content; and, above `SMALL_BYTES`, if it is compressed
-    more than `LARGEST_COMPRESSION`-fold or takes more than `MEMORY_SHARE` of this machine's memory
-    (if known). An array in version 3 of the format is not checked.
-    """
+    """Refuse an array if its header states more than is plausible."""
+    # An array in version 3 of the format is not checked.
     version = npy.read_magic(content)
     if version not in _HEADERS:  # for names of columns that are not Latin
         return

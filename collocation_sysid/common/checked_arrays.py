@@ -103,7 +103,6 @@ def float_converter(
     """
 
     def converted(values: ArrayLike) -> Array:
-        """Return a read-only copy of the values."""
         return read_only_floats(values, shape, name=name, finite=finite)
 
     return converted

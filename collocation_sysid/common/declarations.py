@@ -118,23 +118,16 @@ def declaration(kind: type[T]) -> type[T]:
 
 
 def _forms(kind: type) -> dict[str, Any]:
-    """Return the forms of all fields of a declaration, whose annotations are texts in the modules of
-    the classes that state them.
-    """
+    """Return the forms of all fields; their annotations are texts in the classes' modules."""
     owners = {n: base for base in reversed(kind.__mro__) for n in inspect.get_annotations(base)}
     modules = {name: vars(sys.modules[owner.__module__]) for name, owner in owners.items()}
     return {each.name: _form(each, modules[each.name]) for each in fields(kind)}
 
 
 def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
-    """Return the form of a field, see `key`; None if all values are accepted.
-
-    The default value is accepted, although a problem file may not state it, and so is None for a
-    field whose annotation or default is None. A field without form and converter has the form of its
-    annotation, see `validated_classes.form_of`, in which `names` of the module may occur; numbers
-    are then finite, unless the default is not. The converter ``tuple[X, ...]`` stands for that form
-    of its annotation; type checkers then accept all iterables.
-    """
+    """Return the form of a field, see `key`, else of its annotation; the default is accepted."""
+    # The converter ``tuple[X, ...]`` stands for that form of its annotation; type checkers then
+    # accept all iterables.
     is_optional = field.default is None or str(field.type).endswith("| None")
     if (converter := _converter(field)) is not None:
         return Annotated[
@@ -153,7 +146,6 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
         return None
 
     def unless_default(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
-        """Return a possible None and the default value unchanged, other values validated."""
         is_default = type(value) is type(field.default)
         if (value is None and is_optional) or (is_default and value == field.default):
             return value
@@ -163,7 +155,6 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
 
 
 def _converter(field: Field[Any]) -> Callable[[Any], Any] | None:
-    """Return the function that converts the values of a field."""
     converter, accepted = (field.metadata.get(name) for name in ("converter", "accepted"))
     return None if accepted or get_origin(converter) is tuple else converter
 

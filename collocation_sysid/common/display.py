@@ -295,12 +295,10 @@ def _on_terminal(part: Shown) -> RenderableType:
 
 
 def _titled(title: str, *parts: RenderableType) -> RenderableType:
-    """Return renderables below one another, below a bold title if it is not ""."""
     return Group(_text(title, "bold"), *parts) if title else Group(*parts)
 
 
 def _text(text: str, style: str = "") -> UnbrokenWords:
-    """Return a text in a style of rich as a renderable without broken words."""
     return UnbrokenWords(Text(text, style=style))
 
 
@@ -311,9 +309,6 @@ class UnbrokenWords:
     text: Text
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the lines of the text, wrapped between words to the
-        width of the console, for rich.
-        """
         for line in self.text.split(allow_blank=True):
             breaks = [0]
             for word in re.finditer(r"\S+", line.plain):
@@ -342,7 +337,6 @@ class TerminalTable:
     table: Table
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the table as one of rich, in the form that suits the console."""
         yield _rich_table(self.table, parted=console.is_terminal)
 
 
@@ -428,9 +422,6 @@ def _class(style: str) -> str:
 
 
 def _span(span: Span) -> str:
-    """Return a piece of a sentence as HTML: a link, strong or code element, a span with a class, or
-    plain text.
-    """
     text = escape(span.text)
     if span.to:
         return f'<a href="{escape(span.to)}">{text}</a>'
@@ -440,9 +431,7 @@ def _span(span: Span) -> str:
 
 
 def _html_rows(table: Table) -> str:
-    """Return headings and rows of a table as HTML; without headings, the first cell of each row is
-    its heading.
-    """
+    """Without headings, the first cell of each row is its heading."""
     head = "".join(
         f"<th{_class('n' if table.is_number(k) else '')}>{escape(each)}</th>"
         for k, each in enumerate(table.heads)
@@ -471,7 +460,6 @@ def as_markdown(parts: Sequence[Shown]) -> str:
 
 
 def _markdown(part: Shown) -> str:
-    """Return one part as Markdown; "" for a titled group without title and parts."""
     match part:
         case str():
             return escape_markdown(part)
@@ -507,9 +495,7 @@ def escape_markdown(text: str) -> str:
 
 
 def _markdown_span(span: Span) -> str:
-    """Return a piece of a sentence as Markdown: bold for "strong", code for "code", else plain;
-    targets of links are omitted.
-    """
+    """Return a piece of a sentence as Markdown; targets of links are omitted."""
     text = span.text.strip()
     if not text or span.style not in ("strong", "code"):
         return _spaced_like(span.text, escape_markdown(text))
@@ -522,17 +508,13 @@ def _markdown_span(span: Span) -> str:
 
 
 def _spaced_like(text: str, shown: str) -> str:
-    """Return `shown` with one space before and after it where `text` begins and ends with white
-    space.
-    """
+    """Return `shown` with one space where `text` begins and ends with white space."""
     before = " " if text[:1].isspace() else ""
     after = " " if text[-1:].isspace() else ""
     return f"{before}{shown}{after}"
 
 
 def _longer_than_any(fence: str, text: str) -> str:
-    """Return a fence of backticks that is longer than any sequence of backticks in the text, at
-    least `fence`.
-    """
+    """Return a fence of backticks longer than any in the text, at least `fence`."""
     longest = max(map(len, BACKTICKS.findall(text)), default=0)
     return fence if longest < len(fence) else "`" * (longest + 1)

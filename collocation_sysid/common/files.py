@@ -149,9 +149,7 @@ def require_run_folder(path: Path) -> None:
 
 
 def _file_instead_of_folder(path: Path, what: str, expected_file: str) -> InputError:
-    """Return the error for a file where `what` is expected; it suggests the folder of the file if
-    that has a file `expected_file`.
-    """
+    """The error suggests the folder of the file if that has a file `expected_file`."""
     is_within = (path.parent / expected_file).is_file()
     likely = f", likely {path.parent}" if is_within else ""
     return InputError(f"this is a file; expected {what}{likely}", path)

@@ -77,8 +77,6 @@ def extra_names() -> list[str]:
 
 
 def _source_metadata() -> dict[str, Any]:
-    """Return the table "project" of pyproject.toml, for a package that is run from its sources
-    without installation.
-    """
+    """Return the table "project" of pyproject.toml, for sources without installation."""
     with (_FOLDER.parent / "pyproject.toml").open("rb") as file:
         return tomllib.load(file)["project"]

@@ -55,7 +55,6 @@ class ByForm:
         return handler.generate_schema(Annotated[forms, Discriminator(self._tag)])
 
     def _tag(self, value: Any) -> str:
-        """Return the tag of the form that a value has."""
         return "<first>" if isinstance(value, self.first) else "<second>"
 
 
@@ -121,9 +120,6 @@ class Section(BaseModel):
 
     @model_validator(mode="after")
     def _require_file_or_constant(self) -> Self:
-        """Return the section itself; raise `ValueError` unless exactly one of a constant and a file
-        with a table is given for each key that has both.
-        """
         for key in _keys_by_name(type(self)).values():
             if key.constant is not None:
                 require_one(self, key.constant, key.name)
@@ -131,7 +127,6 @@ class Section(BaseModel):
 
 
 def _keys_by_name(section: type[Section]) -> dict[str, Key]:
-    """Return the keys of the class of which a section is the table, by the name of the field."""
     if not is_dataclass(section.of):
         return {}
     if keys := dict(keys_of(section.of)):

@@ -128,11 +128,9 @@ def read(kind: Any, content: Any) -> Any:
 
 
 def _is_optional(field: Field[Any]) -> bool:
-    """Return whether a field was declared by `optional`."""
     return "optional" in field.metadata
 
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """Return the resolved annotations of a dataclass by field, cached."""
     return get_type_hints(kind)

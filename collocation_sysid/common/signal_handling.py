@@ -44,9 +44,7 @@ class Interrupts:
         self.number = int(signal.SIGINT)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise `KeyboardInterrupt`, or defer the signal if `frame`, which it interrupted, is
-        within an import, a function of CasADi or a `deferred` block.
-        """
+        """Defer the signal within an import, a function of CasADi or a `deferred` block."""
         self.number = number
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False
@@ -107,9 +105,7 @@ INTERRUPTS = Interrupts()
 
 
 def _end_quietly() -> None:
-    """Restore the default action of Ctrl-C (the process ends without a traceback), if this process
-    is the command line and the handler is Python's own; otherwise change nothing.
-    """
+    """Restore the default action of Ctrl-C, which has no traceback, on the command line."""
     handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     command = os.path.splitext(os.path.basename(sys.argv[0]))[0]
     if command == COMMAND and handled and _in_main_thread():

@@ -110,7 +110,6 @@ def search_activity(name: str) -> Iterator[None]:
 
 
 def _report_activity() -> None:
-    """Call the listener, if there is one, with the name of the present search."""
     listener = _activity_listener.get()
     if listener is not None:
         listener(_activity.get())

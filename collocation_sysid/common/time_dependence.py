@@ -118,9 +118,7 @@ def values_over_time(instance: Any) -> dict[str, Any]:
 
 
 def _changed(instance: T, function: Callable[..., Any], *others: T) -> T:
-    """Return an object with a function applied to its marked fields other than None; itself if no
-    value changes.
-    """
+    """Return an object with its marked fields changed; itself if no value changes."""
     changes = {}
     for name, mark in _marks(type(instance)).items():
         value, *rest = (getattr(each, name) for each in (instance, *others))
@@ -132,9 +130,7 @@ def _changed(instance: T, function: Callable[..., Any], *others: T) -> T:
 
 
 def _map_parts(function: Callable[..., Any], value: Any, *others: Any) -> Any:
-    """Return the function of an object, or a tuple of the functions of the objects in a tuple, with
-    the corresponding ones of other values; the value itself if nothing changes.
-    """
+    """Return the function of an object or of those in a tuple; the value itself if unchanged."""
     if not isinstance(value, tuple):
         return function(value, *others)
     parts = tuple(function(*each) for each in zip(value, *others, strict=True))
@@ -144,5 +140,4 @@ def _map_parts(function: Callable[..., Any], value: Any, *others: Any) -> Any:
 
 @cache
 def _marks(kind: type) -> dict[str, TimeDependence]:
-    """Return the marks of a dataclass by the names of the fields, cached; empty without marks."""
     return {each.name: each.metadata[MARK] for each in fields(kind) if MARK in each.metadata}

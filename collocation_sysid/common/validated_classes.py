@@ -134,7 +134,6 @@ def validate_arguments(
     made = {each.name for each in stated_fields if each.default_factory is not MISSING}
 
     def made_validators() -> list[tuple[str, Any, Any]]:
-        """Return name, default and validator of each argument that has a form."""
         stated = {n: f for n, f in forms().items() if n in signature.parameters and f is not None}
         return [(n, signature.parameters[n].default, _validator(f)) for n, f in stated.items()]
 
@@ -166,9 +165,7 @@ def validate_arguments(
 
 
 class _Kept:
-    """Function without arguments that keeps its value. The value is made anew in another process,
-    so that classes of a user's script can be pickled.
-    """
+    """Function that keeps its value, made anew in another process: classes of a user's script."""
 
     def __init__(self, compute: Callable[[], Any]) -> None:
         self._compute = compute

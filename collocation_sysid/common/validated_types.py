@@ -37,7 +37,6 @@ def _of_usual_size(value: float) -> float:
 
 
 def _python_scalar(value: Any) -> Any:
-    """Return a scalar of NumPy as one of Python; other values unchanged."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -49,7 +48,6 @@ def _no_nan(value: float) -> float:
 
 
 def _number_unless_array(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
-    """Return an array unchanged, and anything else validated."""
     return value if np.ndim(value) else validated(value)
 
 

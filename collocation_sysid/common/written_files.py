@@ -116,9 +116,7 @@ def foreign_files(folder: Path) -> Iterator[Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield everything below a folder except folders, lists and ignored names, by name; links are
-    yielded, not followed.
-    """
+    """Yield files and links, which are not followed, without lists and ignored names."""
     for entry in sorted(os.scandir(folder), key=lambda each: each.name):
         path = folder / entry.name
         if entry.is_dir(follow_symlinks=False):
@@ -130,9 +128,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _home(file: Path, folder: Path) -> Path:
-    """Return the nearest folder above a file that has a list, not above `folder`; `folder` if there
-    is none.
-    """
+    """Return the nearest folder above a file that has a list, else `folder`."""
     for parent in file.parents:
         if parent == folder or (parent / LIST_FILE).is_file():
             return parent
@@ -140,6 +136,5 @@ def _home(file: Path, folder: Path) -> Path:
 
 
 def _hash(file: Path) -> str:
-    """Return the SHA-256 hash of a file's content as hexadecimal digits."""
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()

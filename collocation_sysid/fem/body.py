@@ -92,7 +92,6 @@ MeshOrigin = Literal["cad", "scan"]
 
 
 def _require_origin(made: object, mesh_from: object, rest_shape: object) -> None:
-    """Raise `InputError` for unknown words, or for a drawing whose shape is that under gravity."""
     for key, word, words in (
         ("made", made, get_args(Made)),
         ("mesh_from", mesh_from, get_args(MeshOrigin)),
@@ -377,7 +376,6 @@ class Body(Discretisation):
         return state | {"_evaluators": {}, "_framed": {}}
 
     def _list_cached_names(self) -> set[str]:
-        """Return the names of the cached properties that have been computed."""
         return {n for n in vars(self) if isinstance(getattr(type(self), n, None), cached_property)}
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
@@ -589,9 +587,7 @@ class Body(Discretisation):
         return masses
 
     def _masses_with_densities(self, densities: Sequence[float]) -> Array:
-        """Return the mass of every dof (3n,) [kg] for given densities of the parts [kg/m³], without
-        fields and tied masses.
-        """
+        """Mass of every dof (3n,) [kg] for densities [kg/m³] of the parts, without tied masses."""
         return np.sum([d * v for d, v in zip(densities, self._lumped_m3, strict=True)], axis=0)
 
     @cached_property
@@ -965,7 +961,6 @@ class Body(Discretisation):
     def _apply_stiffening_to_curvature(
         self, curvature: SecondDerivatives, memory_input: MemoryInput | None
     ) -> None:
-        """As `_apply_stiffening_chain_rule`, for first and second derivatives."""
         theta_theta = curvature.theta_theta
         for values in (
             curvature.position_theta,

@@ -119,7 +119,6 @@ def coarsen_body(body: Body, node_count: int, node_sets: Sequence[Index]) -> Coa
 
 
 def _own_node_sets(body: Body) -> list[Index]:
-    """Return the nodes of custom forces that have some, and those held during a scan."""
     sets = [
         np.unique(placed.points.nodes)
         for placed in body.placed_forces
@@ -131,7 +130,6 @@ def _own_node_sets(body: Body) -> list[Index]:
 
 
 def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBody:
-    """Return the body on the coarse mesh; `groups` (E,) are the parts of its elements."""
     nodes = ElementNodes.for_element(meshes.mesh, body.element)
     coarse = on_mesh(
         body,
@@ -155,7 +153,6 @@ def _with_properties(body: Body, meshes: CoarseMesh, groups: Index) -> CoarseBod
 
 
 def _transferred_nodes(nodes: Index, meshes: CoarseMesh, coarse_nodes: ElementNodes) -> Index:
-    """Return the nodes of the coarse body for nodes (k,) of the given one."""
     corners = nodes[nodes < len(meshes.coarse_nodes)]
     chosen = np.zeros(len(meshes.mesh.points_m), dtype=bool)
     chosen[meshes.coarse_nodes[corners]] = True
@@ -165,7 +162,6 @@ def _transferred_nodes(nodes: Index, meshes: CoarseMesh, coarse_nodes: ElementNo
 def _coarse_force(
     placed: LocatedForce, meshes: CoarseMesh, coarse_nodes: ElementNodes
 ) -> NodeForce:
-    """Return a custom force for the coarse body, at the corresponding nodes."""
     if placed.force.nodes is None:
         return placed.force
     nodes = _transferred_nodes(np.unique(placed.points.nodes), meshes, coarse_nodes)
@@ -192,13 +188,10 @@ def _coarse_field(source: BodyPart, part: BodyPart, body: Body, coarse: Body) ->
 
 
 def _coarse_axes(source: BodyPart, part: BodyPart, body: Body, coarse: Body) -> Array | None:
-    """Return the axes of fibres in the elements of the coarse part, each those of the nearest
-    element; None without fibres.
-    """
+    """Axes of fibres in the elements of the coarse part, those of the nearest elements."""
     return None if source.axes is None else source.axes[_nearest_cells(source, part, body, coarse)]
 
 
 def _nearest_cells(source: BodyPart, part: BodyPart, body: Body, coarse: Body) -> Index:
-    """Return for each element of the coarse part the nearest of the part of the given body."""
     centres_m = body.mesh.centres_m[source.cells]
     return np.asarray(KDTree(centres_m).query(coarse.mesh.centres_m[part.cells])[1])

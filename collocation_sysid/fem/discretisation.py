@@ -399,7 +399,6 @@ class Discretisation(ConstantsModel):
         return [array.reshape(-1, 3 * nodes) for array in arrays]
 
     def _state(self, positions: ArrayLike) -> Array:
-        """Return one state as (1, 3n); an `InputError` if there are several."""
         states = self._states(positions)[0]
         if len(states) != 1:
             raise InputError(
@@ -466,7 +465,6 @@ class Discretisation(ConstantsModel):
         return max(ends, default=self._width_without_fields(name))
 
     def _width_without_fields(self, name: str) -> int:
-        """Return the length of a result row without derivatives by the logarithms of fields."""
         k = len(self.constants)
         size = self.pattern.size
         entries = (2 + self.is_unsymmetric) * self.pattern.entry_count
@@ -479,7 +477,6 @@ class Discretisation(ConstantsModel):
         }[name]
 
     def _batch(self, name: str, number: int) -> KernelBatch:
-        """Return the batch of a kernel for a part: where each output goes in the result row."""
         part = self.parts[number]
         memory = bool(part.prony) and name != "energy"
         kernel = KERNELS[KERNEL_NAMES.get(name, name)](self.element, self.law(number, memory))

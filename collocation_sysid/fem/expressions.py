@@ -113,7 +113,6 @@ class PointLaw:
         return stress, slope
 
     def _damping_constants(self, theta: ca.SX) -> dict[str, ca.SX]:
-        """Return the constants of the damping law by name, from θ of the law."""
         constants = theta[len(self.material.constants) :]
         return {c.name: constants[k] for k, c in enumerate(self.damping.constants)}
 
@@ -184,7 +183,6 @@ def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    """Return the constants of the material at a point, multiplied by the field."""
     return point.scale_constants()[: len(law.material.constants)]
 
 

@@ -119,15 +119,13 @@ class ForcePoints:
 
     @cached_property
     def _own_nodes(self) -> Index | None:
-        """Node (i,) of each instance if it is its only vector and of no other instance; else
-        None. Indexing takes a tenth of the time of a sparse product.
-        """
+        """Node (i,) of each instance if it is its only vector and of no other; else None."""
+        # Indexing takes a tenth of the time of a sparse product.
         nodes = self.nodes[:, 0]
         is_single = self.node_weights.shape[1:] == (1, 1) and bool((self.node_weights == 1).all())
         return nodes if is_single and len(np.unique(nodes)) == len(nodes) else None
 
     def _operator_for(self, what: str, chosen: Index | None) -> Any:
-        """Return the columns or rows of a matrix that belong to chosen instances."""
         key = what, None if chosen is None else chosen.tobytes()
         if key not in self._operators:
             # Operator, transpose, symmetric and skew assembly of the latest eight choices of instances.
@@ -153,7 +151,6 @@ class ForcePoints:
 
     @cached_property
     def _operators(self) -> dict[tuple[str, bytes | None], Any]:
-        """Cached matrices by kind and instances, filled on demand."""
         return {}
 
     @cached_property
@@ -222,5 +219,4 @@ class ForcePoints:
 
 
 def _expanded_indices(chosen: Index, size: int) -> Index:
-    """Return the indices of all entries of chosen instances with `size` entries each."""
     return (chosen[:, None] * size + np.arange(size)).ravel()

@@ -167,7 +167,6 @@ def from_lower_triangle(matrix: ca.SX) -> ca.SX:
 
 
 def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -> ca.MX:
-    """Return an output of an element with the contribution of the coupling between its points."""
     if how == "none":
         return output
     if how == "nodes":

@@ -209,7 +209,6 @@ class NodeForce:
 
     @property
     def _smallest_dofs(self) -> int:
-        """Number of dofs of a node, or of the simplest face."""
         return 3 if self.on == "nodes" else 9
 
     @cached_property
@@ -228,14 +227,12 @@ class NodeForce:
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Symbols u and data, and the force on a node or the simplest face in them."""
         u = ca.SX.sym("u", self.input_size(self._smallest_dofs))
         data = ca.SX.sym("data", CONTEXT_SIZE)
         return u, data, self.expression(u, data)
 
     @cached_property
     def _force_and_jacobian(self) -> ca.Function:
-        """Function of the force and its derivative by u."""
         u, data, output = self._symbols
         slopes = ca.jacobian(output, u)
         return ca.Function("slopes", [u, data], [output, slopes])
@@ -256,7 +253,6 @@ class NodeForce:
         return float(largest[0]), float(largest[1])
 
     def _check(self) -> None:
-        """Evaluate the law and its derivatives once."""
         dofs = self._smallest_dofs
         named = {c.name: ca.SX.sym(c.name) for c in self.constants}
         x, v, before = (ca.SX.sym("u", size) for size in (3, 3, self.internal_variable_count))
@@ -362,7 +358,6 @@ class LocatedForce:
 
 
 def _as_column(values: Column) -> ca.SX:
-    """Return a list or a single expression as a column vector."""
     if isinstance(values, (list, tuple)):
         return ca.SX(ca.vertcat(*values))
     return ca.SX(cast(ca.SX, values))

@@ -97,9 +97,7 @@ class SymmetricPattern:
 
     @cached_property
     def _compressed(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Rows of the entries of `full`, and the first entry of each column and their number; all
-        matrices share them.
-        """
+        """Row of each entry of `full`, first entry and length of each column, for all matrices."""
         rows, columns, _ = self.full
         starts = np.searchsorted(columns, np.arange(self.size + 1))
         indices, pointers = rows.astype(np.int32), starts.astype(np.int32)

@@ -238,7 +238,6 @@ def parts_from_regions(
 
 
 def _with_fibres(part: BodyPart, fibres: Fibres | None, mesh: TetMesh) -> BodyPart:
-    """Return the part with fibres beside its material; the part itself for None."""
     if fibres is None:
         return part
     try:
@@ -249,7 +248,6 @@ def _with_fibres(part: BodyPart, fibres: Fibres | None, mesh: TetMesh) -> BodyPa
 
 
 def _with_field(part: BodyPart, field: Field | None, mesh: TetMesh) -> BodyPart:
-    """Return the part with the shapes of a field; the part itself for None."""
     if field is None:
         return part
     law = (*part.material.constants, *part.damping.constants)
@@ -301,7 +299,6 @@ def _densities(
 
 
 def _cells_of_regions(mesh: TetMesh, regions: Sequence[Region]) -> list[Index]:
-    """Return the cells of each region, ascending, in the order of the regions."""
     region_of_cell = np.full(len(mesh.tetrahedra), -1)
     claimed: list[Index] = []
     for k, region in enumerate(regions):

@@ -264,8 +264,6 @@ def _average_pressure(stress: Array, shares: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _AssembledForces:
-    """Elastic forces at the mesh, assembled, with derivatives."""
-
     force_n: Array  # (3n,)
     by_position: sp.csc_array  # (3n, 3n) sparse: derivatives by X
     by_theta: Array  # (3n, k): derivatives by the inputs
@@ -578,7 +576,6 @@ class InverseEquilibrium:
             return None
 
     def _is_admissible(self, positions_m: Array) -> bool:
-        """Return whether no element has too small a share of its volume in the mesh."""
         for cells, geometry in self._parts:
             slopes = geometry[..., :-1].reshape(*geometry.shape[:2], -1, 3)
             gradients = np.einsum("ean,eqai->eqni", positions_m[cells], slopes)
@@ -587,9 +584,7 @@ class InverseEquilibrium:
         return True
 
     def _assemble_forces(self, positions_m: Array, theta: Array, slopes: bool) -> _AssembledForces:
-        """Return the elastic forces at the mesh if the stress-free positions X are `positions_m`
-        (n, 3), with derivatives by X and θ if `slopes`, else with zeros in their place.
-        """
+        """Elastic forces at stress-free positions X (n, 3); derivatives are 0 unless `slopes`."""
         size = self.points_m.size
         force = np.zeros(size)
         by_theta = np.zeros((size, len(self.places)))

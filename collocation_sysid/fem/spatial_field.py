@@ -309,10 +309,7 @@ class FieldAssembly:
 
     @cached_property
     def _incidence(self) -> sp.csr_array:
-        """Sparse matrix (size, E) with an entry for each dof of each cell. The entry of dof
-        `dofs[e, a]` and cell e has the value 1 + e d + a: its place in a row (E · d,) of
-        `assemble_nodal`, counted from 1.
-        """
+        """Sparse matrix (size, E) of the place of `dofs[e, a]` in a row of `assemble_nodal`."""
         cells, dofs_per_cell = self.dofs.shape
         rows = self.dofs.ravel()
         columns = np.repeat(np.arange(cells), dofs_per_cell)

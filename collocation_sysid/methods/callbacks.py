@@ -194,9 +194,7 @@ class NlpFunctions:
         """
 
         def evaluate(inputs: list[Array], buffers: list[Array | None]) -> None:
-            """Evaluate those outputs that are requested: their buffers are not None, and are
-            overwritten.
-            """
+            """Evaluate the outputs whose buffers are not None, which are overwritten."""
             requests = zip(outputs, buffers, strict=True)
             self._evaluate(inputs, {output: b for output, b in requests if b is not None})
 
@@ -211,7 +209,6 @@ class NlpFunctions:
         return callback
 
     def _evaluate(self, inputs: list[Array], outputs: dict[str, Array]) -> None:
-        """Write the requested outputs to `outputs`, in place."""
         collocation = self.collocation
         z = inputs[0]
         if "f" in outputs:
@@ -238,9 +235,7 @@ class NlpFunctions:
             ]
 
     def _forward(self, inputs: list[Array], outputs: list[Array | None]) -> None:
-        """Write the directional derivative of the Lagrangian's gradient to the only output, in
-        place.
-        """
+        """Write the directional derivative of the Lagrangian's gradient, in place."""
         z, _, weight, multipliers, _, by_z, _, by_weight, by_multipliers = inputs
         (product,) = outputs
         if product is None:
@@ -380,12 +375,7 @@ class IterationMonitor(ca.Callback):
         return [1 if self.stop or self.recorder.is_late() or self.errors else 0]
 
     def _record(self, arguments) -> None:
-        """Add an entry to the recorder's history, count it in `lines`, and store the iterate in
-        `best` if it is the best.
-
-        The best has the smallest sum of the objective and the largest violation of a constraint.
-        The recorder calls `watch` with the entry; exceptions of `watch` are not caught here.
-        """
+        """Add an entry, and store the iterate of least objective plus largest violation."""
         z, value, rows, _, multipliers, *_ = (argument.full().ravel() for argument in arguments)
         # Objective and constraints are both of order one.
         merit = float(value[0] + np.abs(rows).max(initial=0.0))

@@ -124,7 +124,6 @@ def with_contact_energy(experiment: Experiment) -> Experiment:
 def _relax(
     collocation: Collocation, obstacles_by_experiment: Mapping[str, list[Obstacle]], share: float
 ) -> Collocation:
-    """Return the program with relaxed complementarity."""
     experiments = [
         each.with_obstacles([replace(o, relaxed=share) for o in obstacles_by_experiment[each.name]])
         if each.name in obstacles_by_experiment

@@ -459,7 +459,6 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _jacobian(self) -> CondensedPattern:
-        """Pattern of ∂g/∂z, and how its values follow from those of the complete program."""
         structure = self.complete.jacobian_structure
         of_variable, of_row = self._condensed_indices
         is_remaining = np.repeat(of_variable >= 0, np.diff(structure[0]))
@@ -502,7 +501,6 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def _hessian(self) -> CondensedPattern:
-        """Pattern of the upper triangle, and its values from the complete one."""
         structure = self.complete.hessian_structure
         numbers, _ = self._condensed_indices
         has_number = numbers >= 0
@@ -532,10 +530,7 @@ class CondensedCollocation(Collocation):
         )
 
     def _is_loss_coupling(self, structure: tuple[Index, Index]) -> NDArray[np.bool_]:
-        """Return a mask (entries,) of those entries of the complete Hessian, by its column pointers
-        and row indices, that couple positions at times so distant that no equation of motion
-        contains both.
-        """
+        """Mask (entries,) of couplings at times so distant that no equation of motion has both."""
         indptr, rows = structure
         mask = np.zeros(len(rows), dtype=bool)
         for transcription in self.transcriptions:
@@ -591,11 +586,8 @@ class CondensedCollocation(Collocation):
         return pattern.assemble(complete_values, out, groups=groups)
 
     def _complete_hessian(self, z: Array, loss_weight: float, multipliers: Array | None) -> Array:
-        """Return the values of the complete program's Hessian, with its Gauss–Newton part evaluated
-        at clocks rounded to whole samples and no other clock errors.
-
-        There each residual depends on few positions. The part with the multipliers is that at z.
-        """
+        """Return the Hessian with its Gauss–Newton part at clocks rounded to whole samples."""
+        # There each residual depends on few positions. The part with the multipliers is that at z.
         nearest = z.copy()
         p = self.complete.parameters_from(z)
         for transcription in self.transcriptions:

@@ -196,9 +196,7 @@ class DaskExecutor:
         )
 
     def _result(self, future: Any) -> Any:
-        """Return the result of a future, or raise the exception of its function; check every
-        `LOOK_EVERY_S` that workers exist, and raise `SearchEnded` otherwise.
-        """
+        """Check every `LOOK_EVERY_S` that workers exist; raise `SearchEnded` otherwise."""
         while True:
             try:
                 return future.result(timeout=LOOK_EVERY_S)
@@ -228,41 +226,30 @@ class DaskExecutor:
             raise _disconnection("The scheduler no longer responds.") from error
 
     def _submit(self, home: str, run: Callable[..., Any], *arguments: Any) -> Any:
-        """Return a future of a function of `arguments` on the worker at the address `home`; Dask
-        may choose another worker if that is lost.
-
-        Keys begin with the function's name, from which Dask estimates the duration of a task.
-        """
+        """Return a future on the worker at `home`; Dask may choose another if that is lost."""
+        # Keys begin with the function's name, from which Dask estimates the duration of a task.
         key = f"{run.__name__}-{secrets.token_hex(16)}"
         return self.client.submit(
             _run_alone, run, *arguments, key=key, workers=[home], allow_other_workers=True
         )
 
     def _send_segment(self, transcription: Transcription, home: str) -> Any:
-        """Return the future of a transcription on a worker, at the address `home`.
-
-        Its experiment and body are sent before it. Each object is sent only once: a further call
-        with the same transcription returns the same future. Dask's exceptions pass.
-        """
+        """Return the future of a transcription; each object is sent only once."""
 
         def send_once(value: T, make: Callable[[T], Any]) -> Any:
-            """Return the future of an object, which `make` makes at the first call with it."""
             if value not in self._sent:
                 self._sent[value] = make(value)
             return self._sent[value]
 
         def send_body(body: Body) -> Any:
-            """Return a new future of a body."""
             return self._submit(home, _identity, body)
 
         def send_experiment(experiment: Experiment) -> Any:
-            """Return a new future of an experiment, which refers to that of its body."""
             return self._submit(
                 home, _with_body, _with_fields(experiment), send_once(experiment.body, send_body)
             )
 
         def send_transcription(complete: Transcription) -> Any:
-            """Return a new future of a transcription, which refers to that of its experiment."""
             sent_experiment = send_once(complete.experiment, send_experiment)
             association = replace(
                 complete.association, markers=_with_fields(complete.association.markers)
@@ -307,7 +294,7 @@ def _assign_workers(costs: Sequence[int], threads: dict[str, int]) -> list[str]:
 
 
 def _require_package(client: Any) -> set[str]:
-    """Return the addresses of the workers of a Dask client, after a check of their versions."""
+    """Return the addresses of the workers, after a check of their versions."""
     own_version = package_version()
     try:
         versions = client.run(package_version, on_error="return")
@@ -328,18 +315,15 @@ def _require_package(client: Any) -> set[str]:
 
 
 def _refusal(message: str) -> InputError:
-    """Return an error with this message that refers to the option --scheduler."""
     return InputError(message, None, where="--scheduler")
 
 
 def _require_workers(threads: dict[str, int]) -> None:
-    """Raise `SearchEnded` if no worker is left."""
     if not threads:
         raise _disconnection("No worker is left.")
 
 
 def _disconnection(reason: str) -> SearchEnded:
-    """Return the exception that ends the search because the cluster is lost."""
     return SearchEnded(
         Status.CLUSTER_DISCONNECTED, f"{Status.CLUSTER_DISCONNECTED.sentence} {reason}"
     )
@@ -356,11 +340,9 @@ def _run_alone(run: Callable[..., T], *arguments: Any) -> T:
 
 @cache
 def _retain_freed_memory() -> None:
-    """Let the C library keep freed memory of this process for later arrays.
-
-    Dask's nannies set MALLOC_TRIM_THRESHOLD_, so that glibc returns every freed array to the
-    system; each sweep would then wait for new memory pages. No effect with other C libraries.
-    """
+    """Let the C library keep freed memory of this process for later arrays."""
+    # Dask's nannies set MALLOC_TRIM_THRESHOLD_, so that glibc returns every freed array to the
+    # system; each sweep would then wait for new memory pages. No effect with other C libraries.
     if mallopt := getattr(ctypes.pythonapi, "mallopt", None):  # glibc's only
         for option, size in MALLOC_LIMITS_BYTES.items():
             mallopt(option, size)
@@ -372,9 +354,7 @@ def _identity(value: T) -> T:
 
 
 def _with_fields(instance: T, body: Body | None = None) -> T:
-    """Return a copy of an experiment or a marker association, the `instance`, with another body,
-    without validation and caches; None removes the body for transfer.
-    """
+    """Return a copy with another body, without validation; None removes it for transfer."""
     names = [each.name for each in fields(instance)]  # pyright: ignore[reportArgumentType]
     field_values = {name: getattr(instance, name) for name in names}
     other = object.__new__(type(instance))

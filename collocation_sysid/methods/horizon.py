@@ -227,13 +227,7 @@ class Horizon:
         return self._iterate_from(p, evaluated)
 
     def _iterate_from(self, p: Array, trajectories: list[Any]) -> Iterate:
-        """Return the iterate of the linearised trajectories of all experiments.
-
-        The fit of the iterate, and its products of residuals with previous slopes, are sums over
-        the experiments, the priors of the collocation and, if the horizon has one, its own prior
-        about the guess. The times of the sweeps are added to the stopwatch. `SearchEnded` is raised
-        if the workers are lost.
-        """
+        """Fit and products are sums over experiments, priors, and the horizon's own prior."""
         reports: list[SweepReport] = self.workers.fetch(
             self.workers.map_experiments(_report, trajectories)
         )
@@ -344,7 +338,6 @@ class Horizon:
         return [p[own] for own in self.collocation.parameter_indices]
 
     def _repeat(self, value: Any) -> list[Any]:
-        """Return a list with the same value for every experiment."""
         return [value] * len(self.rows)
 
 

@@ -33,7 +33,7 @@ from .starts.initial_point import InitialPoint, adjoint_multipliers, compute_ini
 
 
 def _require_ipopt_value(value: Any) -> Any:
-    """Return text or a number; booleans are refused: IPOPT has "yes" and "no"."""
+    """Booleans are refused: IPOPT has "yes" and "no"."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         raise ValueError(
             f"found {str(value).lower()}; expected text or a number as in IPOPT's manual; its "
@@ -182,7 +182,6 @@ class InteriorPoint(MethodOptions):
     def _solve(
         self, collocation: Collocation, watch: Watch | None, start: Array | None
     ) -> Solution:
-        """Solve with the contact law, without the complementarity solves."""
         recorder = Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)
@@ -210,7 +209,6 @@ class InteriorPoint(MethodOptions):
     def _solve_by_ipopt(
         self, recorder: Recorder, start: Array | None, initial: InitialPoint | None = None
     ) -> Solution:
-        """Solve the recorder's program by IPOPT."""
         multipliers = None
         with recorder.stopwatch.building():
             program = condense(with_lifted_variables(recorder.collocation))
@@ -220,7 +218,6 @@ class InteriorPoint(MethodOptions):
             hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
 
         def settings(functions: NlpFunctions) -> dict[str, Any]:
-            """Return the options of IPOPT with the time that remains."""
             options = self._settings(functions, is_warm=is_warm)
             remaining_s = max(SHORTEST_S, self.max_time_s - recorder.measure_elapsed_s())
             return {"ipopt.max_wall_time": remaining_s} | options
@@ -250,11 +247,7 @@ class InteriorPoint(MethodOptions):
         return replace(solution, notes=(*solution.notes, missing))
 
     def _settings(self, functions: NlpFunctions, *, is_warm: bool) -> dict[str, Any]:
-        """Return the options for CasADi and IPOPT, except IPOPT's time limit; those of the user
-        (`ipopt`) replace the others.
-
-        The callbacks that they contain are new, and are added to `functions`.
-        """
+        """Return the options except the time limit; those of the user replace the others."""
         settings = nlpsol.ipopt_settings(
             functions, self.linear_solver, self.tolerance, self.max_iterations
         )
@@ -291,12 +284,7 @@ class InteriorPoint(MethodOptions):
 
 
 def _largest_curvature(collocation: Collocation) -> float:
-    """Return an estimate of the largest curvature of the objective with respect to a scaled
-    position, at least one.
-
-    Only markers count, each as if it were a node: the curvature is that of the smallest `sigma_m`
-    of an experiment in its unit of length. Without markers it is one.
-    """
+    """Return about the largest curvature by a scaled position, of markers alone; at least 1."""
     units = (
         transcription.length_m / float(np.min(transcription.experiment.markers.sigma_m))
         for transcription in collocation.transcriptions
@@ -312,17 +300,9 @@ PROXIMAL = 1e-5
 
 
 class _DampedHessian:
-    """Hessian of the Lagrangian with the warm-up and proximal terms.
+    """Hessian of the Lagrangian with the warm-up and proximal terms."""
 
-    It depends on the sequence of calls: each call compares the parameters with those of the
-    previous call, and adapts the damping.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Program that is passed to IPOPT.
-    options : InteriorPoint
-    """
+    # Each call compares parameters with those of the previous call, and adapts the damping.
 
     def __init__(self, collocation: Collocation, options: InteriorPoint) -> None:
         self.collocation = collocation
@@ -331,12 +311,7 @@ class _DampedHessian:
         self._damping = 1.0
 
     def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
-        """Write the upper triangle of the Hessian at z to `values`: the exact one, or that of
-        Gauss–Newton during the warm-up or by the options, with `PROXIMAL` on the diagonal of the
-        positions and, during the warm-up, the damping on that of q.
-
-        The parameters are stored, and the damping is adapted, see `_ends_warm_up`.
-        """
+        """Write the upper triangle, with `PROXIMAL` on positions and, in warm-up, damping of q."""
         is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
         self.collocation.hessian_values(
@@ -350,11 +325,7 @@ class _DampedHessian:
             values[of_q] += weight * self._damping * largest
 
     def _ends_warm_up(self, p: Array) -> bool:
-        """Return whether the exact Hessian may be used at p (np,): the step from the previous p is
-        shorter than `warm_up` in every parameter and the damping is negligible, or `warm_up` is 0.
-
-        p is stored, and the damping, at most 1, adapted to the length of the step of q.
-        """
+        """Whether the step is short and the damping negligible; both are updated."""
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)

@@ -220,7 +220,6 @@ class _NlpsolResult(NamedTuple):
 
     @classmethod
     def failure(cls, count: int, return_status: str) -> _NlpsolResult:
-        """Return the result of a solver that failed or was abandoned."""
         return cls(np.full(count, np.nan), np.zeros(0), return_status=return_status, iterations=0)
 
 
@@ -239,7 +238,6 @@ def _run(
     results: list[_NlpsolResult] = []
 
     def search() -> None:
-        """Call the solver and append its result."""
         try:
             answer = solver(**arguments)
             stats = solver.stats()
@@ -266,12 +264,8 @@ def _run(
 
 
 def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> None:
-    """Run a search on a thread and wait for its end, so that the main thread, from which this must
-    be called, can handle signals during long factorisations.
-
-    After a request to stop, or the limit of time, the search is abandoned if it does not end within
-    `GRACE_S`: the thread goes on, and `monitor.errors` receives an entry.
-    """
+    """Wait on the main thread, which can handle signals during long factorisations."""
+    # After a request to stop, the search is abandoned if it does not end within `GRACE_S`.
     thread = threading.Thread(target=copy_context().run, args=(search,), daemon=True)
     with _interruptible(monitor):
         thread.start()
@@ -291,17 +285,12 @@ def _run_on_thread(search: Callable[[], None], monitor: IterationMonitor) -> Non
 
 @contextmanager
 def _interruptible(monitor: IterationMonitor) -> Iterator[None]:
-    """Context in which Ctrl-C asks the monitor to stop; a second Ctrl-C raises KeyboardInterrupt.
-
-    SIGTERM is treated the same if its handler raises KeyboardInterrupt. The previous handlers are
-    restored at the end.
-    """
+    """Context in which Ctrl-C asks the monitor to stop; a second one interrupts."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if not raises_interrupt(handlers[signal.SIGTERM]):
         del handlers[signal.SIGTERM]
 
     def request(number: int, _frame: object) -> None:
-        """Request a stop; the next signal of this number interrupts the process."""
         monitor.stop = True
         INTERRUPTS.number = number
         signal.signal(number, signal.default_int_handler)

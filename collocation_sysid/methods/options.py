@@ -81,7 +81,6 @@ def samples_in_share(count: int, share: float) -> int:
 
 
 def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
-    """Return shares that ascend strictly to 1; raise `ValueError` otherwise."""
     is_ascending = all(a < b for a, b in pairwise(shares))
     if not is_ascending or shares[-1:] != (1.0,):
         raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")

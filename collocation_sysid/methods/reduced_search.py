@@ -487,10 +487,7 @@ class ReducedSearch:
                 point = self._make_feasible(horizon, point)
 
     def _status_without_progress(self, point: Iterate, curvature: Array) -> Status:
-        """Return the status after rejections of ever shorter steps: that of convergence if even a
-        full step is predicted to decrease the loss by less than is significant, or with impacts if
-        intervals contain its end.
-        """
+        """Return convergence if even a full step would not decrease the loss significantly."""
         full_step = self._full_step(point, curvature)
         if self.has_impacts and self._is_near(point, full_step, 1.0):
             is_converged = self._is_feasible(point, INFEASIBLE)
@@ -504,9 +501,7 @@ class ReducedSearch:
         return point.feasibility_m <= limit * self.size_m
 
     def _is_near(self, point: Iterate, step: Array, share: float) -> bool:
-        """Return whether a step (np,) changes each shared parameter by at most a share of its
-        standard error.
-        """
+        """Whether a step changes each shared parameter by a share of its standard error."""
         count = self.collocation.nq
         return bool((np.abs(step[:count]) <= share * point.fit.standard_errors[:count]).all())
 
@@ -515,24 +510,17 @@ class ReducedSearch:
         return self._next_step(point, curvature, self.largest_trust)
 
     def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
-        """Return the part of the Hessian (np, np) at `after` that Gauss–Newton neglects: exact, or
-        by a secant update of `curvature` from the point `previous`, as the options state.
-        """
+        """Return the part (np, np) that Gauss–Newton neglects: exact, or by a secant update."""
         if self.options.hessian == "exact":
             return exact_curvature(self.collocation, after, stopwatch=self.recorder.stopwatch)
         return secant_update(curvature, previous, after=after)
 
     def _step_length(self, step: Array) -> float:
-        """Return the largest change of a parameter by a step (np,), relative to `reach`; 0 without
-        parameters.
-        """
+        """Return the largest change of a parameter relative to `reach`; 0 without any."""
         return float(np.abs(step / self.reach).max(initial=0.0))
 
     def _next_step(self, point: Iterate, curvature: Array, trust: float) -> Array:
-        """Return the step (np,) from `point` that minimises the quadratic model of the loss, with
-        the neglected curvature (np, np) added as far as `with_curvature` allows, within bounds and
-        a trust region.
-        """
+        """Return the step that minimises the quadratic model within bounds and trust region."""
         low = np.maximum(self.lower - point.p, -trust * self.reach)
         high = np.minimum(self.upper - point.p, trust * self.reach)
         # Rounding may leave a parameter on its bound by a hair.
@@ -541,11 +529,7 @@ class ReducedSearch:
         return with_curvature(point.fit, curvature).minimiser(low, high)
 
     def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
-        """Return the point after a step (np,) of the parameters from `point`, clipped to the
-        bounds, by one sweep on the horizon, which is counted; with impacts by a simulation if the
-        sweep leaves too much infeasibility, or that of a similar step did. None if that fails or is
-        not finite. Nothing else of the search changes.
-        """
+        """Return the point after a step, with impacts perhaps simulated; None if that fails."""
         p = np.clip(point.p + step, self.lower, self.upper)
         length = self._step_length(step)
         trial = None
@@ -565,9 +549,7 @@ class ReducedSearch:
         return trial if trial is not None and trial.is_finite else None
 
     def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:
-        """Return the point at parameters p (np,) with a simulated trajectory, which counts as one
-        sweep; None if the simulation or its sweep fails.
-        """
+        """Return the point with a simulated trajectory, one sweep; None if that fails."""
         self.sweeps += 1
         x, failure = horizon.simulate(p, guess=previous)
         if failure is not None:
@@ -578,18 +560,14 @@ class ReducedSearch:
             return None
 
     def _accuracy_after(self, length: float) -> float:
-        """Return the relative accuracy of the time steps' solutions in the sweep after a step of
-        the parameters of a given length, see `_step_length`.
-        """
+        """Return the relative accuracy of the sweep after a step of a length."""
         if not self.refines_solutions:
             return ACCURACY
         highest = max(ACCURACY, ACCURACY_SHARE * self.options.tolerance)
         return max(highest, min(ROUGH_ACCURACY, SECOND_ORDER_SHARE * length**2))
 
     def _accuracy_at_start(self, horizon: Horizon) -> float:
-        """Return the relative accuracy of the time steps' solutions in the first sweep at given
-        positions: low if they do not satisfy the equations of motion, because steps follow then.
-        """
+        """Low where positions violate the equations of motion, because steps follow then."""
         if not self.refines_solutions:
             return ACCURACY
         assert self.trajectories is not None
@@ -607,11 +585,7 @@ class ReducedSearch:
         )
 
     def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
-        """Return whether a trial is accepted.
-
-        It must decrease the loss by a share of what the model predicts, and violate the equations
-        of motion little. For an accepted trial the trust region is enlarged or reduced, in place.
-        """
+        """Whether loss and infeasibility are acceptable; the trust region is adapted."""
         predicted = point.loss - point.predicted_loss(step)
         actual = point.loss - trial.loss
         if trial.feasibility_m > max(
@@ -630,34 +604,23 @@ class ReducedSearch:
         return True
 
     def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point after its feasibility step or, if that does not halve the infeasibility,
-        with a simulated trajectory; the result is accepted as the best so far, see `_resimulated`
-        for a failure.
-
-        The loss of the projected trajectory is then accurate to a higher order, so that trials are
-        no longer compared with a loss that is too low.
-        """
+        """Return the point after its feasibility step, or simulated if that is not halved."""
+        # The loss of the projected trajectory is accurate to a higher order, so that trials are no
+        # longer compared with a loss that is too low.
         refined = self._try(horizon, point, step=np.zeros(len(point.p)))
         if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
             return self._resimulated(horizon, point)
         return self._accept(horizon, refined)
 
     def _resimulated(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with a simulated trajectory in place of its own, accepted as the best so
-        far by `_accept`; the point itself, with nothing accepted, if the simulation or its sweep
-        fails.
-
-        It counts as one sweep.
-        """
+        """Return the simulated point as the best so far; the point itself if that fails."""
         resimulated = self._simulated(horizon, point.p, point)
         if resimulated is None or not resimulated.is_finite:
             return point
         return self._accept(horizon, resimulated)
 
     def _are_feasible(self, summaries: list[FitSummary]) -> bool:
-        """Return whether the largest residual of the equations of motion of every experiment is at
-        most `FEASIBLE_FORCE` times its unit of force; one summary for each, in their order.
-        """
+        """Whether each largest residual is at most `FEASIBLE_FORCE` times its unit of force."""
         return all(
             each.violation_n <= FEASIBLE_FORCE * transcription.force_n
             for each, transcription in zip(summaries, self.collocation.transcriptions, strict=True)
@@ -666,12 +629,8 @@ class ReducedSearch:
     # Association of the measurements ----------------------------------------------------------
 
     def _associate_initially(self, horizon: Horizon, is_first: bool) -> None:
-        """Associate markers and cameras of unknown position with the first rows of the
-        trajectories, and replace the collocation of the search and the horizon, in place.
-
-        Nothing happens after the first time, unless the trajectories were then too short for the
-        cameras; nor if all positions are known or there are no trajectories.
-        """
+        """Associate markers and cameras of unknown position with the first rows, in place."""
+        # Once, unless the trajectories were then too short for the cameras.
         if (is_first or not self.is_associated) and self.trajectories is not None:
             counts = [
                 transcription.rows_to_place for transcription in self.collocation.transcriptions
@@ -685,24 +644,15 @@ class ReducedSearch:
                 )
 
     def _set_collocation(self, horizon: Horizon, collocation: Collocation, p: Array) -> None:
-        """Use another collocation of the same problem, and its parameters p (np,), in the search,
-        the recorder and the horizon, in place.
-        """
+        """Set another collocation of the same problem in search, recorder and horizon."""
         self.collocation = self.recorder.collocation = collocation
         horizon.set_collocation(collocation)
         self.lower, self.upper = collocation.parameter_bounds
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with measurements associated at its estimates; the point itself if
-        nothing changes, or after `REREADINGS` updates.
-
-        The collocation with this association and its parameters replace those of the search, of the
-        recorder and of the horizon, see `_set_collocation`, and `reassociations` is increased by
-        one. For the trial that `_is_better_reassociated` has associated last, that association is
-        used; else positions and sensitivities of the point are kept, and measurements are evaluated
-        again.
-        """
+        """Return the point with measurements associated anew, at most `REREADINGS` times."""
+        # The association that `_is_better_reassociated` made last for this trial is used.
         stored = self.reassociated_trial
         if stored is not None and stored.trial is point:
             collocation = stored.collocation
@@ -723,18 +673,8 @@ class ReducedSearch:
         return horizon.reassociate(p, point)
 
     def _is_better_reassociated(self, horizon: Horizon, point: Iterate, trial: Iterate) -> bool:
-        """Return whether a trial is still acceptable with correspondences found at its estimates.
-
-        A point may then belong to another part of the surface, or to none. The number of
-        measurements, with those left out because of a crease (`Collocation.associated_count`),
-        must be at least `LEAST_VISIBLE_SHARE` of the largest so far, and the loss per measurement
-        at most `EQUAL_MISFIT_RATIO` times that of the point. True without unlabelled points; false if
-        the association may not be updated any more.
-
-        Afterwards collocation and parameters are those of the point, in the search, the recorder
-        and the horizon. The association at the trial is stored in `reassociated_trial` for
-        `_reassociate`, and `most_measurements` is updated; `reassociations` is unchanged.
-        """
+        """Return whether a trial is still acceptable with correspondences at its estimates."""
+        # A point may then belong to another part of the surface, or to none.
         before = self.collocation
         if not self.has_unlabelled:
             return True
@@ -755,23 +695,14 @@ class ReducedSearch:
         )
 
     def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Make a point the best so far: associate its measurements with its estimates, store and
-        record it, and return it as associated.
-
-        `point`, `indefinite_steps`, `p` and `trajectories` are set, and where measurements are
-        associated differently also the collocation of the search, the recorder and the horizon.
-        Exceptions of the recorder's `watch` are not caught.
-        """
+        """Make a point the best so far: associate its measurements, store and record it."""
         self.point = point = self._reassociate(horizon, point)
         self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
         self._record(point.p, point.trajectories, loss=point.loss, summaries=point.reports)
         return point
 
     def _record(self, p: Array, x: list[Any], loss: float, summaries: Sequence[FitSummary]) -> None:
-        """Store parameters and trajectories as the best so far, and add an entry to the history.
-
-        The recorder calls `watch` with the entry; exceptions of `watch` are not caught.
-        """
+        """Store the best so far, and add an entry to the history."""
         self.p = p
         self.trajectories = x
         squares_m2 = sum(each.squares_m2 for each in summaries)

@@ -139,11 +139,7 @@ class ReducedSpace(SearchOptions):
 def _solution_of_search(
     search: ReducedSearch, workers: ExperimentExecutor, status: Status, message: str
 ) -> Solution:
-    """Return the solution with the best point of a search.
-
-    Rows that were not simulated are those of a rigid motion with the grasp. If workers are lost
-    while the trajectories are fetched, their status and message replace those given.
-    """
+    """Rows that were not simulated are those of a rigid motion with the grasp."""
     recorder = search.recorder
     collocation = recorder.collocation
     try:
@@ -185,9 +181,7 @@ def memory_mb(collocation: Collocation) -> float:
 
 
 def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: Status) -> list[str]:
-    """Return notes for the user on the answer: on time steps whose matrix is indefinite, and on
-    residuals that are much larger than the noise.
-    """
+    """Return notes on time steps with an indefinite matrix, and on large residuals."""
     notes = []
     if indefinite_steps:
         steps = sum(transcription.constraint_times for transcription in collocation.transcriptions)

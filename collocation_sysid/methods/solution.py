@@ -150,7 +150,6 @@ class Timing:
     total: float = 0.0  # total time, which includes what the other three do not count
 
     def __add__(self, other: Timing) -> Timing:
-        """Return new times, the sums of the entries of both [s]."""
         pairs = zip(astuple(self), astuple(other), strict=True)
         return Timing(*(mine + its for mine, its in pairs))
 
@@ -357,7 +356,6 @@ class Solution:
         return {part.transcription.experiment.name: fitted_values(part) for part in self.parts}
 
     def _fitted_by_kind(self, part: ExperimentIterate, kind: type) -> list[tuple[Any, Any]]:
-        """Return the measurements of one kind, each with its prediction."""
         experiment = part.transcription.experiment
         pairs = zip(experiment.measurements, self.fitted_values[experiment.name], strict=True)
         return [(each, values) for each, values in pairs if isinstance(each, kind)]
@@ -532,9 +530,6 @@ def constraint_multipliers(
     """
 
     def of_experiment(iterate: ExperimentIterate) -> Array:
-        """Return the multipliers of one experiment's equations of motion, of its prescribed
-        displacements zero.
-        """
         transcription = iterate.transcription
         gradient = collocation.loss_scale * iterate.gradient()[0]
         solver = Sweep(transcription, stopwatch=stopwatch)
@@ -551,12 +546,8 @@ def constraint_multipliers(
 
 
 def _set_grasp_multipliers(collocation: Collocation, z: Array, multipliers: Array) -> None:
-    """Set the multipliers (constraints,) of prescribed displacements at variables z to minus the
-    remaining gradient of the Lagrangian, in place; the others are unchanged.
-
-    On entry those of prescribed displacements must be zero, because the remaining gradient is that
-    with the given multipliers. The constraints of prescribed displacements have unit Jacobian rows.
-    """
+    """Set those of prescribed displacements, zero on entry, to minus the remaining gradient."""
+    # The constraints of prescribed displacements have unit Jacobian rows.
     slope = collocation.gradient(z) + collocation.jacobian_vjp(z, multipliers)
     for part in collocation.iterates(slope):
         transcription = part.transcription

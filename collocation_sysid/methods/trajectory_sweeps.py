@@ -100,9 +100,7 @@ class LinearisedTrajectory(SweepResult):
         return cls(**swept, slope=slope, report=report)
 
     def __sizeof__(self) -> int:
-        """Return the memory size in bytes, from which a scheduler estimates the cost of a
-        transfer.
-        """
+        """Memory [bytes], from which a scheduler estimates the cost of a transfer."""
         arrays = (self.x, self.step, self.by_p, self.slope)
         return object.__sizeof__(self) + sum(each.nbytes for each in arrays)
 
@@ -337,7 +335,6 @@ def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
 
 
 def _iterate(transcription: Transcription, p: Array, x: Array) -> ExperimentIterate:
-    """Return the experiment at parameters p (k,) and positions x (rows, 3n)."""
     return ExperimentIterate(transcription, p[: transcription.nq], phi=p[transcription.nq :], x=x)
 
 
@@ -347,9 +344,7 @@ def _linearised_trajectory(
     previous: LinearisedTrajectory | None,
     times_s: tuple[float, float, float],
 ) -> LinearisedTrajectory:
-    """Return the sweep result with the measurement residuals and slopes after the feasibility step,
-    as least squares with Huber's loss.
-    """
+    """Return residuals and slopes after the feasibility step, with Huber's loss."""
     response = ObservableResponse.from_array(
         iterate, swept.by_p, swept.grasp_forces, step=swept.step
     )

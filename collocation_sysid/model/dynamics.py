@@ -160,7 +160,6 @@ class Dynamics:
         return self._with_forces(self.forces.with_theta(theta))
 
     def _with_forces(self, forces: Forces) -> Dynamics:
-        """Return these equations with other forces, and with the masses of these forces."""
         if forces.mass is self.forces.mass:
             return replace(self, forces=forces)
         return replace(self, forces=forces, mass=_row_masses(self.tables, forces.mass))

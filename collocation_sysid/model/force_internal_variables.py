@@ -272,15 +272,7 @@ class ForcePreviousState:
 
 
 class _DerivativeIterator:
-    """Derivatives of a history at one evaluation after the other, computed in chunks.
-
-    Attributes
-    ----------
-    next : int
-        Index of the evaluation that is next.
-    columns : array
-        What is propagated; defined by subclasses.
-    """
+    """Derivatives at one evaluation (`next`) after the other, in chunks; `columns` propagate."""
 
     def __init__(self, history: ForceHistory, at: int) -> None:
         self.history = history

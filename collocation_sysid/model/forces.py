@@ -354,7 +354,6 @@ class Forces:
 
     @cached_property
     def _is_nonlinear_in_velocity(self) -> bool:
-        """Whether derivatives by the velocity of any term depend on the velocity."""
         return any(term.is_nonlinear_in_velocity for term in self.external_terms)
 
     def states_of_terms(self, xi: Array, nu: Array) -> Callable[[ForceTerm], States]:

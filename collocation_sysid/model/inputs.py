@@ -153,7 +153,6 @@ def inputs_from_experiment(
         return ca.SX(0) if phi < 0 else float(nuisance.scales[phi]) * p[place[phi]]
 
     def gravity(p: ca.SX, _: ca.SX) -> ca.SX:
-        """Return gravity (3,) in the frame of the body."""
         return nuisance.gravity_expression(p[[place[k] for k in nuisance.gravity_indices.tolist()]])
 
     def share(phi: int, timed: TimedLoad) -> Input:
@@ -162,7 +161,6 @@ def inputs_from_experiment(
         interval_s = experiment.timestep_s
 
         def change(p: ca.SX, since_s: ca.SX) -> ca.SX:
-            """Return the change of the share, from the time since the stated one [s]."""
             late_s = value(p, phi)
             return sign * (
                 smooth_ramp((since_s - late_s) / interval_s) - smooth_ramp(since_s / interval_s)
@@ -171,12 +169,10 @@ def inputs_from_experiment(
         return Input(1, change, data=evaluated_s[None] - timed.declared_s)
 
     def amplitude(number: int, actuator: Actuator) -> Input:
-        """Return the input of the amplitude of a tendon or pressure."""
         declared_calibration = nuisance.declared_calibration[number].tolist()
         places = nuisance.actuator_calibration_indices(number)
 
         def driven(p: ca.SX, data: ca.SX) -> ca.SX:
-            """Return the amplitude at the calibration in p."""
             calibration = (
                 nominal + value(p, phi)
                 for nominal, phi in zip(declared_calibration, places, strict=True)

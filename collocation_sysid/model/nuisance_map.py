@@ -172,7 +172,6 @@ class NuisanceMap(RecordingQuantities):
         return nuisance_map
 
     def _require_valid_expression(self, row: Deviation) -> None:
-        """Check that the reading or clock of a custom kind can be evaluated and differentiated."""
         y = ca.SX.sym("y", 3)
         t_s = ca.SX.sym("t_s")
         values = ca.SX.sym("values", max(1, len(row.axes.split())))
@@ -230,7 +229,6 @@ class NuisanceMap(RecordingQuantities):
         return np.array([places[label] for label in labels], dtype=np.int64)
 
     def _indices_where(self, chosen: Callable[[NuisanceEntry], bool]) -> Index:
-        """Return the indices in φ, ascending, of the entries for which a function is true."""
         return np.array([k for k, e in enumerate(self.entries) if chosen(e)], dtype=np.int64)
 
     @cached_property
@@ -438,7 +436,6 @@ class NuisanceMap(RecordingQuantities):
         late_s = (phi * self.scales)[self.indices_of_rows(JOINING)]
 
         def moved(load: Load) -> Load:
-            """Return a load with its estimated times; the load itself if it has none."""
             times = {
                 timed.change: timed.declared_s + float(late)
                 for timed, late in zip(self.timed_loads, late_s, strict=True)
@@ -558,11 +555,7 @@ def _strain_shifts_m(experiment: Experiment) -> Array:
 
 
 def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
-    """Yield every nuisance parameter of an experiment, in the order of φ.
-
-    Consecutive kinds of one sort of component are ordered by component, then by kind and axis; the
-    unknowns of custom sensors come last. Exact quantities are left out.
-    """
+    """Yield in the order of φ: by component, kind, axis; unknowns of custom sensors come last."""
     for _, rows in groupby(experiment.nuisance.kinds, key=lambda row: row.of):
         applicable = [row for row in rows if row.applies(experiment)]
         for number, component_name in (
@@ -583,10 +576,8 @@ def _entries(experiment: Experiment) -> Iterator[NuisanceEntry]:
 
 
 def _components(experiment: Experiment, of: Component) -> Iterable[tuple[int, str]]:
-    """Return index and name of all components of one kind, such as all markers; of the kind "place"
-    only markers whose position is estimated. Indices of obstacles follow those of grasps, those of
-    pressures those of tendons.
-    """
+    """Return index and name of all components; "place" are markers of estimated position."""
+    # Indices of obstacles follow those of grasps, those of pressures those of tendons.
     names = experiment.markers.names
     if of == "recording":
         return [(0, "")]

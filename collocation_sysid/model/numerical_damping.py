@@ -122,7 +122,6 @@ def substeps_needed(
     """
 
     def suffices(substeps: int) -> bool:
-        """Return whether damping and period error are within the limits with this many substeps."""
         mode, damped = (
             numerical_mode(
                 scheme,

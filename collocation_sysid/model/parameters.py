@@ -173,7 +173,6 @@ class Parameter:
             )
 
     def _check_fixed(self) -> None:
-        """Raise an `InputError` if the fixed value is missing or not admissible."""
         constant = constant_named(self.name)
         least = (
             constant.at_least
@@ -187,7 +186,6 @@ class Parameter:
         self._require_below_limit(value, "fixed")
 
     def _require_below_limit(self, value: float, what: str) -> None:
-        """Raise an `InputError` if a value reaches the limit of the constant, such as ν = 0.5."""
         if not value < (limit := constant_named(self.name).below):
             why = (
                 ": an incompressible body has no finite λ; for rubber state 0.499"
@@ -262,7 +260,6 @@ def with_widest_bounds(item: Parameter) -> Parameter:
 
 
 def _lower_limit_text(least: float) -> str:
-    """Return the start of an inequality with the smallest admissible value; "" if there is none."""
     return "" if least == -np.inf else f"{least:g} <= "
 
 
@@ -390,7 +387,6 @@ def _with_usual_guess(name: str, user_statement: Unknown, constant: Constant) ->
 
 
 def _require_admissible(constant: Constant, value: float, what: str) -> None:
-    """Raise an `InputError` if a user-defined constant does not admit a value; `what` names it."""
     least = constant.at_least if constant.scale == "linear" else -np.inf
     if not value >= least or not value < constant.below:
         raise InputError(
@@ -450,7 +446,6 @@ class Parameters:
 
     @staticmethod
     def _check_ties(items: Iterable[Parameter]) -> None:
-        """Raise an InputError for a parameter tied to one that is missing or tied itself."""
         untied = {item.name: item for item in items if item.tied is None}
         for item in items:
             if item.tied is not None and item.tied.to not in untied:
@@ -566,7 +561,6 @@ class Parameters:
     def _with_components(
         self, function: Callable[[Parameter], tuple[Parameter, ...]]
     ) -> Parameters:
-        """Return parameters with components replaced by those of a tuple."""
         items: list[Parameter | FieldCoefficients] = []
         for item in self.items:
             if isinstance(item, Parameter):
@@ -831,7 +825,6 @@ class Parameters:
 
 
 def _guess(item: Parameter) -> float:
-    """Return the guess of a parameter, or raise an `InputError` if there is none."""
     if item.guess is None:
         raise InputError(
             "this parameter has no guess; expected guess = a value, because only solve and check "
@@ -843,7 +836,6 @@ def _guess(item: Parameter) -> float:
 
 
 def _describe(item: Parameter) -> str:
-    """Return a short description of a parameter for `repr`."""
     if item.tied is not None:
         return f"{item.name} = {item.tied.ratio:g} × {item.tied.to}"
     if item.is_fixed:
@@ -895,12 +887,10 @@ class ThetaMap:
 
     @cached_property
     def _theta(self) -> GeneratedFunction:
-        """Expression of θ with derivatives."""
         return GeneratedFunction(self.expression, len(self.parameters.free), data_size=0)
 
     @cached_property
     def _derived(self) -> tuple[tuple[str, ...], GeneratedFunction]:
-        """Names of `_derived_moduli`, and the function from q to their values."""
         names = self.parameters.names
         body = self.body
         derived_names, _ = _derived_moduli(
@@ -908,7 +898,6 @@ class ThetaMap:
         )
 
         def values(q: ca.SX, _: ca.SX) -> ca.SX:
-            """Return the derived moduli as an expression in q."""
             return _derived_moduli(names, body, theta=self.expression(q))[1]
 
         return derived_names, GeneratedFunction(values, self._theta.input_size, data_size=0)
@@ -919,19 +908,14 @@ NOTHING = np.zeros(0)
 
 
 def _as_float_array(q: Sequence[float] | Array) -> Array:
-    """Return q as an array of floats."""
     return np.asarray(q, dtype=np.float64)
 
 
 def _derived_moduli(
     names: Sequence[str], body: Body, theta: ca.SX
 ) -> tuple[tuple[str, ...], ca.SX]:
-    """Return names and expressions of the moduli that follow from θ.
-
-    These are (E, ν) of every part at small strain, unless they are parameters themselves, and (λ,
-    μ) of the parts that are parametrised by (E, ν). With memory they are the long-term moduli; the
-    instantaneous modulus E(1 + Σg) is added. A region that has the moduli of the others is omitted.
-    """
+    """Return moduli that follow from θ: (E, ν) or (λ, μ) of each part, long-term with memory."""
+    # The instantaneous modulus E(1 + Σg) is added. Equal moduli of a region are omitted.
     derived: dict[str, ca.SX] = {}
     shares = body.split_theta(theta)
     for part, share, source in zip(body.parts, shares, body.constant_sources(names), strict=True):

@@ -135,11 +135,7 @@ class Pointwise(ForceTerm):
         return since_s, (since_s == 0).astype(float)
 
     def _inputs_at(self, states: States) -> _LawInputs:
-        """Return the inputs and data of the law at states, at those points that can act.
-
-        The inputs u = (y, ẏ, c, h_{k−1}) are (…, T, i): without ẏ if the law does not depend on
-        it, and with zeros for h_{k−1} if there is no `previous_state`. The data are (d, T, i).
-        """
+        """Return u = (y, ẏ, c, h_{k−1}) (…, T, i) and data (d, T, i) at the points that can act."""
         chosen, y = self.active_points(states)
         constants = self.constants(states)
         constants_offset = len(y) * (2 if self.is_nonlinear_in_velocity else 1)
@@ -260,13 +256,7 @@ class Pointwise(ForceTerm):
                 curvature.theta_theta[:, column, place] += second[k, other].sum(axis=1)
 
     def _weights(self, here: _LawInputs, weights: Array) -> Array:
-        """Return the weights (d + n, T, i) of the values of the law: of the forces on y, then of
-        the n internal variables h.
-
-        The weights (T, 3n) of the nodal forces are interpolated to the chosen points and
-        multiplied by `factor`; those of h are `variable_weights`, zero if that is None. Without
-        internal variables the result is (d, T, i).
-        """
+        """Return the weights (d + n, T, i) of the forces on y, then of the n internal variables."""
         force_weights = self.factor * self.points.vectors(weights, here.chosen)
         if not self.internal_variable_count:
             return force_weights

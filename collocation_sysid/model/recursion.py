@@ -52,7 +52,6 @@ class Recursion:
         """Expression R of the stacked inputs u = (h_{k−1}, s_k, s_{k−1}, c), with derivatives."""
 
         def expression(u: ca.SX, data: ca.SX) -> ca.SX:
-            """Return h_k from the stacked inputs."""
             before, now, last, constants = ca.vertsplit(u, [0, *self.input_offsets])
             return self.expression(before, now, last, constants, data)
 

@@ -297,7 +297,6 @@ def _zero_loads(rows: Array, count: int = 0) -> dict[str, Array]:
 
 
 def _sum_over_nodes(dofs: Array) -> Array:
-    """Return the sums over the nodes (T, 3) of dof values (T, 3n)."""
     return dofs.reshape(len(dofs), -1, 3).sum(axis=1)
 
 

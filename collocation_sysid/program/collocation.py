@@ -439,13 +439,8 @@ class Collocation:
     def _with_associations(
         self, associations: Sequence[Association], p: Array, phis: Sequence[Array]
     ) -> tuple[Collocation, Array]:
-        """Return the program with another association of each fitted experiment, and p (nq + nphi,)
-        with the φ of each experiment in `phis`, which refer to these associations.
-
-        Of shared entries, the association and the φ of the first experiment are used. Values that
-        are cached here are computed anew, those of the motions are shared, see
-        `Transcription.with_association`.
-        """
+        """Return the program with other associations, and p with `phis`, which refer to these."""
+        # Of shared entries, those of the first experiment are used; caches of motions are shared.
         updated = self._combine_parameters(p[: self.nq], phis)
         transcriptions = _with_shared_associations(self.transcriptions, associations)
         other = replace(
@@ -809,7 +804,6 @@ class Collocation:
         multipliers: Array,
         weights: Sequence[RowWeights],
     ) -> list[Array]:
-        """Return the values of each group of `_additional_hessian_entries`."""
         return []
 
     # Reading a point --------------------------------------------------------------------------

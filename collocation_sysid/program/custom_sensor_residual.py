@@ -138,11 +138,8 @@ class CustomSensorResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples.
-
-        Its data are the distances of the neighbouring times from the sample, and the time of the
-        sample [s]. A sample beyond the known times uses the nearest ones.
-        """
+        """Stencil of all samples; data are distances of neighbouring times, and the time [s]."""
+        # A sample beyond the known times uses the nearest ones.
         times = self._times
         vectors = times[..., None] * self.observable.vector_count + self.point_indices[:, None]
         places = vectors.reshape(len(times), 1, -1)

@@ -76,9 +76,7 @@ class LocalLoss:
 
     @cached_property
     def _constant(self) -> Array:
-        """Values of the entries at zero positions and parameters; valid everywhere if
-        `_is_quadratic`.
-        """
+        """Values at zero positions and parameters; valid everywhere if `_is_quadratic`."""
         rows = max((points.rows[-1] + 1 for _, points in self.residuals), default=1)
         return self._evaluate_at(
             np.zeros((rows, self.dof_count)),
@@ -87,9 +85,7 @@ class LocalLoss:
         )
 
     def _evaluate_at(self, x: Array, phi: Array, has_observation_curvature: bool) -> Array:
-        """Return the values of the entries of `structure` at x (N, 3n) and φ (k,), with or without
-        the curvature of the observations.
-        """
+        """Return the values of the entries of `structure` at x (N, 3n) and φ (k,)."""
         codes = self._codes(*self.structure)
         values = np.zeros(len(codes))
         for entries in self._entries(x, phi, has_observation_curvature):
@@ -99,9 +95,6 @@ class LocalLoss:
     def _entries(
         self, x: Array, phi: Array, has_observation_curvature: bool
     ) -> Iterator[SparseEntries]:
-        """Iterate over the contributions of the measurements, and of the curvature of
-        observables.
-        """
         for residual, points in self.residuals:
             values = points.evaluate_positions(x, phi)
             yield residual.hessian(

@@ -64,14 +64,9 @@ class MotionJacobian:
         return np.maximum(starts, -1) if first_row else starts
 
     def _blocks(self) -> list[BandBlock]:
-        """Return the blocks of ∂c_t/∂x_{t−lag}, from lag 0 on, with the terms that fill them.
-
-        The terms are derivatives of the forces; their coefficients contain the factor `length_m` /
-        `force_n`.
-        A block without terms has only the diagonal of the free dofs, for the inertia. Block 0 also
-        has the diagonal of prescribed dofs that are constrained; these rows have constants only,
-        which are written afterwards.
-        """
+        """Return the blocks of ∂c_t/∂x_{t−lag}, from lag 0 on, times `length_m` / `force_n`."""
+        # A block without terms has only the diagonal of the free dofs, for the inertia. Block 0 also
+        # has the diagonal of prescribed dofs that are constrained.
         rows, columns, source = self.dynamics.pattern.full
         place = np.full(self.dynamics.pattern.size, -1)
         moving = np.zeros(self.dynamics.pattern.size, dtype=bool)
@@ -204,9 +199,7 @@ def shifted_back(values: Array, steps: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _DroppedForce:
-    """Entries a G + b C of one evaluation that the Jacobian does not have, because a grasp
-    prescribed the dof.
-    """
+    """Entries a G + b C that the Jacobian does not have, because a grasp prescribed the dof."""
 
     positions: Index  # (e,): positions in the values of the Jacobian
     evaluation: int  # index of the evaluation

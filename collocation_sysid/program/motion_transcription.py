@@ -427,9 +427,7 @@ class MotionTranscription:
     def _scaled_constraints(
         self, x: Array, residual: Array, equations: EquationsAtParameters
     ) -> Array:
-        """Return the scaled constraints (constraints,) from the residual of the equations of
-        motion.
-        """
+        """Return the scaled constraints (constraints,) from the residual of the motion."""
         rows = residual / self.force_n
         goals = equations.dynamics.prescribed_m
         grasped = ~np.isnan(goals)
@@ -623,12 +621,8 @@ class MotionTranscription:
         return self.nq + np.arange(self.grid_times) * self.dof_count
 
     def _hessian_blocks(self, factors: Factors) -> list[BandBlock]:
-        """Return the blocks ∂²φ/∂x_{t−distance}∂x_t of the Hessian of a potential φ of the
-        evaluation states (here not the nuisance parameters).
-
-        There is one block for each distance in time from 0 to the largest lag at which the Hessian
-        may have entries; that of distance 0 has the upper triangle alone.
-        """
+        """Return the blocks ∂²φ/∂x_{t−distance}∂x_t of a potential φ (no nuisance parameters)."""
+        # One for each distance up to the largest lag with entries; that of 0 has the upper triangle.
         rows, columns, source = self.experiment.sparsity.full
         blocks = []
         for distance in range(self.dynamics.largest_lag + 1):
@@ -756,11 +750,7 @@ class MotionTranscription:
         weights: Array,
         lifted_histories: Sequence[WeightedHistory],
     ) -> SecondDerivatives:
-        """Return the second derivatives of Σ weights · F at all N evaluations, including that of a
-        stated initial state, and of Σ μ · h of the lifted history variables.
-
-        The result is overwritten by the next call.
-        """
+        """Return second derivatives of Σ weights · F and Σ μ · h; overwritten by the next call."""
         dynamics = equations.dynamics
         forces = dynamics.forces
         xi, nu = dynamics.all_evaluation_states(x)

@@ -151,7 +151,6 @@ class PointPositions:
         return self._operator_at(np.zeros(size))
 
     def _operator_at(self, phi: Array) -> sp.csr_array:
-        """Return the matrix `operator` at φ (k,)."""
         nodes, shape = self.shape_functions(phi)
         return interpolation_matrix(nodes, shape.weights, node_count=self.node_count)
 
@@ -162,9 +161,7 @@ class PointPositions:
         return np.einsum("ma...,tmai->tmi...", weights, at)
 
     def _coordinate_derivatives(self, x: Array, shape: tuple[Index, ShapeFunctions]) -> Array:
-        """Return the derivatives (R, estimated, 3, k) of the points with estimated places by their
-        own k coordinates, at positions x (rows, 3n); `shape` is the result of `shape_functions`.
-        """
+        """Return derivatives (R, estimated, 3, k) of the points by their own k coordinates."""
         nodes, functions = shape
         estimated = self.association.estimated
         if not len(estimated):
@@ -284,10 +281,7 @@ class PointPositions:
 
     @cached_property
     def _dependencies(self) -> tuple[Index, Index]:
-        """Index of the point and of the corner of its element, (w,) each, for each pair of a point
-        and a node on which its position can depend: all corners if the place is estimated,
-        otherwise those with a weight.
-        """
+        """Index of point and corner (w,) of each pair on which a position can depend."""
         reads = self.association.weights != 0
         reads[self.association.estimated] = True
         marker, corner = np.nonzero(reads)

@@ -95,7 +95,6 @@ def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[Nuis
 
 
 def _require_same_objects(leader: Experiment, experiment: Experiment, row: Deviation) -> None:
-    """Check that two experiments share what a nuisance parameter refers to."""
     theirs = row.same(leader)
     ours = row.same(experiment)
     for entry in ours:
@@ -145,7 +144,6 @@ def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
 def _sharing_error(
     experiment: Experiment, row: Deviation, result: str, expected: str
 ) -> InputError:
-    """Return the error for a parameter that cannot be shared."""
     key = row.key or row.name
     message = f"{key} is shared with {result}; expected {expected}, or a separate scope"
     return InputError(message, None, where=f"experiment '{experiment.name}'")

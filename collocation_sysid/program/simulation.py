@@ -269,7 +269,6 @@ def _steps_per_sample(
     timestep_s: float | None,
     substeps: int | Literal["auto"],
 ) -> int | Literal["auto"]:
-    """Return the time steps between samples, 1 in a static experiment; arguments as in `simulate`."""
     if experiment.is_static:
         return 1
     if integrator != NEWMARK or timestep_s is None:
@@ -285,12 +284,8 @@ def _with_automatic_steps(
     options: NewtonOptions | None,
     progress: Progress | None,
 ) -> Trajectory:
-    """Return the simulation of a dynamic experiment whose steps are halved until it is accurate, or
-    `MOST_AUTOMATIC_STEPS` are reached.
-
-    A number of steps that cannot be simulated counts as inaccurate. Arguments as in `simulate`,
-    with constants θ.
-    """
+    """Return a simulation whose steps are halved until accurate or `MOST_AUTOMATIC_STEPS`."""
+    # A number of steps that cannot be simulated counts as inaccurate.
     is_newmark = integrator == NEWMARK
     order = NEWMARK_ORDER if is_newmark else as_scheme(integrator).order
     steps = FIRST_NEWMARK_STEPS if is_newmark else FIRST_SCHEME_STEPS
@@ -327,21 +322,14 @@ def _with_automatic_steps(
 
 
 def _part(progress: Progress, done: float, share: float) -> Progress:
-    """Return a function that reports a part of the work, from `done` on, to `progress`."""
-
     def report(part: float) -> None:
-        """Report the share of all work."""
         progress(done + share * part)
 
     return report
 
 
 def _accepted_error_m(trajectory: Trajectory) -> float:
-    """Return the error of positions [m] at which a simulation needs no finer steps.
-
-    It is `STEP_TOLERANCE` times the largest distance of a node from its first position; for a body
-    that hardly moves it is a rounding error, `ROUNDING` times the size of the body.
-    """
+    """Return `STEP_TOLERANCE` times the largest distance [m], `ROUNDING` sizes if hardly moved."""
     positions = trajectory.positions_m
     farthest_m = np.linalg.norm(positions - positions[0], axis=2).max()
     size_m = np.ptp(positions[0], axis=0).max()
@@ -356,11 +344,7 @@ def _with_steps(
     options: NewtonOptions | None,
     progress: Progress | None,
 ) -> Trajectory:
-    """Return the simulation with `steps` time steps between samples; other arguments as in
-    `simulate`, with constants θ.
-
-    Velocities of a collocation scheme are central differences of its positions.
-    """
+    """Velocities of a collocation scheme are central differences of its positions."""
     sensed = sensed_dofs(experiment)
     equilibria = None
     if integrator == NEWMARK and not experiment.is_static:
@@ -399,7 +383,6 @@ def _with_steps(
 def _with_values(
     experiment: Experiment, kind: type[Measurement], values: Sequence[Any]
 ) -> Experiment:
-    """Return the experiment with other numbers of its measurements of one kind, in their order."""
     is_kind = [isinstance(each, kind) for each in experiment.measurements]
     if len(values) != sum(is_kind):
         names = ", ".join(each.title for each in experiment.measurements if isinstance(each, kind))

@@ -202,12 +202,7 @@ class Transcription(MotionTranscription):
         return (replace(association, correspondences=aligned) if aligned else association), phi
 
     def _place_markers(self, phi: Array, x: Array) -> tuple[Association, Array]:
-        """Return the association and φ (k,) with unknown marker places initialised from rows x
-        (rows, 3n) [m].
-
-        Both are returned unchanged if all places are stated, or no unknown marker has a first
-        sample within the rows.
-        """
+        """Return the association and φ (k,) with unknown marker places from rows x [m]."""
         markers = self.experiment.markers
         rows = self.sample_rows
         if markers.located.all():

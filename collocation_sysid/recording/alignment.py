@@ -121,9 +121,7 @@ def _cut_to_poses(
     grasp_intervals_s: Sequence[tuple[float, float]],
     fewest: int,
 ) -> tuple[MarkerTable, list[str]]:
-    """Return the markers at times for which every active grasp has a pose, and notes on the cuts:
-    an empty list, and the same table, if nothing is cut.
-    """
+    """Return the markers at times for which each active grasp has a pose, and notes on cuts."""
     t_s = table.t_s
     is_inside = np.ones(len(t_s), dtype=bool)
     moving = [
@@ -164,10 +162,7 @@ def _cut_to_poses(
 
 
 def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerTable:
-    """Return the samples of a table within a window, its first and last time [s] included.
-
-    Times count as inside up to `STEP_TOLERANCE` median intervals beyond it.
-    """
+    """Times up to `STEP_TOLERANCE` median intervals beyond the window [s] count as inside."""
     first_s, last_s = window_s
     steps = np.diff(table.t_s)
     slack_s = STEP_TOLERANCE * float(np.median(steps)) if steps.size else 0.0
@@ -181,7 +176,6 @@ def _cut_to_window(table: MarkerTable, window_s: tuple[float, float]) -> MarkerT
 
 
 def _even_grid(t_s: Array, rate_hz: float) -> Array:
-    """Return evenly spaced times at a rate [Hz] from the first time on, up to the last of `t_s`."""
     if not (np.isfinite(rate_hz) and rate_hz > 0.0):
         raise InputError(f"resample_hz is {rate_hz:g}; expected a rate above 0")
     count = int(np.floor((t_s[-1] - t_s[0]) * rate_hz + SAME_TIME_INTERVALS)) + 1
@@ -194,13 +188,8 @@ def _even_grid(t_s: Array, rate_hz: float) -> Array:
 
 
 def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence | None:
-    """Return poses whose samples at the marker times are moved onto the grid.
-
-    Samples between these are moved by the interpolated shift. Samples before the first marker time
-    are left out if a pose exists at that time, and samples after the last one likewise. Positions
-    and rotations stay. A single pose, and poses with fewer than two marker times within their span,
-    are returned unchanged; None if a marker time within the span has no pose within `_tolerance_s`.
-    """
+    """Move pose samples at marker times onto the grid; None if a marker time has no pose."""
+    # Samples between these are moved by the interpolated shift; positions and rotations stay.
     if len(poses.t_s) == 1:
         return poses
     slack_s = _tolerance_s(poses, t_s)
@@ -224,21 +213,13 @@ def _poses_on_grid(poses: PoseSequence, t_s: Array, grid: Array) -> PoseSequence
 
 
 def _tolerance_s(poses: PoseSequence, t_s: Array) -> float:
-    """Return the largest time difference at which a pose and a marker sample count as simultaneous
-    [s].
-
-    It is `STEP_TOLERANCE` times the median interval of the marker times `t_s` (T,) [s], which is 0
-    for a single one, plus half the `printed_rounding_s` of the markers' and of the poses' times.
-    """
+    """Return the largest time difference [s] at which a pose and a marker count as simultaneous."""
     step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
     return STEP_TOLERANCE * step_s + 0.5 * (printed_rounding_s(t_s) + printed_rounding_s(poses.t_s))
 
 
 def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
-    """Return the predicate of a note on poses that were interpolated to the times `grid` (G,), and
-    on gaps of the poses within the grid (see `gap_interpolation`); the caller adds the
-    subject.
-    """
+    """Return the predicate of a note; the caller adds the subject."""
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
     at = f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}" if len(grid) > 1 else _span_text(grid)
     note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
@@ -254,10 +235,7 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
 
 
 def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
-    """Return the predicate of a note on jumps of smoothly interpolated poses between the first and
-    last time of `grid` (G,), as a list of one; empty if there are none or the interpolation is not
-    smooth.
-    """
+    """Return the predicate of a note on jumps in smoothly interpolated poses, or an empty list."""
     if poses.interpolation != "smooth":
         return []
     at_s = poses.jumps_s[(poses.jumps_s >= grid[0]) & (poses.jumps_s < grid[-1])]
@@ -271,15 +249,11 @@ def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:
 
 
 def _rate_hz(t_s: Array) -> float:
-    """Mean sample rate of times (T,), T > 1."""
     return (len(t_s) - 1) / float(t_s[-1] - t_s[0])
 
 
 def _clock_remedy(pose_times_s: Array, marker_times_s: Array) -> str:
-    """Return the end of a message on poses and markers without a common time: the unit of the times
-    if that explains how long they last, else the difference of their starts, for clocks with
-    different zero points; "" if they overlap.
-    """
+    """Return the cause of times without overlap: their unit or zero points; "" if they overlap."""
     ratio = np.ptp(marker_times_s) / max(np.ptp(pose_times_s), 1e-300)
     for factor, unit in UNITS_OF_TIMES.items():
         for of, other, size in (("markers", "poses", ratio), ("poses", "markers", 1 / ratio)):
@@ -299,5 +273,4 @@ def _clock_remedy(pose_times_s: Array, marker_times_s: Array) -> str:
 
 
 def _span_text(t_s: Array) -> str:
-    """First and last of times (T,) as text, "from 0 s to 1.5 s"."""
     return f"from {t_s[0]:.12g} s to {t_s[-1]:.12g} s"

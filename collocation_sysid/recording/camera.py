@@ -60,7 +60,6 @@ X = TypeVar("X", Array, ca.SX)
 
 
 def _require_poses(poses: PoseSequence) -> PoseSequence:
-    """Return `poses` unchanged; an `InputError` if it is no `PoseSequence`."""
     if not isinstance(poses, PoseSequence):
         raise InputError(f"poses of a camera is {type(poses).__name__}; expected a PoseSequence")
     return poses
@@ -108,9 +107,6 @@ class Camera:
     size_px: tuple[int, int] | None = key(ImageSize | None, default=None)
 
     def __post_init__(self) -> None:
-        """Check the camera, and store matrix, distortion and pose as read-only arrays, in place;
-        the pose is the identity by default.
-        """
         pose = read_only_floats(np.eye(4) if self.pose is None else self.pose, (4, 4), name="pose")
         turn = pose[:3, :3]
         rigid = np.allclose(turn @ turn.T, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0

@@ -119,9 +119,7 @@ class CustomSensor(Measurement):
     predict: Callable[..., SensorValues]
 
     def __post_init__(self) -> None:
-        """Check the sensor and complete it in place: `values` become (S, m) unless they are None,
-        and `columns` the name of the sensor, with _1, _2, … if m > 1, where none are given.
-        """
+        """Store `values` (S, m) and `columns`: the name, with _1, _2, … if m > 1."""
         where = f"the reading '{self.name}'"
         vars(self)["unknowns"] = self.unknowns or {}
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
@@ -264,12 +262,7 @@ class CustomSensor(Measurement):
         return stack_values(read)
 
     def _count_of_values(self) -> int:
-        """Evaluate the expression and its Jacobian at rest, and return the number m of its values.
-
-        Rest means the undeformed places of the points without velocity and acceleration, or force
-        and torque with all components one; unknowns are zero, and the time is that of the first
-        sample.
-        """
+        """Return the number m of values, at rest or with force and torque of ones."""
         points = np.asarray(self.points_m).T
         zero_rates = np.zeros_like(points)
         of_points = [points, zero_rates, zero_rates]
@@ -379,7 +372,6 @@ class Gauge(CustomSensor):
     sigma_ratios: Array | None = key(converter=unconverted_or_none, default=None)
 
     def __post_init__(self) -> None:
-        """Check and complete the sensor, see `CustomSensor`; then split σ of each sample."""
         super().__post_init__()
         where = f"the reading '{self.name}'"
         shape = self.measured_values.shape

@@ -48,7 +48,6 @@ DepthCamera = Camera
 
 
 def _require_selection(faces: Selection | None) -> Selection | None:
-    """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(
             f"faces of a depth camera is {faces!r}; expected a selection, such as cs.Named(…)"
@@ -134,7 +133,6 @@ class Depth(Measurement):
     images_m: tuple[Array | None, ...] = key(converter=_unconverted_images, default=())
 
     def __post_init__(self) -> None:
-        """Check the times, and thin the clouds in place, see `_thin_cloud`."""
         where = f"the depth camera '{self.name}'"
         times = read_only_floats(self.t_s, (None,), name=f"t_s of {where}")
         if fault := first_unordered_time(times):
@@ -154,9 +152,7 @@ class Depth(Measurement):
         vars(self).update(t_s=times, clouds=clouds, images_m=self._check_images(len(times)))
 
     def _check_images(self, count: int) -> tuple[Array | None, ...]:
-        """Return `images_m` in single precision, with NaN for pixels without a positive depth, and
-        None where an image is None; an empty tuple if there are no images.
-        """
+        """Return `images_m` in single precision, with NaN for pixels without a positive depth."""
         where = f"the depth camera '{self.name}'"
         if not len(self.images_m):
             return ()
@@ -238,12 +234,7 @@ class Depth(Measurement):
         )
 
     def _thin_cloud(self, cloud: Array) -> Array:
-        """Return the finite points of a cloud (P, 3) or (P, 6), one for each cube of a grid of
-        `spacing_m`, in their order in the cloud; without those at the camera, if it has a matrix.
-
-        Of the points in a cube the one nearest to the cube's centre across the optical axis is
-        selected; the depth has no influence.
-        """
+        """Return the finite point of each cube that is nearest to its centre across the axis."""
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 6):
             raise InputError(
                 f"a cloud of the depth camera '{self.name}' has the shape {cloud.shape}; expected "

@@ -218,9 +218,6 @@ class Deviation:
     largest: float = np.inf
 
     def __post_init__(self) -> None:
-        """Set the default label, in place: the name, with the component of marker parameters and
-        the axis of vectors; and what a change of the stiffness changes.
-        """
         if self.stiffness:
             vars(self)["changes"] = ("stiffness",)
         if not self.label:

@@ -184,12 +184,7 @@ class Experiment:
     specimen: HomogeneousDeformation | None = None
 
     def __post_init__(self) -> None:
-        """Check the experiment and complete its fields, in place.
-
-        The body gets the frames of the obstacles, grasps and loads their nodes on the body, markers
-        their placement, and pressures their rim, as far as they do not have them; obstacles are put
-        last in `grasps`.
-        """
+        """Append the frames of the obstacles to the body, put obstacles last, and resolve nodes."""
         loads = ("masses", "forces", "tendons", "pressures")
         vars(self)["body"] = with_obstacle_frames(
             self.body, self.obstacles, is_static=self.is_static
@@ -461,12 +456,8 @@ class Experiment:
         return first_share - last_share
 
     def _share_since(self, load: PointMass | Force, change: LoadTime, times: Array) -> Array:
-        """Return the share (T,), from 0 to 1, of a load whose time `change` ("from_s" or "until_s")
-        has passed at the given times, see `share`.
-
-        In a motion it is 0 or 1 throughout unless that time is strictly within the recording;
-        static, 1 from that time on.
-        """
+        """Return the share (T,) of a load whose "from_s" or "until_s" has passed, see `share`."""
+        # In a motion it is 0 or 1 throughout unless that time is strictly within the recording.
         at_s = getattr(load, change)
         if self.is_static:
             return (times >= at_s - TIME_TOLERANCE_S).astype(np.float64)
@@ -658,9 +649,7 @@ class Experiment:
         )
 
     def _check_stiffness_deviations(self) -> None:
-        """Raise an `InputError` if a known deviation does not change the stiffness here, or a custom
-        one would change that of a body with memory, whose overstress would not follow.
-        """
+        """Refuse known deviations without effect here, and custom ones of a body with memory."""
         for row in self.nuisance.own:
             if row.stiffness is not None and self.body.has_memory:
                 raise InputError(
@@ -678,7 +667,6 @@ class Experiment:
                 )
 
     def _check_time(self) -> None:
-        """Check the sample times against each other and against those of all measurements."""
         fewest = 1 if self.is_static else 3
         if len(self.t_s) < fewest:
             raise InputError(
@@ -717,10 +705,6 @@ class Experiment:
                 )
 
     def _check_separate_sensors(self) -> None:
-        """Raise an `InputError` if two sensors of one kind have the same name, one has too few
-        samples within the experiment or refers to no grasp, or a camera of a static experiment has
-        an image between the samples.
-        """
         named = Counter((each.description_name, each.name) for each in self.separate_sensors)
         for sensor in self.separate_sensors:
             kind, name = sensor.description_name, sensor.name
@@ -744,7 +728,6 @@ class Experiment:
                     )
 
     def _require_measurements(self) -> None:
-        """Refuse an experiment in which nothing is measured."""
         if self.separate_sensors or self.instrumented_grasps:
             return
         if not self.markers.names:
@@ -792,9 +775,7 @@ class Experiment:
             )
 
     def _check_order_of_grasps(self) -> None:
-        """Raise an `InputError` if one platen of an equilibrium passes the other one: the nodes of
-        two grasps exchange their order. Ends of slender bodies may do so.
-        """
+        """Refuse platens that pass each other in an equilibrium; slender ends may do so."""
         if not self.is_static:
             return
         nodes_m = self.body.nodes_m
@@ -824,7 +805,6 @@ class Experiment:
                 )
 
     def _check_obstacles(self) -> None:
-        """Raise an `InputError` if two obstacles have the same name."""
         names = [obstacle.name for obstacle in self.obstacles]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
             raise InputError(f"two obstacles are called {twice[0]!r}; expected different names")
@@ -848,9 +828,7 @@ class Experiment:
         vars(self)["pressures"] = bounded
 
     def _check_start(self) -> None:
-        """Check the start, and complete a given state in place: velocities are zero by default, and
-        the frames of the obstacles are appended.
-        """
+        """Complete a given start in place: zero velocities, and the frames of the obstacles."""
         if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
             raise InputError(
                 f"loaded_since_s is given, but start is '{self.start}'; loaded_since_s is the "
@@ -901,7 +879,6 @@ class Experiment:
         return velocities
 
     def _append_obstacle_frames(self, node_count: int) -> None:
-        """Append the obstacles' frames to a given start without them, in place."""
         if node_count == len(self.body.nodes_m):
             return
         state = ("start_positions_m", "start_velocities_m_s")

@@ -44,7 +44,6 @@ def coarse_experiment(experiment: Experiment, relation: CoarseBody) -> Experimen
     """
 
     def on_coarse_nodes(load):
-        """Return a grasp, point mass or force with its nodes on the coarse body."""
         return replace(load, nodes=relation.coarse_nodes(load.nodes))
 
     return experiment_on_body(

@@ -56,7 +56,6 @@ def experiment_on_body(
     )
 
     def moved_state(values: Array | None) -> Array | None:
-        """Return a given start state on the other mesh; None for None."""
         return None if values is None else move_state(values)
 
     return replace(

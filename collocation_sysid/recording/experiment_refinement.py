@@ -31,7 +31,6 @@ def refined_experiment(experiment: Experiment, finer: Body) -> Experiment:
     body = experiment.body
 
     def refined_load(load):
-        """Return a grasp, point mass or force with its nodes on the finer body."""
         return replace(load, nodes=refine_nodes(load.nodes, load.selection, body=body, finer=finer))
 
     return experiment_on_body(

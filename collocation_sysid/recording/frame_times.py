@@ -136,9 +136,7 @@ def evenly_sampled(table: MarkerTable) -> tuple[MarkerTable, list[str]]:
 
 
 def _assignment_note(assignment: FrameAssignment, is_jittered: bool, has_markers: bool) -> str:
-    """Return a note on lost frames, and on the jitter if `is_jittered`; without markers, the frames
-    are only times, and the model is not compared there.
-    """
+    """Without markers the frames are only times, and the model is not compared there."""
     parts = []
     if lost := (len(assignment.t_s) - len(assignment.samples)):
         longest = int(np.diff(assignment.samples).max(initial=1)) - 1
@@ -160,7 +158,6 @@ def _assignment_note(assignment: FrameAssignment, is_jittered: bool, has_markers
 
 
 def _irregularity(t_s: Array) -> InputError:
-    """Return the error for times (F,) [s] that are not those of one frame rate."""
     steps_s = np.diff(t_s)
     typical_s = float(np.median(steps_s))
     row = int(np.argmax(np.abs(steps_s - typical_s)))

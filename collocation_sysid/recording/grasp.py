@@ -94,13 +94,10 @@ class Grasp:
     displacement_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the grasp, see `_check_times_and_axes`."""
         self._check_times_and_axes()
 
     def _check_times_and_axes(self) -> None:
-        """Check the time window and the uncertain axes, in place: `zero` loses the axes that the
-        grasp does not hold, and nodes given as a selection are stored as `selection`, too.
-        """
+        """In place: `zero` loses axes that are not held; selected nodes are `selection`, too."""
         if not self.from_s <= self.until_s:
             raise InputError(
                 f"a grasp holds from {self.from_s:g} s until {self.until_s:g} s; expected "
@@ -125,9 +122,7 @@ class Grasp:
         return self._with_nodes(select_on_body(self.nodes, body), t_s)
 
     def _with_nodes(self, nodes: Index, t_s: Array) -> Self:
-        """Return the grasp with other nodes; poses that are matrices (T, 4, 4) become a
-        `PoseSequence` at the times `t_s` (T,). Return self if nothing changes.
-        """
+        """Poses that are matrices (T, 4, 4) become a `PoseSequence` at the times `t_s` (T,)."""
         poses = self.poses
         if not isinstance(poses, PoseSequence):
             poses = PoseSequence.from_matrices(t_s, poses)
@@ -266,9 +261,7 @@ def free_rigid_modes(points_m: Array, is_prescribed: NDArray[np.bool_]) -> tuple
 
 
 def _null_space(matrix: Array) -> Array:
-    """Return an orthonormal basis (k, n) of the null space of a matrix (m, n) with entries of the
-    order of one: singular values up to `SMALLEST_SINGULAR_VALUE` count as zero.
-    """
+    """Return an orthonormal basis (k, n) for a matrix (m, n) with entries of the order of one."""
     _, values, directions = np.linalg.svd(matrix)
     return directions[int((values > SMALLEST_SINGULAR_VALUE).sum()) :]
 
@@ -286,7 +279,6 @@ def _axis_aligned_basis(vectors: Array) -> Iterator[Array]:
 
 
 def _direction_text(direction: Array) -> str:
-    """Return "x", "y" or "z" for a vector along that axis, else its components."""
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) > 1 - 1e-6:
         return "xyz"[axis]

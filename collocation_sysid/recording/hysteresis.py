@@ -124,10 +124,8 @@ def _specimen_curve(experiment: Experiment) -> tuple[Array, Array, float] | None
 
 
 def _bench_curve(experiment: Experiment) -> tuple[Array, Array, float] | None:
-    """Return size of the displacement (S,) [m], force along it (S,) [N] and its σ, of the part that
-    is modelled, both from their first values on, because a force may contain a weight; None without
-    a force in a static test along a line.
-    """
+    """Return displacement (S,) [m], force along it (S,) [N] and its σ."""
+    # Both are taken from their first values on, because a force may contain a weight.
     travel_m = bench_travel(experiment) if experiment.is_static else None
     if travel_m is None:
         return None

@@ -128,9 +128,6 @@ class Load:
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def __post_init__(self) -> None:
-        """Store nodes given as a selection as `selection`, too, in place; raise an `InputError`
-        unless `from_s` is before `until_s`.
-        """
         if not self.from_s < self.until_s:
             raise InputError(
                 f"a {self.description_name} acts from {self.from_s:g} s until {self.until_s:g} s; "
@@ -237,7 +234,6 @@ class Force(Load):
     description_name: ClassVar[str] = "force"
 
     def __post_init__(self) -> None:
-        """Check window and forces, and store the forces as (1, 3) or (m, 3), in place."""
         super().__post_init__()
         course = TimeSeries(self.force_n, self.t_s, what="force_n", shape=(3,))
         vars(self).update(force_n=course.values, t_s=course.t_s)

@@ -59,9 +59,6 @@ class MarkerTable:
     sigma_m: Array | None = key(converter=np.asarray, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
-        """Check times and shapes, in place; an `InputError` for times that do not increase or
-        another shape.
-        """
         if fault := first_unordered_time(self.t_s):
             raise InputError(fault[1], where=f"row {fault[0] + 1}")
         shape = (len(self.t_s), len(self.names), 3)
@@ -125,7 +122,6 @@ def read_markers(
 
 
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
-    """Return the tracks that `choose` selects from a file of any known format."""
     source = open_source(path)
     if isinstance(source, bytes):
         if c3d.is_c3d(source):
@@ -139,16 +135,9 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
 
 
 def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
-    """Return the function that picks the requested markers from the labels in a file.
-
-    It returns their indices: in the order of the file if `names` is None, else in that of `names`.
-    Labels that the file excludes, such as unlabelled markers, are picked only if they are renamed
-    or requested by name. It raises an `InputError` if labels or names repeat, if a label of
-    `renamed` or a name is not there, or if nothing is chosen.
-    """
+    """Excluded labels, such as unlabelled markers, are picked only if renamed or requested."""
 
     def choose(labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
-        """Return the indices of the chosen labels, see `LabelChooser`."""
         _require_distinct(labels, "two markers are labelled")
         for label in renamed:
             _require_one_of(label, labels, what="label")
@@ -176,14 +165,12 @@ def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> L
 
 
 def _require_distinct(names: Sequence[str], message: str) -> None:
-    """Raise an `InputError` that begins with `message` if a name occurs twice."""
     for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{message} '{name}'; expected names that differ")
 
 
 def _require_one_of(name: str, known: Sequence[str], what: str) -> None:
-    """Refuse a name that is not among the known ones, with similar names."""
     if name not in known:
         hint = hint_at(name, known)
         raise InputError(f"no {what} '{name}'; the file has {', '.join(known)}{hint}")
@@ -229,12 +216,8 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
 
 
 def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
-    """Raise an `InputError` if neither the mean nor the median step of times (T,) agrees with a
-    frame rate within `_RATE_TOLERANCE`; fewer than two times are not checked. `key` is where the
-    rate is stated, for the message.
-
-    Lost frames change the mean step, and coarsely printed times the median: one of them must agree.
-    """
+    """Require that the mean or the median step agrees with the rate stated in `key`."""
+    # Lost frames change the mean step, and coarsely printed times the median.
     if len(t_s) < 2:
         return
     steps = np.diff(t_s)
@@ -248,12 +231,7 @@ def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
 
 
 def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str]]:
-    """Return coordinates (T, M, 3) with NaN for missing ones, and a note on how many samples are
-    missing or incomplete.
-
-    A sample is missing if all coordinates are NaN, or 0 in a format in which zeros mean that. The
-    note lists all markers, those with the same losses together; without losses there is none.
-    """
+    """Return coordinates (T, M, 3) with NaN for missing ones, and a note on them."""
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).all(axis=2))
     incomplete = np.isnan(x).any(axis=2) & ~blank

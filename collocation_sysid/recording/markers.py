@@ -114,9 +114,6 @@ class Markers(Measurement):
     sigma_ratios: Array | None = key(converter=as_array_or_none, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
-        """Check the markers and complete the fields, in place: names m1, m2, … by default, and
-        `sigma_m` as an array (M,).
-        """
         shape = len(self.t_s), None, 3
         tracks = read_only_coordinates(self.positions_m, shape)
         m = tracks.shape[1]
@@ -164,11 +161,7 @@ class Markers(Measurement):
         return sigma_m
 
     def _check_places(self, m: int) -> None:
-        """Check the places of the m markers, and store them in place: without a placement
-        `places_m` (m, 3), NaN where unknown, and `located` (m,); `places_sigma_m` as an array (m,).
-
-        With a placement all markers are located unless `located` is given.
-        """
+        """Store `places_m` (m, 3), NaN if unknown, `located` and `places_sigma_m` (m,)."""
         places_m = self.places_m
         placement = self.placement
         known = self.located

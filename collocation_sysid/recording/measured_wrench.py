@@ -102,7 +102,6 @@ class Wrench(Measurement):
     sigma_ratios: Array | None = key(converter=as_array_or_none, default=None, metadata=over_time())
 
     def __post_init__(self) -> None:
-        """Check the measurements and store them as read-only floats (S, 6), in place."""
         if not len(self.t_s):
             raise InputError("the measured wrench has no samples; expected at least one")
         shape = len(self.t_s), 6

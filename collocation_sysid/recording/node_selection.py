@@ -89,7 +89,6 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
     """
 
     def chosen(selection: ArrayLike | Selection) -> Index:
-        """Return sorted distinct read-only node indices, or a `Selection` unchanged."""
         if isinstance(selection, Selection):
             return cast(Index, selection)
         nodes = np.unique(read_only_nodes(selection, (None,), name=f"nodes of {what}"))

@@ -88,12 +88,10 @@ def _has_images(experiment: Any, index: int) -> bool:
 
 
 def _has_depth_cameras(experiment: Any) -> bool:
-    """Return whether the experiment has depth cameras."""
     return bool(experiment.depths)
 
 
 def _has_depth_outlines(experiment: Any) -> bool:
-    """Return whether a depth camera of the experiment has images, with outlines to compare."""
     return any(len(depth.images_m) for depth in experiment.depths)
 
 
@@ -104,7 +102,6 @@ def _camera_sharing_key(experiment: Any) -> dict[str, object]:
 
 
 def _has_image_cameras(experiment: Any) -> bool:
-    """Return whether ordinary cameras film the body."""
     return any(each.counts_pixels for each in experiment.readings)
 
 
@@ -113,16 +110,11 @@ def _is_filmed_motion(experiment: Any) -> bool:
 
 
 def _is_motion(experiment: Any) -> bool:
-    """Return whether the experiment is a motion, and not static."""
     return not experiment.is_static
 
 
 def _has_observable_hand_eye(experiment: Any) -> bool:
-    """Return whether markers determine the position of the body in its grasp (hand–eye transform).
-
-    True if the body has a grasp that is not an obstacle, there are markers, and the start is an
-    equilibrium.
-    """
+    """True with markers, a grasp that is not an obstacle, and a start in equilibrium."""
     return (
         bool(experiment.body_grasps)
         and _has_markers(experiment)
@@ -131,7 +123,6 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
 
 
 def _largest_place_step_m(experiment: Any) -> float:
-    """Return `EDGES_A_STEP` mean edges of the mesh."""
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
 
@@ -821,7 +812,6 @@ class Nuisance:
         def __getattr__(self, name: str) -> float | None: ...
 
     def __post_init__(self) -> None:
-        """Check custom kinds, deviations and scopes."""
         for row in self.own:
             _check_custom_kind(row)
             if [each.name for each in self.kinds].count(row.name) > 1:
@@ -879,9 +869,6 @@ class Nuisance:
 
 
 def _check_custom_kind(row: Deviation) -> None:
-    """Raise an `InputError` if a custom kind is of a component other than "recording" or "marker",
-    has no sigma, or does not have exactly one effect.
-    """
     if row.of not in ("recording", "marker"):
         raise InputError(
             f"the nuisance parameter {row.name!r} has of = {row.of!r}; expected 'recording' or "

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 
 def _require_solid(shape: Solid) -> Solid:
-    """Return `shape` unchanged; an `InputError` if it is no `Solid`."""
     if not isinstance(shape, Solid):
         kinds = ", ".join(kind.__name__ for kind in KINDS.values())
         raise InputError(f"shape of an obstacle is {shape!r}; expected one of {kinds}")
@@ -38,7 +37,6 @@ def _require_solid(shape: Solid) -> Solid:
 
 
 def _require_selection(faces: Selection | None) -> Selection | None:
-    """Return `faces` unchanged; an `InputError` if it is no `Selection`."""
     if not isinstance(faces, Selection):
         raise InputError(
             f"faces of an obstacle is {faces!r}; expected a selection, such as cs.Named(…)"
@@ -131,9 +129,6 @@ class Obstacle(Grasp):
     relaxed: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check time window, axes and friction; an `InputError` if `axes` is not "xyz", the
-        friction is above its bound, or the name of its parameter does not end with "friction".
-        """
         self._check_times_and_axes()
         if self.axes != "xyz":
             raise InputError(

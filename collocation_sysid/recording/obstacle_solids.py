@@ -75,7 +75,6 @@ class Solid(ABC):
 
 
 def _unit_normal(value: ArrayLike) -> Array:
-    """Return the normalised vector (3,) of a normal, not zero."""
     vector = float_converter((3,), "normal of a plane")(value)
     length = float(np.linalg.norm(vector))
     if not length > 0:
@@ -157,7 +156,6 @@ class Sphere(Solid):
 
 
 def _checked_ends(value: ArrayLike) -> Array:
-    """Return the two ends (2, 3) of an axis [m] as a read-only array."""
     ends = float_converter((2, 3), "ends_m")(value)
     if (ends[0] == ends[1]).all():
         raise InputError(
@@ -249,7 +247,6 @@ class Cuboid(Solid):
     rounding_m: float = key(NotNegative, default=0.0)
 
     def __post_init__(self) -> None:
-        """Raise an `InputError` unless the first corner is lower than the second along all axes."""
         if not (self.corners_m[0] < self.corners_m[1]).all():
             raise InputError(
                 f"a box has the corners {self.corners_m.tolist()}; expected the lower one first, "
@@ -354,7 +351,6 @@ class SolidSection(Section):
 
     @model_validator(mode="after")
     def _require_one_solid(self) -> SolidSection:
-        """Raise `ValueError` unless exactly one solid is given."""
         require_one(self, *type(self).model_fields)
         return self
 

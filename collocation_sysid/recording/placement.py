@@ -54,9 +54,6 @@ class Placement:
     node_count: int
 
     def __post_init__(self) -> None:
-        """Store read-only copies, in place; an `InputError` if shapes disagree or a node is not
-        below `node_count`.
-        """
         nodes = read_only_nodes(self.nodes, (None, None), name="nodes of the placement")
         if nodes.size and nodes.max() >= self.node_count:
             raise InputError(
@@ -281,13 +278,8 @@ class LocatedBody:
         return np.concatenate([-rest.sum(axis=1, keepdims=True), rest], axis=1)
 
     def _shape_functions_at(self, point: Array, cell: int) -> Array:
-        """Return the shape functions (npe,) of an element, by its index, at a point (3,), which may
-        be outside the element.
-
-        Barycentric coordinates of the corners are exact for straight edges. In a quadratic element
-        with curved edges they are corrected iteratively until the element maps them to the point;
-        the best iterate is returned, without a check.
-        """
+        """Return the shape functions (npe,) of an element at a point (3,), which may be outside."""
+        # Barycentric coordinates are exact for straight edges, and corrected for curved ones.
         one = np.array([cell])
         local = self.barycentric(point, one)
         best = self.body.element.shape_functions(local)[0]

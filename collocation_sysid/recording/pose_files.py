@@ -82,9 +82,7 @@ def read_poses(
 def _checked_sequence(
     t_s: Array, positions_m: Array, quaternions: Array, row_names: list[str]
 ) -> PoseSequence:
-    """Return a smooth pose sequence from times (T,) [s], positions (T, 3) [m] and quaternions (T,
-    4), ordered x, y, z, w.
-    """
+    """Return a smooth sequence from positions (T, 3) [m] and quaternions (T, 4), x, y, z, w."""
     if fault := first_pose_fault(t_s, positions_m, quaternions_xyzw=quaternions):
         raise InputError(fault[1], where=row_names[fault[0]])
     return PoseSequence(t_s, positions_m, quaternions_xyzw=quaternions)
@@ -99,12 +97,7 @@ def _read_columns(grid: Table, places: Iterable[int]) -> Array:
 
 
 def _with_column_names(table: Table) -> Table:
-    """Return a table without a line of names with the names of poses.
-
-    These are t_s, x, y, z and q0 to q3, whose order is stated elsewhere. A table has no names if it
-    has eight columns, all named by numbers: these become its first row. Any other table is returned
-    unchanged.
-    """
+    """Name eight unnamed columns t_s, x, y, z and q0 to q3, whose order is stated elsewhere."""
     if len(table.columns) != 8 or not all(map(is_number, table.columns)):
         return table
     names = ["t_s", "x", "y", "z", "q0", "q1", "q2", "q3"]
@@ -112,7 +105,6 @@ def _with_column_names(table: Table) -> Table:
 
 
 def _column_error(grid: Table) -> InputError:
-    """Return the error for a table whose columns are not those of poses."""
     return grid.error_at(
         f"the columns are {', '.join(grid.columns)}; expected {', '.join(POSE_COLUMNS)}, each once "
         "(or t_s and m00, m01 … m33)"

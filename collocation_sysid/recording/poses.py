@@ -86,7 +86,6 @@ class PoseSequence:
     )
 
     def __post_init__(self) -> None:
-        """Check the poses, see `first_pose_fault`, and normalise the quaternions, in place."""
         t_s = self.t_s
         m = len(self.t_s)
         if not m:
@@ -207,9 +206,7 @@ class PoseSequence:
         return self._interpolate_linearly(times)
 
     def _interpolate_linearly(self, times: Array) -> tuple[Array, Array]:
-        """Return rotations (k, 3, 3) (SLERP) and translations (k, 3) at times (k,), linear between
-        samples and continued linearly beyond them; at least two samples.
-        """
+        """Return rotations (k, 3, 3) (SLERP) and translations (k, 3), also beyond samples."""
         k = np.clip(np.searchsorted(self.t_s, times, side="right") - 1, 0, len(self.t_s) - 2)
         fraction = ((times - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k]))[:, None]
         step_m = self.positions_m[k + 1] - self.positions_m[k]
@@ -331,9 +328,7 @@ def first_matrix_fault(t_s: Array, matrices: Array) -> tuple[int, str] | None:
 
 
 def _unit_and_continuous(quaternions: Array) -> Array:
-    """Return quaternions (m, 4) that are normalised, with signs such that neighbours are in the
-    same hemisphere, as a read-only array; the first keeps its sign.
-    """
+    """Return normalised quaternions (m, 4) whose neighbours are in the same hemisphere."""
     unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     aligned = np.sum(unit[1:] * unit[:-1], axis=1) >= 0.0
     signs = np.cumprod(np.concatenate([[1.0], np.where(aligned, 1.0, -1.0)]))
@@ -433,9 +428,7 @@ def require_determined_motion(
 
 
 def _typical_step_s(poses: PoseSequence, first_s: float, last_s: float) -> float:
-    """Return the median time [s] between consecutive poses from `first_s` to `last_s` between which
-    the grasp moves by more than `LARGEST_REST_DIFFERENCE`; 0 if it rests.
-    """
+    """Return the median step [s] of moving poses (`LARGEST_REST_DIFFERENCE`); 0 at rest."""
     shift_m = np.abs(np.diff(poses.positions_m, axis=0)).max(axis=1)
     turn = np.abs(np.diff(poses.quaternions_xyzw, axis=0)).max(axis=1)
     within = (poses.t_s[1:] > first_s) & (poses.t_s[:-1] < last_s)

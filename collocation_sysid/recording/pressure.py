@@ -30,7 +30,6 @@ PLANE_TOLERANCE = 1e-9
 
 
 def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
-    """Return a selection, or a copy of triangles (F, 3); anything else is refused."""
     if isinstance(faces, Selection):
         return faces
     faces = np.array(faces)
@@ -92,9 +91,6 @@ class Pressure(Actuator[EnclosedVolume]):
     offset_field: ClassVar[str] = "loss_pa"
 
     def __post_init__(self) -> None:
-        """Check the stated pressures and store them as `declared_values`, in place; an `InputError`
-        for a constant pressure with a lag.
-        """
         pressure = TimeSeries(self.pressure_pa, self.t_s, what=f"pressure_pa of {self.name}")
         vars(self).update(pressure_pa=pressure.values, t_s=pressure.t_s, declared_values=pressure)
         if self.lag_s and self.t_s is None:
@@ -182,13 +178,9 @@ class Pressure(Actuator[EnclosedVolume]):
         return self.energy_amplitude(pressure_pa, self.factor, offset=self.loss_pa)
 
     def _lagging_pressure(self, t_s: Any, lag_s: Any) -> Any:
-        """Return the solution p [Pa] of τ dp/dt = stated pressure − p at the times `t_s`, for τ =
-        `lag_s`; CasADi expressions or numbers.
-
-        It is the first stated pressure until the first time; after the last time the stated
-        pressure stays. The stated pressure is a sum of ramps, one for each change of its slope; the
-        response to a ramp that begins at zero is t − τ (1 − exp(−t/τ)).
-        """
+        """Return the solution p [Pa] of τ dp/dt = stated pressure − p for τ = `lag_s`."""
+        # The stated pressure is a sum of ramps, one for each change of its slope; the response to a
+        # ramp that begins at zero is t − τ (1 − exp(−t/τ)).
         assert self.t_s is not None
         slopes = np.diff(self.pressure_pa) / np.diff(self.t_s)
         changes = np.diff(slopes, prepend=0.0, append=0.0)

@@ -225,10 +225,7 @@ def least_rigid_marker(reference_m: Array, positions_m: Array) -> int:
 
 
 def _fixes_rotation(points: Array, weight: Array) -> NDArray[np.bool_]:
-    """Return whether the points (B, 3) of each frame determine a rotation, as (T,) bool: at least
-    two of them, whose second singular value about the mean exceeds `_LEAST_RELATIVE_SPREAD` times
-    the first.
-    """
+    """Return for each frame (T,) whether at least two of the points (B, 3) are apart."""
     used = (weight > 0).astype(np.float64)
     centred = (points - _mean(points, used)[:, None]) * used[:, :, None]
     spread = (
@@ -247,11 +244,7 @@ def _mean(points: Array, weight: Array) -> Array:
 
 
 def _best_motions(source: Array, target: Array, weight: Array) -> tuple[Array, Array]:
-    """Return rotations (T, 3, 3) and translations (T, 3) that map source to target points (T, B, 3)
-    with the least squared distances, weighted by `weight` (T, B).
-
-    Points of weight zero may be NaN.
-    """
+    """Return the motions (T, …) of weighted least squares; points of weight zero may be NaN."""
     source_mean = _mean(source, weight)
     target_mean = _mean(target, weight)
     used = weight[:, :, None] > 0

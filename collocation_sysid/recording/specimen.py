@@ -161,9 +161,6 @@ class Specimen:
     area_m2: float | None = key(Positive, default=None)
 
     def __post_init__(self) -> None:
-        """Check the measurements, and number the rows in seconds from 0 where no times are given,
-        in place.
-        """
         if self.test not in DEFORMATIONS:
             raise InputError(
                 f"found {self.test!r}; expected one of {', '.join(TESTS)}", None, where="test"
@@ -210,9 +207,6 @@ class Specimen:
                 )
 
     def _require_measurements_of_test(self) -> None:
-        """Raise an `InputError` unless there is a second strain exactly if the test is biaxial; or
-        if there is a second stress or lateral stretch that the test does not have.
-        """
         of = f"a {self.test} test"
         if (self.second_strain is None) == bool(self.find_deformation().second):
             fault = (
@@ -443,9 +437,7 @@ class Specimen:
         )
 
     def _grasps(self, has_fibres: bool) -> list[Grasp]:
-        """Return a grasp for each of the four nodes of the cell, in their order: at rest, or with
-        the displacements of the test at `t_s`. With fibres, a specimen in uniaxial tension shears.
-        """
+        """Return a grasp for each node of the cell; with fibres, uniaxial tension shears."""
         assert self.t_s is not None
         deformation = self.find_deformation()
         if has_fibres and self.test == "uniaxial":
@@ -465,9 +457,7 @@ class Specimen:
         return grasps
 
     def _sensors(self) -> list[Gauge]:
-        """Return the sensors of the first stress, of the second stress and of the lateral stretch,
-        as far as they are measured; a stress without a finite value has no sensor.
-        """
+        """Return the sensors of both stresses and the lateral stretch, as far as measured."""
         assert self.t_s is not None
         sensors = []
         for name, component, values in (
@@ -494,7 +484,6 @@ class Specimen:
         return sensors
 
     def _stress_sensor(self, name: str, component: str, values: Array) -> Gauge:
-        """Return the sensor of one component of the nominal stress."""
         deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
         direction, normal = (AXES.index(axis) for axis in component)
         assert self.t_s is not None
@@ -577,9 +566,6 @@ class LateralStretch:
         self.axis = axis
 
     def __call__(self, at: PointQuantities) -> ca.SX:
-        """Return the stretch along the axis: the coordinate of the first point of `at` over the
-        size of the cell.
-        """
         return at.position_m[self.axis, 0] / CELL_SIZE_M
 
 

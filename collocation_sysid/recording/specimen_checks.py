@@ -101,9 +101,7 @@ def require_plausible_specimen(specimen: Specimen, *, is_stretch: bool = False) 
 
 
 def _require_strains(specimen: Specimen) -> None:
-    """Raise an `InputError` if the strains look like stretches, which are 1 without load: all above
-    `STRETCH_LIKE`, and hardly any stress at the smallest.
-    """
+    """Refuse strains that look like stretches, which are 1 without load."""
     stress_pa = np.abs(np.nan_to_num(specimen.stress_pa, nan=np.inf))
     first = int(np.argmin(specimen.strain))
     finite = stress_pa[np.isfinite(stress_pa)]
@@ -209,9 +207,7 @@ def order_warnings(specimen: Specimen) -> Iterator[str]:
 
 
 def _reversal_share(specimen: Specimen) -> float:
-    """Return the share of pairs of successive changes of the stress with opposite signs, both
-    larger than `NOISE_SIGMAS` standard deviations; changes from or to NaN are none.
-    """
+    """Return the share of changes with opposite signs, both larger than `NOISE_SIGMAS` σ."""
     changes = np.diff(specimen.stress_pa)
     sigma_pa = np.broadcast_to(np.nan_to_num(specimen.sigma_pa, nan=np.inf), len(changes) + 1)
     limit = NOISE_SIGMAS * np.lib.stride_tricks.sliding_window_view(sigma_pa, 3).max(axis=1)

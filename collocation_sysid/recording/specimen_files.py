@@ -389,14 +389,7 @@ def _column_choices(
     *,
     is_optional: bool = False,
 ) -> list[dict[str, str]]:
-    """Return the possible choices of one column for one of several quantities, each as the name by
-    the quantity's key.
-
-    These are the `stated` columns of the quantities, else all columns that fit one of them, else
-    those that are similar (`similar_column_names`), without columns `taken` for other quantities;
-    without any, the last quantity with the name "…". If `is_optional`, only columns that are stated
-    or fit, and an empty list without any.
-    """
+    """Return stated, else fitting, else similar columns, each by the quantity's key."""
     choices = [
         {quantity.key: stated[quantity.key]} for quantity in quantities if quantity.key in stated
     ]
@@ -417,14 +410,12 @@ def _column_choices(
 
 
 def _names_of(choices: Iterable[Mapping[str, str]]) -> set[str]:
-    """Return the names of all columns that choices of columns contain."""
     return {name for each in choices for name in each.values()}
 
 
 def _one_of(
     table: QuantityTable, quantities: tuple[Quantity, ...], what: str, layout: SpecimenLayout
 ) -> Quantity:
-    """Return the only one of several quantities that a table has."""
     there = [quantity for quantity in quantities if quantity.key in table.values]
     if len(there) != 1:
         present = " and ".join(quantity.key for quantity in there)
@@ -453,9 +444,7 @@ def _one_of(
 
 
 def _complete(table: QuantityTable, quantity: Quantity) -> Array:
-    """Return the values (T,) of the column of a quantity; raise an `InputError` with the line if a
-    cell is blank.
-    """
+    """Return the values (T,) of a column without blank cells."""
     values = table.values[quantity.key]
     if (blank := np.isnan(values)).any():
         raise table.grid.error_at(
@@ -465,11 +454,7 @@ def _complete(table: QuantityTable, quantity: Quantity) -> Array:
 
 
 def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
-    """Return the strain (T,) of the test, as `Specimen` defines it.
-
-    `strain_sign` applies to strains and displacements, not to stretches and volume ratios. A strain
-    of a volumetric test is that of the volume, J − 1.
-    """
+    """Return the strain (T,) as `Specimen` defines it; stretches and ratios have no sign."""
     quantity = _one_of(table, layout.list_deformations(), what="deformation", layout=layout)
     values = _complete(table, quantity)
     if quantity == STRETCH:
@@ -493,9 +478,7 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
 
 
 def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) -> None:
-    """Raise an `InputError` if a ratio (T,) of deformed to undeformed size is not positive
-    everywhere; it names the first such row and the likely cause for `quantity`.
-    """
+    """Refuse a ratio (T,) of deformed to undeformed size that is not positive everywhere."""
     if (ratio > 0).all():
         return
     row = int(np.argmax(ratio <= 0))
@@ -534,9 +517,7 @@ def _second_strain(table: QuantityTable, layout: SpecimenLayout) -> Array | None
 
 
 def _lateral_stretch(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
-    """Return the lateral stretch (T,), from the stretch or else from 1 plus the signed strain, NaN
-    where blank; None if the table has neither.
-    """
+    """Return the lateral stretch (T,), NaN where blank; None if the table has none."""
     if LATERAL_STRETCH.key in table.values:
         return table.values[LATERAL_STRETCH.key]
     if LATERAL_STRAIN.key in table.values:
@@ -545,11 +526,7 @@ def _lateral_stretch(table: QuantityTable, layout: SpecimenLayout) -> Array | No
 
 
 def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
-    """Return the stress (T,) as the table has it, positive in tension [Pa]: engineering or true, a
-    force over `area_m2`, or minus the pressure; NaN where blank.
-
-    `stress_sign` applies to all but pressures.
-    """
+    """Return the stress (T,), positive in tension [Pa]; pressures have no `stress_sign`."""
     quantity = _one_of(table, layout.loads, what="load", layout=layout)
     values = table.values[quantity.key]
     if quantity == PRESSURE:
@@ -572,13 +549,7 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
 def _area_ratios(
     layout: SpecimenLayout, strain: Array, second_strain: Array | None, lateral: Array | None
 ) -> tuple[Array, Array]:
-    """Return the deformed over the undeformed area (T,) of the faces of the first and of the second
-    stress.
-
-    Both are 1 in "confined" and "volumetric" tests, and constant in "simple-shear" tests.
-    Otherwise they follow from the strains (T,) and the lateral stretch (T,); where `lateral` is
-    None, from that of an incompressible specimen. `second_strain` is None for tests with one.
-    """
+    """Return the deformed over the undeformed area (T,) of the faces of both stresses."""
     stretch = 1 + strain
     if layout.test in ("confined", "simple-shear", "volumetric", "biaxial-difference"):
         across = transverse_stretch(layout.axial_stretch, layout.transverse_stretch)
@@ -665,7 +636,6 @@ def specimen_columns(
 def _noise_columns(
     experiment: Experiment, values: Mapping[str, Array], layout: SpecimenLayout
 ) -> dict[str, Array]:
-    """Return the columns (T,) of standard deviations that the layout names."""
     if not layout.noise_columns:
         return {}
     sigmas = {
@@ -707,9 +677,7 @@ def _usual_quantities(layout: SpecimenLayout) -> tuple[Quantity, ...]:
 def _specimen_quantities(
     experiment: Experiment, values: Mapping[str, Array], layout: SpecimenLayout
 ) -> dict[Quantity, Array]:
-    """Return every quantity (T,) that follows from the strains of a specimen and the values of its
-    sensors, in SI units and with the signs of `layout`; arguments as of `specimen_columns`.
-    """
+    """Return each quantity (T,), in SI units and with the signs of `layout`."""
     strain, second_strain = specimen_strains(experiment)
     if layout.modulus == "harmonic":
         # After the sample at rest: those at the largest strain, and a quarter of a period later.

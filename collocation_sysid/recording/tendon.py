@@ -74,7 +74,6 @@ class Tendon(Actuator[PolylineLength]):
     offset_field: ClassVar[str] = "loss_n"
 
     def __post_init__(self) -> None:
-        """Check points and tension, and store the tension as `declared_values`, in place."""
         points = self.points_m
         name = self.name
         if len(points) < 2:
@@ -97,7 +96,6 @@ class Tendon(Actuator[PolylineLength]):
         vars(self).update(tension_n=tension.values, t_s=tension.t_s, declared_values=tension)
 
     def _measure_on(self, body: Body) -> PolylineLength:
-        """Return the length of the polyline in a body."""
         shape = LocatedBody(body.nodes_m, body)
         embedded = [shape.weights_at_point(point) for point in self.points_m]
         nodes, weights, distances = map(np.array, zip(*embedded, strict=True))

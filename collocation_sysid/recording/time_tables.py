@@ -83,7 +83,6 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
 def _read_limited(
     path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
 ) -> tuple[Array, Array]:
-    """Return times (T,) and values (T,) of one quantity, with limits on the values."""
     table = read_columns(path, [quantity])
     values = table.values[quantity.key]
     for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
@@ -184,9 +183,7 @@ def _read_displacements(
     timed: bool,
     other_columns: Collection[str],
 ) -> QuantityTable:
-    """Read the columns of a displacement, or of a strain if the undeformed length `length_m` [m] is
-    given.
-    """
+    """Read a displacement, or a strain if the undeformed length `length_m` [m] is given."""
     quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
     return read_columns(
         path, quantities, column_names=columns, requires_times=timed, other_columns=other_columns

@@ -63,7 +63,6 @@ def require_admissible_damping(damping: DampingLaw, material: Material) -> None:
 
 
 def _require_own_names(damping: DampingLaw, material: Material) -> None:
-    """Raise an `InputError` if a name of the law occurs twice or belongs to others."""
     taken = {
         *(constant.name for constant in material.constants),
         *elastic_names(material),
@@ -128,7 +127,6 @@ def viscous_stress(
 
 
 def _failure(damping: DampingLaw, kind: str, error: Exception) -> str:
-    """Return the message about an error in a function of the law, "stress" or "potential"."""
     arguments = ["psi", "F", "rate", *(c.name for c in damping.constants)]
     return (
         f"the {kind} of the damping law {damping.name!r} cannot be evaluated ({reason(error)}); "

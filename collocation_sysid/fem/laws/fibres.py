@@ -191,7 +191,6 @@ def _vectors(given: str | Array | None, mesh: TetMesh, where: str) -> Array:
 
 
 def _normalised(vectors: Array, where: str, cells: Index) -> Array:
-    """Return vectors (k, 3) with the length 1."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     if not (np.isfinite(lengths).all() and (lengths > 0).all()):
         cell = int(cells[np.flatnonzero(~(lengths[:, 0] > 0))[0]])
@@ -256,7 +255,6 @@ class ReinforcedEnergy:
     fibres: FibreLaw
 
     def __call__(self, F: ca.SX, **constants: ca.SX) -> ca.SX:
-        """Return ψ of the matrix and of the fibres."""
         own = {c.name: constants[c.name] for c in self.matrix.constants}
         values = ca.vertcat(*(constants[c.name] for c in self.fibres.constants))
         return self.matrix.energy(F, **own) + self.fibres.psi(F, values)
@@ -317,7 +315,6 @@ def reinforced(matrix: Material, fibres: FibreLaw) -> ReinforcedMaterial:
 
 
 def _require_isotropic(matrix: Material) -> None:
-    """Raise an `InputError` if the energy changes when the body is turned before it is deformed."""
     F = np.array([[1.10, 0.05, -0.02], [0.03, 0.95, 0.04], [-0.01, 0.06, 1.02]])
     turn = np.array([[0.6, -0.8, 0.0], [0.48, 0.36, -0.8], [0.64, 0.48, 0.6]])
     values = ca.DM([c.plausible for c in matrix.constants])

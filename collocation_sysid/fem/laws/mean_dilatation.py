@@ -97,7 +97,6 @@ class _VolumeSums:
 
     @classmethod
     def from_point(cls, point: QuadraturePoint) -> _VolumeSums:
-        """Return the volumes of a quadrature point and symbols of their sums."""
         F, *rates = point.gradients.values()
         volumes = point.mesh_volume * ca.det(ca.reshape(F, 3, 3))
         for rate in rates:
@@ -129,9 +128,7 @@ class _VolumeSums:
         }
 
     def volume_pieces(self, order: int) -> Pieces:
-        """Return the pieces of the first phase: the volume of the mesh ("volume", summed to V), σ
-        ("volumes", summed to s) and, if `order` is at least 1, ∂σ/∂x ("volumes_by_x").
-        """
+        """Pieces of the first phase: "volume" for V, "volumes" for s, and from order 1 ∂σ/∂x."""
         sums: Pieces = {
             "volume": ("none", self.point.mesh_volume),
             "volumes": ("none", self.own_volumes),
@@ -164,7 +161,6 @@ class _ScalarDerivatives:
     fields: tuple[str, ...]  # fields whose Σ_q ∂²g/∂field∂m are coupled node vectors
 
     def sum_name(self, name: str) -> str:
-        """Return the name of a sum of this scalar."""
         return f"{name}_{self.number}"
 
     @cached_property
@@ -189,9 +185,7 @@ class _ScalarDerivatives:
         return pieces
 
     def piece(self, by: By) -> ca.SX:
-        """Return the piece of a derivative of g by one or two variables: the derivative at fixed
-        sums s and, for two fields α and β, the term Γ ∂n/∂s ∂²σ/∂α∂β of the point's own volumes σ.
-        """
+        """Derivative of g at fixed s; by two fields with Γ ∂n/∂s ∂²σ/∂α∂β of the point's own σ."""
         shape = self.shape
         point = self.shape.point
         nodal = [field for field in by if field != "theta"]
@@ -241,7 +235,6 @@ class _ScalarDerivatives:
 
 
 def _scalar_derivatives(shape: _VolumeSums, outputs: Outputs) -> dict[int, _ScalarDerivatives]:
-    """Return the chain rule of each scalar in the outputs, by the identity of the scalar."""
     terms = [term for those in outputs.values() for term in those]
     chains: dict[int, _ScalarDerivatives] = {}
     for term in terms:

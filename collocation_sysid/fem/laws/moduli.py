@@ -93,10 +93,7 @@ def find_source(
     """
 
     def name_of(own: str) -> str | None:
-        """Return the parameter that gives a constant, that of the region first.
-
-        None if there is none.
-        """
+        """Return the parameter that gives a constant, that of the region first."""
         prefixed = f"{region}.{own}" if region else own
         return prefixed if prefixed in known else own if own in known else None
 
@@ -154,18 +151,15 @@ def elastic_names(material: Material) -> tuple[str, ...]:
 
 
 def _alternatives(elastic: Sequence[Sequence[str]]) -> str:
-    """Return sets of names as text, joined by "or"."""
     return ", or ".join(" and ".join(choice) for choice in elastic)
 
 
 def _expected(elastic: Sequence[Sequence[str]], plain: Sequence[str]) -> str:
-    """Return the expected names as text."""
     own = ", ".join(plain)
     return f"{own}, and {_alternatives(elastic)}" if elastic else own
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names and the verb "is" or "are" as text."""
     return f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 

@@ -42,7 +42,6 @@ class PowerLawEnergy:
     names: tuple[str, ...]  # names of the constants in the order of θ
 
     def __call__(self, F: ca.SX, **constants: ca.SX) -> ca.SX:
-        """Return the energy density at a deformation gradient F (3, 3) as one expression."""
         first, second, ratio = ca.vertsplit(reduced_invariants(F))
         traces = PowerTraces(first, second)
         return self.density(ratio, lambda alpha: traces.scaled_excess(alpha)(()), constants)
@@ -66,7 +65,6 @@ class PowerLawEnergy:
         excesses: list[SymbolicFunction] = []
 
         def scaled_excess(alpha: ca.SX) -> ca.SX:
-            """Return the symbol of the scaled excess for an exponent."""
             partial = traces.scaled_excess(alpha)
             excess = SymbolicFunction(
                 ca.vertcat(first, second, alpha), lambda indices: list(map(partial, indices))
@@ -78,13 +76,11 @@ class PowerLawEnergy:
         rule = ChainRule(tuple(excesses))
 
         def partial(index: PartialIndex) -> ca.SX:
-            """Return a partial derivative in y and the symbols of the traces."""
             if index not in partials:
                 partials[index] = rule.jacobian(partial(index[:-1]), y[index[-1]])
             return partials[index]
 
         def evaluate(indices: Sequence[PartialIndex]) -> list[ca.SX]:
-            """Return partial derivatives at the arguments."""
             return ca.substitute(rule.eliminate(list(map(partial, indices))), [y], [arguments])
 
         return SymbolicFunction(arguments, evaluate)
@@ -127,7 +123,6 @@ def term_numbers(names: Iterable[str]) -> range:
 def _ogden_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of Ogden's material."""
     energy = 0.5 * constants["kappa_pa"] * (ratio - 1) ** 2
     for p in term_numbers(constants):
         alpha = constants[f"alpha_{p}"]
@@ -138,7 +133,6 @@ def _ogden_density(
 def _hyperfoam_density(
     ratio: ca.SX, scaled_excess: ScaledExcess, constants: Mapping[str, ca.SX]
 ) -> ca.SX:
-    """Return the energy density of the foam from the constants of `hyperfoam`."""
     log_j = ca.log(ratio)
     energy = ca.SX(0)
     for p in term_numbers(constants):

@@ -116,7 +116,6 @@ class PowerTraces:
         weights = _exponent_partials(_weights(parity, alpha), alpha)
 
         def partial(index: PartialIndex) -> ca.SX:
-            """Return a partial derivative: that of the weights times that of the functions."""
             first = index.count(0)
             second = index.count(1)
             chosen = weights if first + second else value_weights
@@ -155,18 +154,14 @@ def _nodes() -> Array:
 
 
 def _weights(parity: Parity, alpha: ca.SX) -> ca.SX:
-    """Return the weights (NODES + TAIL_TERMS,) of the sum of a parity, cosh(su) if even and
-    sinh(su) if odd, with s = α / 2^(DOUBLINGS + 1): values at the nodes, then those of the series
-    beyond them, see `_exponentials`.
-    """
+    """Return weights (NODES + TAIL_TERMS,) of cosh(su) or sinh(su), s = α / 2^(DOUBLINGS + 1)."""
+    # Values at the nodes, then those of the series beyond them, see `_exponentials`.
     growing, decaying = _exponentials(alpha)
     return (growing + decaying) / 2 if parity == "even" else (growing - decaying) / 2
 
 
 def _value_weights(parity: Parity, alpha: ca.SX) -> ca.SX:
-    """Return the weights (NODES + TAIL_TERMS,) of a sum after summation by parts: sinh(su)/s for
-    the even sum, (cosh(su) − 1)/s for the odd one, with s = α / 2^(DOUBLINGS + 1).
-    """
+    """Return the weights after summation by parts: sinh(su)/s or (cosh(su) − 1)/s, s as above."""
     s = alpha / 2 ** (DOUBLINGS + 1)
     safe_alpha = ca.if_else(
         ca.fabs(s) < SMALLEST_EXPONENT, SMALLEST_EXPONENT * 2 ** (DOUBLINGS + 1), alpha
@@ -217,7 +212,6 @@ def _product(first: Partials, second: Partials) -> Partials:
     """Return the partial derivatives of a product by the rule of Leibniz, cached."""
 
     def partial(index: PartialIndex) -> ca.SX:
-        """Return the partial derivative of the product with an index."""
         counts = [index.count(argument) for argument in range(EXPONENT + 1)]
         total = ca.SX(0)
         for orders in itertools.product(*(range(count + 1) for count in counts)):
@@ -235,8 +229,6 @@ def _index(orders: Sequence[int]) -> PartialIndex:
 
 
 def _exponent_partials(expression: ca.SX, alpha: ca.SX) -> Partials:
-    """Return the partial derivatives of an expression of α alone, cached."""
-
     def partial(index: PartialIndex) -> ca.SX:
         """Return the partial derivative with an index; zero by the invariants."""
         if not index:

@@ -224,7 +224,6 @@ class StressEvaluator:
         return self._slopes("force_slope", x, theta=theta)
 
     def _slopes(self, name: str, x: Array, theta: Array) -> Array:
-        """Return the entries (T, K) of a derivative at `jacobian_entries`."""
         out = np.zeros((len(x), len(self.jacobian_entries.points)))
         return self._evaluate_all_parts(name, [x], theta=theta, out=out)
 

@@ -232,7 +232,6 @@ def edge_lengths(points: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
 
 
 def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
-    """Raise an `InputError` if a used node has coordinates that are not finite."""
     bad = used[~np.isfinite(points[used]).all(axis=1)]
     if len(bad):
         raise InputError(
@@ -242,7 +241,6 @@ def _require_finite(points: np.ndarray, used: np.ndarray) -> None:
 
 
 def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
-    """Raise an `InputError` if two elements have the same nodes."""
     _, first, inverse = np.unique(
         np.sort(tetrahedra, axis=1), axis=0, return_index=True, return_inverse=True
     )
@@ -256,7 +254,6 @@ def _require_no_duplicates(tetrahedra: np.ndarray) -> None:
 
 
 def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
-    """Raise an `InputError` if an element has almost no volume, of either sign."""
     volumes = np.abs(signed_volumes(points, tetrahedra))
     cubes = edge_lengths(points, tetrahedra).mean(axis=1) ** 3
     bad = np.flatnonzero(volumes <= DEGENERATE_RATIO * cubes)
@@ -271,7 +268,6 @@ def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
 
 
 def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
-    """Return a note if the mesh consists of several unconnected parts; empty otherwise."""
     edges = unique_edges(tetrahedra)
     n = len(points)
     graph = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))

@@ -116,7 +116,6 @@ class _CollapseState:
         self._set_quadrics()
 
     def collapse_round(self, at_most: int) -> int:
-        """Do the best collapses that share no element; return their number."""
         pairs = self._candidates()
         if not len(pairs):
             return 0
@@ -130,7 +129,6 @@ class _CollapseState:
         return len(chosen)
 
     def result(self, mesh: TetMesh) -> CoarseMesh:
-        """Return the present mesh; `mesh` is the given one."""
         kept = np.unique(self.cells)
         coarse_index = np.full(len(self.points), -1)
         coarse_index[kept] = np.arange(len(kept))
@@ -277,10 +275,9 @@ class _CollapseState:
 
 
 def _is_smooth(edges: Index, faces: Index, n: int) -> NDArray[np.bool_]:
-    """Return whether each edge (m, 2) belongs to the surface of triangles (F, 3), and its collapse
-    leaves the surface without folds: both ends then have no other common neighbours on the surface
-    than the third corners of the triangles at the edge (link condition).
-    """
+    """Return whether edges (m, 2) of a surface (F, 3) collapse without folds (link condition):"""
+    # both ends have no other common neighbours on the surface than the third corners of the
+    # triangles at the edge.
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [0, 2]], faces[:, 1:]])
     codes, triangles = np.unique(sides @ [n, 1], return_counts=True)
     own = edges @ [n, 1]

@@ -88,7 +88,6 @@ def read_tetrahedra(path: str | Path, length_unit: str = "m") -> TetrahedraConte
 
 
 def _tetrahedra(data: MeshContent, metres: float) -> TetrahedraContent:
-    """Return the same as `read_tetrahedra` from the data of meshio."""
     counts = _cell_counts(data)
     points_m = np.asarray(data.points, dtype=float) * metres
     blocks = [block for block in data.cells if block.type in _TETRAHEDRA and len(block.data)]
@@ -201,7 +200,6 @@ def _without_booleans(values: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
-    """Context that gives the content of a file."""
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
     require_regular(path)
@@ -235,7 +233,6 @@ def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
 
 
 def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
-    """Return the error for a file that cannot be read or written as a mesh."""
     if missing := re.search(r"No module named '(\w+)'", reason):
         package = missing[1]
         return InputError(
@@ -251,7 +248,6 @@ def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
 
 
 def _point_sets(data: MeshContent) -> dict[str, np.ndarray]:
-    """Return the point sets of a file as boolean arrays."""
     sets = {}
     for name, nodes in (data.point_sets or {}).items():
         sets[name] = np.zeros(len(data.points), dtype=bool)
@@ -260,7 +256,6 @@ def _point_sets(data: MeshContent) -> dict[str, np.ndarray]:
 
 
 def _cell_sets(data: MeshContent) -> dict[str, list[np.ndarray]]:
-    """Return the cell sets of a file as boolean arrays, block by block."""
     sets = {}
     for name, per_block in (data.cell_sets or {}).items():
         if name == "gmsh:bounding_entities":  # numbers of entities, not of cells
@@ -299,7 +294,6 @@ def _group_name(tag: int, dimension: int, ambiguous: bool) -> str:
 
 
 def _nodes_of(data: MeshContent, masks: list[np.ndarray]) -> np.ndarray:
-    """Return the mask (n,) of the nodes of cells selected by one mask for each block."""
     chosen = np.zeros(len(data.points), dtype=bool)
     for block, mask in zip(data.cells, masks, strict=True):
         chosen[np.asarray(block.data)[mask].ravel()] = True
@@ -336,7 +330,6 @@ def _triangle_sets(data: MeshContent, arrays: Mapping[str, Any]) -> Arrays:
 
 
 def _cell_counts(data: MeshContent) -> Counter[str]:
-    """Return the number of cells by their type."""
     counts: Counter[str] = Counter()
     for block in data.cells:
         counts[block.type] += len(block.data)
@@ -344,12 +337,10 @@ def _cell_counts(data: MeshContent) -> Counter[str]:
 
 
 def _listed(counts: Mapping[str, int]) -> str:
-    """Return counts as text, such as "12 tetra, 3 line"; "no cells at all" if empty."""
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "no cells at all"
 
 
 def _note_omitted_cells(counts: Mapping[str, int]) -> tuple[str, ...]:
-    """Return a note on cells other than tetrahedra, which are omitted; empty if there are none."""
     others = {name: count for name, count in counts.items() if name not in _TETRAHEDRA and count}
     if not others:
         return ()

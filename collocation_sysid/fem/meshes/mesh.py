@@ -135,7 +135,6 @@ class TetMesh:
         )
 
     def _set(self, **values: Any) -> None:
-        """Set attributes of the frozen dataclass."""
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -288,7 +287,6 @@ class TetMesh:
 
     @cached_property
     def _boundary(self) -> tuple[np.ndarray, np.ndarray]:
-        """Boundary triangles and the indices of their elements."""
         faces, owners = boundary_of(self.tetrahedra)
         return _read_only(faces), _read_only(owners)
 

@@ -129,7 +129,6 @@ def _is_small_and_safe(path: Path) -> bool:
 
 
 def _read_in_process(path: str | Path) -> MeshContent:
-    """Return the content of a file read in this process; nothing is printed."""
     import meshio  # slow to import
 
     captured = io.StringIO()

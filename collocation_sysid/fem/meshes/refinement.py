@@ -161,7 +161,6 @@ def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["st
 
 
 def _refined_force(placed: LocatedForce, mesh: TetMesh, body: Body) -> NodeForce:
-    """Return a custom force for the refined body, at the corresponding nodes."""
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
     nodes = chosen[: len(body.mesh.points_m)]
     chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])

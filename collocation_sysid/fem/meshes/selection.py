@@ -25,8 +25,6 @@ FaceName = Literal["top", "bottom", "side_x", "side_y"]
 
 
 class _PositionSelection:
-    """Base class of selections by position."""
-
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the sorted indices of the selected nodes, mid nodes included."""
         hint = self._nearest_hint(nodes.points_m)
@@ -43,7 +41,6 @@ class _PositionSelection:
         return _select_faces(self._contains(mesh.points_m), mesh, what=str(self))
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the mask of the points inside."""
         raise NotImplementedError
 
     def _nearest_hint(self, points_m: np.ndarray) -> str:
@@ -82,7 +79,6 @@ class Box(_PositionSelection):
         object.__setattr__(self, "high_m", high)
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the mask of the points inside, with a tolerance for rounding."""
         slack = _tolerance_m(points_m)
         above = points_m >= np.subtract(self.low_m, slack)
         below = points_m <= np.add(self.high_m, slack)
@@ -120,16 +116,13 @@ class Ball(_PositionSelection):
             raise InputError(f"ball: center_m is {self.center_m}; expected finite numbers")
 
     def _nearest_hint(self, points_m: np.ndarray) -> str:
-        """Return the distance of the nearest node as a hint."""
         least_m = self._distance_m(points_m).min()
         return f"; the nearest node is {least_m:.4g} m from its centre"
 
     def _distance_m(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the distances of points from the centre [m]."""
         return np.linalg.norm(points_m - np.array(self.center_m), axis=1)
 
     def _contains(self, points_m: np.ndarray) -> np.ndarray:
-        """Return the mask of the points inside, with a tolerance for rounding."""
         return self._distance_m(points_m) <= self.radius_m + _tolerance_m(points_m)
 
     def __str__(self) -> str:
@@ -359,7 +352,6 @@ class Named:
     def _mask(
         self, arrays: Mapping[str, np.ndarray], count: int, what: str, lacking: str = ""
     ) -> np.ndarray:
-        """Return an array of the mesh as a mask, or raise an `InputError` if it cannot be one."""
         kind = what.split(" ", 1)[0]
         if self.name not in arrays:
             names = ", ".join(f'"{name}"' for name in arrays if not name.startswith("gmsh:"))
@@ -408,7 +400,6 @@ def _select_faces(chosen_nodes: np.ndarray, mesh: TetMesh, what: str) -> np.ndar
 def _indices_or_error(
     mask: np.ndarray, mesh: TetMesh, what: str, of: str = "nodes", missed: str = ""
 ) -> np.ndarray:
-    """Return the indices of a mask, or raise an `InputError` if it is false everywhere."""
     if not mask.any():  # no mid node lies beyond the corners
         missed = missed or f"selects none of the {len(mask)} {of}"
         raise InputError(f"{what} {missed}; the body spans {_describe_bounds(mesh.bounds_m)}")
@@ -426,13 +417,11 @@ def _tolerance_m(points_m: np.ndarray) -> float:
 
 
 def _is_number(value: object) -> bool:
-    """Return whether a value is a real number and not a boolean."""
     is_real = isinstance(value, (int, float, np.integer, np.floating))
     return is_real and not isinstance(value, bool)
 
 
 def _vector(values: Iterable[float], what: str) -> tuple[float, float, float]:
-    """Return three numbers as a tuple of floats: a position (x, y, z)."""
     components = (
         list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     )

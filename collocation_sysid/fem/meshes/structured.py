@@ -125,7 +125,6 @@ def _divisions(size_m: np.ndarray, edge_length_m: float) -> np.ndarray:
 
 
 def _require_element_limit(elements: float) -> None:
-    """Raise an `InputError` for more than a million elements."""
     if elements > _MOST_ELEMENTS:
         raise InputError(
             f"with this length the mesh has {elements:.3g} elements; expected at most "

@@ -112,7 +112,6 @@ def merge_coincident(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndar
 
 
 def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and triangles as arrays, or raise an `InputError` if they are invalid."""
     points = np.asarray(points_m, dtype=float)
     faces = np.asarray(triangles)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
@@ -138,7 +137,6 @@ def _checked_surface(points_m: ArrayLike, triangles: ArrayLike) -> tuple[np.ndar
 
 
 def _require_closed(triangles: np.ndarray) -> None:
-    """Raise an `InputError` unless every edge belongs to exactly two triangles (F, 3)."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, count = np.unique(edges, axis=0, return_counts=True)
     open_edges = int((count == 1).sum())
@@ -154,9 +152,6 @@ def _require_closed(triangles: np.ndarray) -> None:
 def _require_suitable_edge_length(
     points: np.ndarray, triangles: np.ndarray, edge_length_m: float
 ) -> None:
-    """Raise an `InputError` if the edge length is not positive and finite, over half the diagonal
-    of the surface, or so small that more than `MOST_ELEMENTS` tetrahedra would result.
-    """
     if not 0 < edge_length_m < np.inf:
         raise InputError(
             f"edge_length_m is {edge_length_m!r}; expected a positive number of metres"
@@ -179,7 +174,6 @@ def _require_suitable_edge_length(
 
 
 def _pytetwild_version() -> str:
-    """Return the version of pytetwild, or raise an `InputError` if it is not installed."""
     try:
         version("pyvista")  # pytetwild imports it without depending on it
         return version("pytetwild")

@@ -62,7 +62,6 @@ class Continuation(MethodOptions):
     stage: Mapping[str, object] | Callable[..., Solution] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raise an `InputError` for invalid shares or a stage that is no method, see `method`."""
         self.method  # noqa: B018 - refuses a stage that makes no sense
 
     @cached_property
@@ -125,25 +124,7 @@ def first_share(collocation: Collocation, share: float) -> Collocation:
 
 
 class _ContinuationState:
-    """State between the parts: known positions, the last solution, and counts.
-
-    Parameters
-    ----------
-    method : Method
-        Method that solves each part.
-    recorder : Recorder
-        Record of the whole solve, with the complete problem.
-
-    Attributes
-    ----------
-    known : tuple or None
-        Parameters p and positions of each experiment [m] as far as they were solved; None before
-        the first part.
-    last : Solution or None
-        Solution of the last part; None before the first part.
-    iterations, evaluations : int
-        Sums over all parts.
-    """
+    """State between the parts: known positions, the last solution, and counts."""
 
     def __init__(self, method: Method, recorder: Recorder) -> None:
         self.method = method
@@ -154,10 +135,7 @@ class _ContinuationState:
         self.iterations = self.evaluations = 0
 
     def solve(self, share: float) -> bool:
-        """Solve the first share of the samples, from 0 to 1, starting from the last solution, and
-        store the result; return whether to continue with a larger share: unless the solve was
-        interrupted or refused.
-        """
+        """Solve the first share of the samples; return whether to continue."""
         recorder = self.recorder
         part = recorder.collocation if share == 1 else first_share(recorder.collocation, share)
         start = None if self.known is None else _continue_variables(part, *self.known)
@@ -165,7 +143,6 @@ class _ContinuationState:
         elapsed_s = recorder.measure_elapsed_s()
 
         def record(line: Iteration) -> None:
-            """Record an iteration with its number, time and share in the whole solve."""
             number = line.number + before
             time_s = line.time_s + elapsed_s
             recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
@@ -175,13 +152,7 @@ class _ContinuationState:
         return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
 
     def solution(self) -> Solution:
-        """Return the solution of the last part as a solution of the complete problem, after at
-        least one part was solved.
-
-        If the last part is not the complete problem, missing positions are simulated or move
-        rigidly, and the solution has no multipliers of the method. History, counts and times are
-        those of all parts.
-        """
+        """Return the solution of all; missing positions are simulated or move rigidly."""
         assert self.last is not None
         assert self.known is not None
         last = self.last
@@ -202,9 +173,7 @@ class _ContinuationState:
         )
 
     def _add(self, solution: Solution, share: float) -> None:
-        """Store the solution of a part as the last one and its positions as known, and add its
-        counts, its times and a note, in place; `share` is that of the samples, from 0 to 1.
-        """
+        """Store a part as the last one, and add its counts, its times and a note."""
         self.last = solution
         part = solution.collocation
         self.known = part.unpack(solution.z)
@@ -226,12 +195,7 @@ class _ContinuationState:
 
 
 def _continue_variables(collocation: Collocation, p: Array, positions: list[Array]) -> Array:
-    """Return variables z (variables,) from parameters and the first rows of the positions of each
-    experiment.
-
-    The missing rows are simulated or, from where that fails, those of a rigid motion with the
-    grasp; surplus rows are cut.
-    """
+    """Return z; missing rows are simulated or, where that fails, move with the grasp."""
     parts = collocation.iterates_at(p, positions)
     known, _ = simulate_trajectories(
         collocation, p, known_rows=[part.x[: part.transcription.grid_times] for part in parts]

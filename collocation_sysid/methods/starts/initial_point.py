@@ -118,13 +118,10 @@ def _search(
     method: ReducedSpace,
     max_time_s: float,
 ) -> Solution:
-    """Return the solution of a search by reduced space, and add every iteration to the recorder,
-    with its numbers continued.
-    """
+    """Search, and add every iteration to the recorder, with its numbers continued."""
     first_number = recorder.history[-1].number + 1 if recorder.history else 0
 
     def record(line: Iteration) -> None:
-        """Record an iteration, and raise `SearchEnded` if the time is over."""
         recorder.add(
             replace(line, number=first_number + line.number, time_s=recorder.measure_elapsed_s())
         )
@@ -145,11 +142,8 @@ def _reaches_end(solution: Solution) -> bool:
 
 
 def _refined_solution(coarse: Solution, refined: Solution) -> Solution:
-    """Return the refined solution, or the coarse one if the refinement failed, with the sweeps,
-    evaluations and times of both.
-
-    The status is that of the coarse solution, unless the refinement was interrupted or late.
-    """
+    """Return the refined solution, or the coarse one if it failed, with the work of both."""
+    # The status is that of the coarse solution, unless the refinement was interrupted or late.
     both = refined.after(coarse, why="")
     if refined.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
         return both
@@ -211,13 +205,9 @@ def adjoint_multipliers(
 
 
 def _bound_multipliers(program: Collocation, variables: Array, slope: Array) -> Array:
-    """Return multipliers of the bounds (variables,), positive at upper bounds: those that balance
-    the slope where a bound is active, and zero elsewhere.
-
-    A bound is active if its multiplier is larger than the distance to it. Elsewhere a multiplier
-    that balances the slope would be an error of the complementarity instead of one of stationarity,
-    larger by the distance.
-    """
+    """Return multipliers (variables,) that balance the slope at active bounds."""
+    # A bound is active if its multiplier is larger than the distance to it. Elsewhere a multiplier
+    # would be an error of the complementarity, larger by the distance.
     lower, upper = program.bounds()
     distance = np.where(slope > 0, variables - lower, upper - variables)
     is_active = (lower < upper) & (np.abs(slope) > distance)

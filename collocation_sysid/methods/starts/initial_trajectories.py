@@ -118,9 +118,7 @@ def simulate_trajectories(
     parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
 
     def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
-        """Simulate experiment number k, from 0; return its trajectory as far as it succeeded, and
-        the failure or None.
-        """
+        """Return the trajectory as far as it succeeded, and the failure or None."""
         part = parts[k]
         count = part.transcription.grid_times if rows is None else rows[k]
         x, failure = continue_simulation(
@@ -169,7 +167,6 @@ def complete_variables(
 
 
 def _empty_trajectories(collocation: Collocation) -> list[Array]:
-    """Return an empty trajectory (0, 3n) of each fitted experiment."""
     return [np.zeros((0, transcription.dof_count)) for transcription in collocation.transcriptions]
 
 

@@ -98,7 +98,6 @@ class _Table:
         return 1.0 if self.part.shift is None else float(self.part.shift.factor(values))
 
     def modulus_pa(self, values: Mapping[str, float]) -> float:
-        """Return the long-term modulus of the test."""
         body = self.experiment.body
         lam, mu = body.lame(body.theta_from_values(values))[self.part.name]
         specimen = self.experiment.specimen
@@ -130,16 +129,7 @@ def _branch_names(part: BodyPart) -> list[tuple[str, str]]:
 
 
 class _MemoryFit:
-    """Least-squares fit of the branches in closed form.
-
-    Parameters
-    ----------
-    parameters : Parameters
-        With guesses of all.
-    tables : sequence of _Table
-    names : sequence of (str, str)
-        Names of share and relaxation time of each branch.
-    """
+    """Least-squares fit of the branches in closed form."""
 
     def __init__(
         self, parameters: Parameters, tables: Sequence[_Table], names: Sequence[tuple[str, str]]
@@ -158,9 +148,7 @@ class _MemoryFit:
         self.of_elasticity: dict[tuple[float, ...], list[float]] = {}
 
     def start(self) -> Parameters | None:
-        """Return the parameters with the start; None without free relaxation times and moduli, with
-        the share of a liquid, or if the guesses are as good.
-        """
+        """None without free relaxation times and moduli, or if the guesses are as good."""
         free = [tau for _, tau in self.names if tau in self.items]
         if not free or not self.moduli or not self.items.keys() >= {s for s, _ in self.names}:
             return None
@@ -190,14 +178,11 @@ class _MemoryFit:
         )
 
     def _fit(self, q: Array, evaluations: int) -> OptimizeResult:
-        """Return the least-squares solution from a start."""
         bounds = (self.lower, self.upper)
         return least_squares(self._residuals, q, bounds=bounds, x_scale="jac", max_nfev=evaluations)
 
     def _in_order(self, q: Array, order: Sequence[str]) -> Array:
-        """Return the coordinates with branches exchanged such that their relaxation times ascend as
-        the guesses do; unchanged where bounds or priors do not allow it.
-        """
+        """Exchange branches so that relaxation times ascend as the guesses do, if admissible."""
         shares = {tau: share for share, tau in self.names}
         times = [self.items[name] for name in order]
         own = [self.items[shares[name]] for name in order]
@@ -209,14 +194,12 @@ class _MemoryFit:
         return found if is_inside.all() and np.allclose(*same) else q
 
     def _long_term_pa(self, values: Mapping[str, float]) -> list[float]:
-        """Return the long-term modulus of each test."""
         key = tuple(value for name, value in values.items() if name not in self.of_memory)
         if key not in self.of_elasticity:
             self.of_elasticity[key] = [table.modulus_pa(values) for table in self.tables]
         return self.of_elasticity[key]
 
     def _residuals(self, q: Array) -> Array:
-        """Return the weighted differences from the tables, and those from the priors."""
         values = self.parameters.values(q)
         shares = np.array([values[share] for share, _ in self.names])
         tau_s = np.array([values[tau] for _, tau in self.names])
@@ -231,9 +214,7 @@ class _MemoryFit:
         return np.concatenate([*rows, self.parameters.prior_residuals(q)[0]])
 
     def _strengths(self, q: Array, tau_s: Array) -> tuple[Array, Array]:
-        """Return the non-negative strengths (1 + K,) of spring and branches with relaxation times,
-        over the long-term modulus at q, and the weighted residuals.
-        """
+        """Return strengths (1 + K,) of spring and branches, and the weighted residuals."""
         values = self.parameters.values(q)
         rows, data = [], []
         for table, modulus in zip(self.tables, self._long_term_pa(values), strict=True):
@@ -245,9 +226,7 @@ class _MemoryFit:
         return strengths, matrix @ strengths - right
 
     def _spectrum(self, q: Array) -> tuple[Array, Array, Array]:
-        """Return the coordinates with the shifts that fit a spectrum best, the relaxation times of
-        the grid, and their strengths.
-        """
+        """Return the best coordinates, the relaxation times of the grid, and their strengths."""
         branches = {name for pair in self.names for name in pair}
         shifts = [k for name, k in self.items.items() if name in self.of_memory - branches]
 
@@ -278,9 +257,7 @@ class _MemoryFit:
         return q, tau_s, self._strengths(q, tau_s)[0][1:]
 
     def _with_strengths(self, q: Array) -> Array:
-        """Return the coordinates with the shares, and then the modulus, that fit the relaxation
-        times best.
-        """
+        """Return q with the shares, and then the modulus, that fit best."""
         values = self.parameters.values(q)
         spring, *strengths = self._strengths(q, np.array([values[tau] for _, tau in self.names]))[0]
         # Shares of a liquid are as large as their bounds.

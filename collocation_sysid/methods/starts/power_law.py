@@ -64,8 +64,6 @@ LARGEST_LOGARITHM = 300.0
 
 @dataclass(frozen=True, eq=False)
 class _Stress:
-    """Measured nominal stresses of one direction."""
-
     # Direction; in simple shear that of the larger principal stretch, of a difference that of the
     # first stress.
     axis: int
@@ -77,8 +75,6 @@ class _Stress:
 
 @dataclass(frozen=True, eq=False)
 class _Test:
-    """Measurements of one specimen."""
-
     gradient: Array  # (T, 3, 3): prescribed deformation gradients, 1 where the specimen is free
     per_strain: Array  # (3, 3): derivative of the gradient by an offset of all strains
     free: int  # number of directions in which the specimen is free to contract
@@ -95,10 +91,7 @@ class _Test:
         return sum(int(np.isfinite(each).sum()) for each in values)
 
     def log_stretches(self, offset: float) -> Array:
-        """Return the logarithms (T, 3) of the principal stretches, 0 where free, with an offset of
-        the strain: along x, y and z, or, of the two in the plane of shear, the larger one last for
-        a shear that is not negative.
-        """
+        """Return logarithms (T, 3) of the stretches, 0 where free; in shear the larger last."""
         gradient = self.gradient + offset * self.per_strain
         x, y, z = np.einsum("tii->it", gradient)
         shear = gradient[:, 0, 2]
@@ -162,17 +155,7 @@ def power_law_start(collocation: Collocation) -> PowerLawStart | None:
 
 
 class _PowerLawFits:
-    """Closed forms of the tests of one law, and their least-squares fits.
-
-    Parameters
-    ----------
-    collocation : Collocation
-    tests : sequence of _Test
-    is_foam : bool
-        Whether the law is the compressible foam, else Ogden's with incompressible specimens.
-    widened : function
-        Returns a parameter with the bounds of the fits.
-    """
+    """Closed forms of the tests of one law, and their least-squares fits."""
 
     def __init__(
         self,
@@ -208,7 +191,6 @@ class _PowerLawFits:
     def of(
         cls, collocation: Collocation, widened: Callable[[Parameter], Parameter]
     ) -> _PowerLawFits | None:
-        """Return the fits of a problem; None if it has none, see `power_law_start`."""
         experiments = [each.experiment for each in collocation.transcriptions]  # fitted ones
         parts = [part for each in experiments for part in each.body.parts]
         laws = {part.material.name for part in parts}
@@ -235,12 +217,8 @@ class _PowerLawFits:
     # Closed forms -------------------------------------------------------------------------------
 
     def _system(self, alpha: Array, beta: Array | None) -> tuple[Array, Array]:
-        """Return the matrix (m, n) of the predictions by the shares of the shear modulus, and the
-        measured values (m,), both in standard deviations, of terms with the same β.
-
-        Measured lateral stretches have rows of zeros; their values are the measured minus the free
-        stretch.
-        """
+        """Return predictions (m, n) by shares of the shear modulus, and measured values (m,)."""
+        # Measured lateral stretches have rows of zeros; their values are measured minus free.
         rows, right = [], []
         for test in self.tests:
             logs = test.log_stretches(0.0)
@@ -260,9 +238,7 @@ class _PowerLawFits:
     def _residuals(
         self, alpha: Array, shear_pa: Array, beta: Array | None, deviations: Array
     ) -> Array:
-        """Return the residuals of all measurements and priors in standard deviations; `deviations`
-        are the `_deviations` over their prior standard deviations.
-        """
+        """Return all residuals in standard deviations; `deviations` are over their priors."""
         parts = [deviations]
         values = iter(deviations * self.prior_sigmas)
         for test in self.tests:
@@ -324,7 +300,6 @@ class _PowerLawFits:
         return starts[:MOST_IMPROVED]
 
     def _fit(self, terms: int) -> _Fit | None:
-        """Return the best fit of a law with a number of terms and one β; None if there is none."""
         projected = [self._project(alpha, beta) for alpha, beta in self._starts(terms)]
         fits = [fit for fit in projected if fit]
         if not fits:
@@ -338,12 +313,9 @@ class _PowerLawFits:
         return self._improve(best)
 
     def _project(self, alpha: Array, beta: float | None) -> _Fit | None:
-        """Return the fit with one β and without deviations from a start with ascending exponents;
-        None if none of its terms may be the first one.
-
-        Variables are the first exponent, the distances of the others, and β if it is estimated;
-        the shares of the shear modulus follow from linear least squares.
-        """
+        """Return the fit with one β and without deviations; None if no term may be the first."""
+        # Variables are the first exponent, the distances of the others, and β if it is estimated;
+        # the shares of the shear modulus follow from linear least squares.
         n = len(alpha)
         count = int(beta is not None and self.beta_is_free[:n].any())
 
@@ -367,9 +339,7 @@ class _PowerLawFits:
         return _Fit(2 * float(result.cost), alpha, shares, betas, True, 2 * n + count)
 
     def _improve(self, fit: _Fit, has_one_beta: bool = True) -> _Fit | None:
-        """Return the fit with the deviations of the measurements, and with a β of each term unless
-        `has_one_beta`, from a fit without; None if none of its terms may be the first one.
-        """
+        """Return the fit with deviations and, unless `has_one_beta`, a β of each term."""
         n = len(fit.alpha)
         size, beta = fit.shear_pa, fit.beta
         is_free = self.beta_is_free[:n]
@@ -414,7 +384,6 @@ class _PowerLawFits:
         return fits[-1]
 
     def start(self) -> PowerLawStart | None:
-        """Return the start; None if the law cannot be fitted."""
         names = [f"{key}_{p}{unit}" for p in self._numbers() for key, unit in _KEYS]
         has_guess = any(
             item.guess is not None and not item.is_fixed
@@ -435,9 +404,7 @@ class _PowerLawFits:
 
     @staticmethod
     def _is_worth_a_pair(fit: _Fit, fits: Sequence[_Fit]) -> bool:
-        """Return whether a fit with two exponents that run together is clearly better than those
-        with fewer terms.
-        """
+        """Whether two exponents that run together are clearly better than fewer terms."""
         fewer = [each.loss for each in fits if len(each.alpha) < len(fit.alpha)]
         return fit.loss < (1 - LEAST_SHARE_TOGETHER) * min(fewer, default=np.inf)
 
@@ -490,7 +457,6 @@ class _PowerLawFits:
     def _notes(
         self, terms: int, near: Sequence[int], tied: Mapping[str, Tied], fixed: Mapping[str, float]
     ) -> list[str]:
-        """Return what the measurements do not determine, for people."""
         notes = []
         if terms < self.terms:
             zero = ", ".join(symbol_of(f"mu_{p}_pa") for p in range(terms + 1, self.terms + 1))
@@ -522,27 +488,21 @@ def _has_default_bounds(item: Parameter) -> bool:
 
 
 def _with_both_signs(item: Parameter) -> Parameter:
-    """Return the first exponent with bounds that admit both signs in place of its default bounds;
-    any other parameter itself.
-    """
+    """Return the first exponent with default bounds that admit both signs."""
     if item.name != "alpha_1" or not _has_default_bounds(item):
         return item
     return replace(item, lower=-item.upper)
 
 
 def _widened(item: Parameter) -> Parameter:
-    """Return an exponent with its widest bounds, which admit both signs, in place of its default
-    bounds; any other parameter itself.
-    """
+    """Return an exponent with its widest bounds, which admit both signs."""
     if not item.name.startswith("alpha_") or not _has_default_bounds(item):
         return item
     return with_widest_bounds(item)
 
 
 def _with_factor(item: Parameter, value: float) -> Parameter:
-    """Return a factor with its start as guess; the first one on a linear scale if it is negative or
-    below its default bound, as that of a high power is.
-    """
+    """Return a factor with its guess, linear if that is negative or very small."""
     if item.scale == "log" and _has_default_bounds(item) and value < 10 * item.lower:
         item = replace(item, scale="linear", lower=-item.upper)
     value = float(np.clip(value, item.lower, item.upper))
@@ -553,7 +513,6 @@ def _with_factor(item: Parameter, value: float) -> Parameter:
 def _least_squares(
     residuals: Callable[[Array], Array], start: Array, lower: Array, upper: Array
 ) -> OptimizeResult:
-    """Return the bounded least-squares solution from a start near it."""
     inside = np.clip(start, lower, upper)
     return least_squares(
         residuals, inside, bounds=(lower, upper), x_scale="jac", max_nfev=MOST_EVALUATIONS
@@ -566,7 +525,6 @@ def _started(
     fixed: Mapping[str, float],
     tied: Mapping[str, Tied],
 ) -> Parameter:
-    """Return a parameter with its start, fixed, or tied, by what is known of its name."""
     if item.name in tied:
         return Parameter(item.name, 0.0, tied=tied[item.name])
     if item.name in fixed:
@@ -582,9 +540,7 @@ def _started(
 def _free_stretch(
     test: _Test, logs: Array, alpha: Array, shear_pa: Array, beta: Array | None
 ) -> Array:
-    """Return the logarithm (T,) of the free stretch, at which the stress across the free surface
-    vanishes; zeros if there is none.
-    """
+    """Return the logarithm (T,) of the stretch without stress across; else zeros."""
     prescribed = logs.sum(axis=1)
     if not test.free or beta is None:
         return -prescribed / max(1, test.free) * (test.free > 0)
@@ -644,9 +600,7 @@ def _power(logarithm: Array, exponent: Array) -> Array:
 
 
 def _test(experiment: Experiment, is_foam: bool) -> _Test | None:
-    """Return the measurements of a specimen; None without a stress, and for tests of nearly
-    incompressible specimens that determine κ.
-    """
+    """None without a stress, and for nearly incompressible tests that determine κ."""
     deformation = experiment.specimen
     assert deformation is not None
     if not (deformation.free or deformation.test == "simple-shear" or is_foam):

@@ -302,9 +302,7 @@ def typical_constants(parameters: Parameters) -> dict[str, float]:
 
 
 def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
-    """Return the moduli [Pa] that could be simulated: the one with the smallest misfit, followed by
-    the stiffer ones in ascending order; softer ones are left out. Empty if none could be simulated.
-    """
+    """Return the moduli [Pa] that could be simulated: the best, then stiffer ones."""
     if np.isnan(misfit).all():
         return []
     best = int(np.nanargmin(misfit))
@@ -312,9 +310,7 @@ def _ranked_moduli(young_pa: Array, misfit: Array) -> list[float]:
 
 
 def _with_units(parameters: Parameters, young_pa: float) -> Parameters:
-    """Return the parameters with a unit for those linear ones that have none (NaN): a tenth of the
-    Young's modulus `young_pa` [Pa].
-    """
+    """Linear parameters without a unit (NaN) get a tenth of `young_pa` [Pa]."""
     unit = young_pa / 10
     return parameters.map_components(
         lambda item: replace(item, unit=unit) if np.isnan(item.unit) else item
@@ -326,7 +322,6 @@ def _with_wider_modulus(item: Parameter) -> Parameter:
 
 
 def _has_free_modulus(collocation: Collocation) -> bool:
-    """Return whether the problem has an estimated modulus on a logarithmic scale."""
     free = collocation.parameters.free
     return any(is_modulus(item.name) and item.scale == "log" for item in free)
 
@@ -347,10 +342,7 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
 
 def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
-    """Return the root mean square of all residuals on the first rows, in standard deviations.
-
-    Markers of unknown position are associated with the body at the first samples.
-    """
+    """Return the RMS of all residuals on the first rows, in standard deviations."""
     # Cameras are compared by `rough_residuals`, which need no correspondences.
     collocation, p = collocation.place_unknown_markers(p, positions, only_poses=True)
     parts = collocation.iterates_at(p, positions)
@@ -358,13 +350,9 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
 
 
 def _residuals(iterate: ExperimentIterate) -> Array:
-    """Return the residuals (m,) of all measurements of one experiment, in standard deviations;
-    missing values are left out.
-
-    Offsets, clocks and tool parameters of sensors have the values that fit best, because nothing
-    else determines them beforehand and the residuals are nearly linear in them; their m − M priors
-    follow the M measurements.
-    """
+    """Return the residuals (m,) of all measurements, in standard deviations."""
+    # Offsets, clocks and tool parameters have the values that fit best, because nothing else
+    # determines them beforehand; their m − M priors follow the M measurements.
     residuals = []
     slopes = []
     predictions = iterate.linearise_fixed_motion()
@@ -391,9 +379,7 @@ def _residuals(iterate: ExperimentIterate) -> Array:
 
 
 def _compared_samples(transcription: Transcription, share: float) -> int:
-    """Return the number of first samples of an experiment that are compared: a share of them, and
-    at least one sample of each measurement; at most all.
-    """
+    """Return a share of the samples, at least one of each measurement; at most all."""
     t_s = transcription.experiment.t_s
     first_samples = [transcription.experiment.markers.first_visible_sample]
     first_samples += [
@@ -505,16 +491,12 @@ class TrialSimulation:
         return tuple(self._p(young_pa).tolist())
 
     def _p(self, young_pa: float) -> Array:
-        """Return the parameters p (np,) with missing guesses replaced by typical values at a
-        Young's modulus [Pa], and φ zero.
-        """
+        """Return p (np,) with typical values for missing guesses, and φ zero."""
         q = typical_parameters(self.collocation.parameters, young_pa).guess_q
         return np.concatenate([q, np.zeros(self.collocation.nphi)])
 
     def _evaluate(self, p: Array, positions: Sequence[Array]) -> float:
-        """Return the misfit of the first part of the recordings, see `_misfit`; NaN if it is not
-        finite.
-        """
+        """Return the misfit of the first part; NaN if it is not finite."""
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, positions=first)
         return misfit if np.isfinite(misfit) else np.nan
@@ -613,11 +595,7 @@ class ScanState:
         return best == (min(self.misfits) if softest else max(self.misfits))
 
     def _try(self, young_pa: float) -> float:
-        """Simulate at a Young's modulus [Pa], store its misfit and trajectories, and return the
-        misfit; NaN if the simulation fails, and then the last trajectories are kept.
-
-        The step is counted in the display of progress, see `complete_steps`.
-        """
+        """Simulate, and return the misfit; NaN if it fails, with the last trajectories kept."""
         misfit, warm = self.trial.evaluate_at(young_pa, self.last_trajectories)
         self.last_trajectories = warm or self.last_trajectories
         self.misfits[young_pa] = misfit

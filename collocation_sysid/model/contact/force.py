@@ -163,9 +163,7 @@ class Contact(ComplementarityForce):
         return chosen, y[..., chosen]
 
     def _least_gaps(self, states: States, y: Array) -> Array:
-        """Return the gaps (T, i) [m] of points y (12, T, i); for a pressure that is averaged over a
-        step the smaller one of the gaps at its ends.
-        """
+        """Return the gaps (T, i) [m] of y (12, T, i); the smaller one if averaged over a step."""
         half_s = self.step_s / 2
         if not half_s:
             return self.law_of_contact.gaps(y)

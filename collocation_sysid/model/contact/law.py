@@ -283,7 +283,6 @@ class ContactLaw:
         moving = 1 + self.depends_on_velocity
 
         def force(u: ca.SX, data: ca.SX) -> ca.SX:
-            """Return the force on the point; `u` is its position and, if needed, velocity."""
             moving_parts = ca.vertsplit(u, 3)
             frame = ca.vertsplit(data, [0, 9 * moving, data.numel()])
             frame_ends = ca.vertsplit(frame[0], 9)
@@ -313,11 +312,7 @@ class ContactLaw:
         )
 
     def _complementarity_expression(self, u: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the contact forces (12,) on y and the residual b + g − √((b − g)² + 4 r δ²),
-        stacked (13,).
-
-        The residual vanishes where b and the gap g are positive and b g = r δ².
-        """
+        """Return contact forces (12,) on y and b + g − √((b − g)² + 4 r δ²), 0 where b g = r δ²."""
         inputs, b = ca.vertsplit(u, [0, u.numel() - 1, u.numel()])
         gap = self.gap_at(self.to_obstacle_frame(inputs[: 3 * VECTORS_PER_POINT])[0])
         residual = b + gap - ca.sqrt((b - gap) ** 2 + 4 * data[1])
@@ -386,9 +381,7 @@ class ContactLaw:
     def _friction(
         self, u: ca.SX, place: ca.SX, slope: ca.SX, force_n: ca.SX
     ) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Return limit μ N [N], friction force (3,) [N] and tangential velocity (3,) [m/s]; these
-        and the gradient `slope` of the gap are in the axes of the world.
-        """
+        """Return limit μ N [N], friction (3,) [N] and tangential velocity (3,) [m/s] (world)."""
         relative, *ends = ca.vertsplit(u[3 * VECTORS_PER_POINT : 6 * VECTORS_PER_POINT], 3)
         relative -= ca.horzcat(*ends) @ (place / self._frame_size_m)
         normal = slope / ca.norm_2(slope)
@@ -406,7 +399,6 @@ class ContactLaw:
         """
 
         def friction_values(u: ca.SX, data: ca.SX) -> ca.SX:
-            """Return the 6 values of friction, with u = (y, ẏ, c)."""
             place, axes, slope, force_n = self._normal_contact(u, data, pressing=None)
             limit_n, force, velocity = self._friction(u, place, axes @ slope, force_n)
             # Friction is then at least 95 % of its limit.
@@ -420,7 +412,6 @@ class ContactLaw:
 
 
 def _no_data(y: Array) -> Array:
-    """Return an empty array of data for the instances of y."""
     return np.zeros((0, *y.shape[1:]))
 
 

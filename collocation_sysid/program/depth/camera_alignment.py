@@ -226,9 +226,7 @@ def align_camera(
 
 
 def _first_candidates(cloud_m: Array, places: Array, gate_m: float) -> list[AlignedPose]:
-    """Return the poses from which an alignment starts: the stated one and the one that puts the
-    cloud at the middle of the shape, each also rotated in both directions about each axis.
-    """
+    """Return the stated and the centred pose, each also rotated both ways about each axis."""
     rotation_vectors = np.vstack([np.zeros(3), TURNED * np.eye(3), -TURNED * np.eye(3)])
     is_near = KDTree(places).query(cloud_m)[0] < gate_m
     shifts = [np.zeros(3), np.zeros(3)]
@@ -332,9 +330,7 @@ def _match_surface(
     rotations: Rotation,
     translations_m: Array,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return for B camera errors the nearest cloud points of P points of the surface: relative to
-    the camera's pivot and to these points (B, P, 3) [m], and whether the surface faces the camera.
-    """
+    """Return arms from the pivot and distances (B, P, 3) [m] of cloud points, and what is seen."""
     pivot = camera.pivot_m
     turns = rotations.as_matrix()
     moved = translations_m[:, None] + pivot

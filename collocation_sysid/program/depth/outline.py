@@ -169,7 +169,6 @@ def _padded(values: NDArray, count: int) -> NDArray:
 
 
 def _no_edges(corners: int) -> dict[str, NDArray]:
-    """Return the result of `_edges` for no points, with `corners` nodes per face."""
     return {
         "faces": np.zeros(0, dtype=np.int64),
         "weights": np.zeros((0, corners)),
@@ -315,7 +314,6 @@ def _edges(
     empty = no_depth_is_empty(camera_in, image_m, sample=sample, size_m=camera_in.size_m)
 
     def shown_at(pixels: Array) -> NDArray[np.int64]:
-        """Return the classes (…, P) of pixels (…, P, 2) beside the points of the outline."""
         return _classify_pixels(
             image_m, pixels, depth_m=points.depth_m, gate_m=gate_m, is_missing_empty=empty
         )
@@ -412,11 +410,7 @@ def _nearest_ends(
 def _classify_pixels(
     image_m: Array, pixels: Array, depth_m: Array, *, gate_m: float, is_missing_empty: bool
 ) -> NDArray[np.int64]:
-    """Classify pixels of an image beside a body as BODY, UNKNOWN or EMPTY.
-
-    A pixel whose depth differs by at most `gate_m` shows the body, a farther one is empty, a nearer
-    one unknown. Pixels outside the image are unknown.
-    """
+    """Classify pixels: within `gate_m` BODY, farther EMPTY, nearer or outside the image UNKNOWN."""
     column, row = np.moveaxis(np.round(pixels).astype(np.int64), -1, 0)
     inside = (column >= 0) & (column < image_m.shape[1]) & (row >= 0) & (row < image_m.shape[0])
     depths_m = image_m[np.where(inside, row, 0), np.where(inside, column, 0)]
@@ -431,9 +425,7 @@ def _classify_pixels(
 def _nearest_edges(
     nothing: NDArray[np.bool_], pixels: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the edges (P, 2) nearest to pixels (P, 2) that show nothing, half a pixel from the
-    middle of the nearest other pixel, unit vectors to the pixels (P, 2), and whether they exist.
-    """
+    """Return the nearest edges (P, 2), unit vectors to them (P, 2), and whether they exist."""
     if nothing.all():
         return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
     places: Array = np.asarray(
@@ -478,5 +470,4 @@ def _planes(
 
 
 def _concatenated_rays(camera: DepthCamera, pixels: Sequence[Array]) -> list[Array]:
-    """Return points at depth one on the rays of several sets of pixels."""
     return np.split(camera.points_at_unit_depth(np.concatenate(pixels)), len(pixels))

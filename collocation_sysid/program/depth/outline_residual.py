@@ -65,7 +65,6 @@ class OutlineResidual(DepthResidual):
 
     @property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions by numbers of vectors and of data."""
         return self.correspondences.camera.outline_expressions
 
     @cached_property

@@ -133,7 +133,6 @@ class DepthResidual(CorrespondenceResidual):
 
     @property
     def _expressions(self) -> dict[tuple[int, int], ResidualExpression]:
-        """Generated functions by numbers of vectors and of data."""
         return self.correspondences.camera.depth_expressions
 
     @property
@@ -145,10 +144,7 @@ class DepthResidual(CorrespondenceResidual):
 
     @cached_property
     def _neighbour_times(self) -> NDArray[np.int64]:
-        """Indices (S, k) of the observable's times from which each image is computed: the one at
-        its time if all images are at such times and the clock is not estimated, else those around
-        it.
-        """
+        """Indices (S, k) of the observable's times around each image; k = 1 if at its time."""
         nearest = np.abs(self.observable_s - self.t_s[:, None]).argmin(axis=1)
         is_off_grid = (
             np.abs(self.observable_s[nearest] - self.t_s).max(initial=0.0) > TIME_TOLERANCE_S
@@ -300,11 +296,8 @@ class DepthResidual(CorrespondenceResidual):
 
     @cached_property
     def _patch_indices(self) -> NDArray[np.int64]:
-        """Index of the patch (S, E) of each compared point, −1 for others: a cube of the undeformed
-        body. There are at most `PATCHES`.
-
-        Residuals of neighbouring points are correlated; their means over patches nearly are not.
-        """
+        """Index of the patch (S, E) of each compared point, −1 for others; at most `PATCHES`."""
+        # Residuals of neighbouring points are correlated; their means over patches nearly are not.
         pairs = self.correspondences_in_use
         patches = np.full(self.correspondences_in_use.is_compared.shape, -1)
         places = pairs.places_m[pairs.is_compared]
@@ -319,9 +312,8 @@ class DepthResidual(CorrespondenceResidual):
 
     @cached_property
     def _pooling(self) -> tuple[sp.csr_array, NDArray[np.int64]]:
-        """Sparse matrix (S · 3M, S · E) from points to patches, with entries 1/√count, and the
-        counts (S, 3M) of points; the number of patches is rounded up to a multiple of three.
-        """
+        """Matrix (S · 3M, S · E) from points to patches, entries 1/√count, and counts (S, 3M)."""
+        # The number of patches is rounded up to a multiple of three.
         samples, points = self._patch_indices.shape
         patches = GROUP * -(-(int(self._patch_indices.max(initial=0)) + 1) // GROUP)
         sample, point = np.nonzero(self._patch_indices >= 0)
@@ -381,10 +373,7 @@ class DepthResidual(CorrespondenceResidual):
         return SurfaceComparison.from_shapes(self.correspondences, shapes_m, phi)
 
     def _interpolated(self, motion: SampledMotion) -> Array:
-        """Return positions (n, 3n') at the times of the observable, interpolated from those of a
-        motion by a cubic spline, or by lines between fewer than `FEWEST_FOR_SPLINE`; outside its
-        times the end positions.
-        """
+        """Return positions (n, 3n') by a spline, by lines below `FEWEST_FOR_SPLINE` times."""
         t_s, x = motion.t_s, motion.observed.x
         at_s = np.clip(self.observable_s, t_s[0], t_s[-1])
         if len(t_s) >= FEWEST_FOR_SPLINE:

@@ -325,10 +325,7 @@ class SurfaceCorrespondences(Correspondences):
 
 
 def _aligned_parameters(camera: DepthCameraModel, body: Body, shapes_m: Array, phi: Array) -> Array:
-    """Return φ (k,) with the pose of the camera that is aligned with the shape of the first image
-    that has points; φ itself if the pose would differ from the stated one by more than `FARTHEST`
-    prior standard deviations. The arguments are those of `SurfaceCorrespondences.from_alignment`.
-    """
+    """Return φ (k,) with the camera aligned with its first image, unless beyond `FARTHEST`."""
     first = camera.depth.first_sample_with_points
     surface = VisibleSurface.from_body(body, camera.depth)
     turn, shift_m = align_camera(camera, surface, x=shapes_m[first], image=first)
@@ -347,7 +344,6 @@ def _match_image(
     gate_m: float,
     settled: bool,
 ) -> dict[str, NDArray]:
-    """Find the correspondences of one image."""
     depth = camera.depth
     cloud = camera.depth.clouds[sample]
     world = camera.world_points(phi, sample)
@@ -403,9 +399,7 @@ def _match_image(
 def _nearest_facing(
     world: Array, surface: VisibleSurface, x: Array, eye_m: Array | None, gate_m: float
 ) -> tuple[Index, Index, Array]:
-    """Return indices (k,) of the points near a shape, and face (k,) and barycentric coordinates
-    (k, 3) of the nearest points of faces towards the camera.
-    """
+    """Return points (k,) near a shape, their faces (k,) and barycentric coordinates (k, 3)."""
     low = x.min(axis=0) - gate_m
     high = x.max(axis=0) + gate_m
     in_box = np.flatnonzero(((world >= low) & (world <= high)).all(axis=1))

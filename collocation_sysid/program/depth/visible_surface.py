@@ -130,10 +130,7 @@ class VisibleSurface:
     def _evaluate_tangents(
         self, x: Array, faces: Index, barycentric: Array
     ) -> tuple[Array, Array, Array]:
-        """Return shape functions and points as `evaluate` does, and tangents (P, 2, 3): derivatives
-        by the first and the second barycentric coordinate [m], the third changing by the opposite
-        amount.
-        """
+        """Return also tangents (P, 2, 3) [m] by two coordinates, the third changing oppositely."""
         weights, slopes = face_shape_functions(barycentric, self.faces.shape[1])
         corners = x[self.faces[faces]]
         tangents = np.einsum("pak,pai->pki", slopes[:, :, :2] - slopes[:, :, 2:], corners)
@@ -338,12 +335,9 @@ def _turned(vectors: Array) -> Array:
 def _nearest_of_triangles(
     points: Array, triangles: Array, neighbours: Index
 ) -> tuple[Index, Array]:
-    """Return the nearest of some flat triangles to each point, and the nearest point on it.
-
-    The distance from the plane of a triangle, and the distances in this plane from the lines of its
-    sides, are lower bounds: only for triangles that these do not exclude is the distance from the
-    sides themselves computed.
-    """
+    """Return the nearest of some flat triangles to each point, and the nearest point on it."""
+    # Distances from the plane and the lines of the sides are lower bounds: only for triangles that
+    # these do not exclude is the distance from the sides themselves computed.
     first = triangles[:, 0]
     sides = np.roll(triangles, -1, axis=1) - triangles
     normals = np.cross(sides[:, 0], -sides[:, 2])
@@ -386,9 +380,7 @@ def _nearest_of_triangles(
 
 
 def _affine_values(slopes: Array, through: Array, points: Array, rows: Index) -> Array:
-    """Return the values s · (p − o) (P, k) at points p (P, 3), with the slopes s and the origins o
-    `through` (T, 3) each, of those of the T functions that `rows` (P, k) states for each point.
-    """
+    """Return s · (p − o) (P, k) at p (P, 3), with s and o (T, 3) of the functions `rows` (P, k)."""
     values = np.take(-np.einsum("ti,ti->t", slopes, through), rows)
     for slope, coordinate in zip(slopes.T, points.T, strict=True):
         values += np.take(slope, rows) * coordinate[:, None]
@@ -396,5 +388,4 @@ def _affine_values(slopes: Array, through: Array, points: Array, rows: Index) ->
 
 
 def _cross_2d(a: Array, b: Array) -> Array:
-    """Return the cross product of plane vectors (…, 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -255,17 +255,7 @@ class _PointAssembly:
 
     @classmethod
     def from_places(cls, places: Index, weights: Array, size: int) -> _PointAssembly:
-        """Return the assembly of points onto `size` dofs.
-
-        Parameters
-        ----------
-        places : (t, 3v) array
-            See the attributes.
-        weights : (t, v) array
-            See the attributes.
-        size : int
-            Number s of active dofs.
-        """
+        """Return the assembly of points with weights (t, v) at places (t, 3v) onto `size` dofs."""
         pair_places = places[:, :, None] * (size + 1) + places[:, None]
         return cls(
             places.ravel(),

@@ -83,7 +83,6 @@ def _solve_equilibrium(
     start: Array | None,
     solver: NewtonSolver,
 ) -> Array:
-    """Return the equilibrium (3n,) [m] under given forces at the time `at_s`."""
     shape = experiment.rigid_positions([at_s])[0]
     forces = with_start_memory(forces, experiment.loaded_since_s)
     separate = _with_separate_obstacles(forces, shape)
@@ -146,18 +145,13 @@ def static_equations(loaded: Forces, share: float, free: Index) -> tuple[Residua
 
 
 def _describe_state(share: float, force_n: Array) -> str:
-    """Return the load step and the residual of the search for an equilibrium in words."""
     residual_n = float(np.abs(force_n).max(initial=0.0))
     return f"equilibrium at {share:.1%} of the load, residual {residual_n:.1e} N"
 
 
 def _with_separate_obstacles(forces: Forces, shape: Array) -> Array:
-    """Return a copy of a shape (n, 3) [m] with the frame of each obstacle moved out of the body by
-    its deepest penetration.
-
-    Deep inside a curved obstacle, its forces are not stable; the obstacle must approach from
-    outside.
-    """
+    """Return a shape (n, 3) [m] with the frame of each obstacle moved out of the body."""
+    # Deep inside a curved obstacle, its forces are not stable; it must approach from outside.
     places = shape.copy()
     for term in forces.external_terms:
         places = term.separate_bodies(places, shape)

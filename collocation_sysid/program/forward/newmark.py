@@ -52,8 +52,6 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """State of the integrator at one time."""
-
     t_s: float  # time [s]
     # (3n,): positions [m], velocities [m/s] and accelerations without local forces [m/s²].
     x: Array
@@ -150,27 +148,9 @@ def simulate_newmark(
 
 
 class _NewmarkEquations(StepEquations):
-    """Force balance F + 2 C − M a of one Newmark step as a function of the positions at its end,
-    with the local forces C in the middle of the step.
+    """Force balance F + 2 C − M a of a step in its end positions; local forces C in its middle."""
 
-    Attributes
-    ----------
-    mass_kg : (3n,) array
-        Masses of the dofs [kg].
-
-    Parameters
-    ----------
-    state : _State
-        State at the begin of the step.
-    step_s : float
-        Length of the step [s].
-    forces : Forces
-        All forces, with loads of the end of the step and local forces averaged over the step.
-    prescribed_dofs : (p,) array
-        Prescribed dofs.
-    prescribed : (3, p) array
-        Their positions [m], velocities [m/s] and accelerations [m/s²] at the end of the step.
-    """
+    # `prescribed` (3, p): positions [m], velocities [m/s] and accelerations [m/s²] at the end.
 
     def __init__(
         self,
@@ -200,11 +180,7 @@ class _NewmarkEquations(StepEquations):
         self._known_a = -(slope**2) * state.x - 2 * slope * state.v - state.a
 
     def extrapolation(self) -> Array:
-        """Return a guess (3n,) of the positions at the end of the step [m].
-
-        Free dofs move at the acceleration of the start plus that by the mean local forces of the
-        previous step; prescribed dofs are at their prescribed positions.
-        """
+        """Return a guess (3n,) [m]: free dofs keep the acceleration, local forces their mean."""
         state = self._state
         h = self._step_s
         mass = self.mass_kg
@@ -214,13 +190,11 @@ class _NewmarkEquations(StepEquations):
         return self.with_prescribed_positions(guess)
 
     def with_prescribed_positions(self, x: Array) -> Array:
-        """Return x [m] with prescribed dofs at the end."""
         moved = x.copy()
         moved[self._prescribed_dofs] = self._prescribed[0]
         return moved
 
     def kinematics(self, x: Array) -> tuple[Array, Array]:
-        """Return velocities and accelerations at the end x, with local forces."""
         v = self._slope * x + self._known_v
         a = self._slope**2 * x + self._known_a
         # Finite differences of a grasp's motion ring under this rule; its own motion does not.
@@ -233,17 +207,14 @@ class _NewmarkEquations(StepEquations):
         return x[None], self.kinematics(x)[0][None]
 
     def states(self, x: Array) -> tuple[Array, Array]:
-        """Return ξ [m] and ν [m/s] of the step, (1, 3n), if it ends at x."""
         before = self._state.x
         return (before + x)[None] / 2, (x - before)[None] / self._step_s
 
     def residual_without_local(self, x: Array) -> Array:
-        """Return the force balance (3n,) [N] without local forces."""
         v, a = self.kinematics(x)
         return self._forces.total(x, v)[0] - self.mass_kg * a
 
     def linearise_without_local(self, x: Array) -> NewtonLinearisation:
-        """Return it with its derivative by x."""
         v, a = self.kinematics(x)
         slope = self._slope
         at = self._forces.linearise(x, v)
@@ -256,17 +227,7 @@ class _NewmarkEquations(StepEquations):
 
 
 class _Stepper:
-    """Newmark steps of one experiment.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment.
-    theta : (k,) array
-        Constants of the body.
-    options : NewtonOptions or None
-        Options of Newton's method; None means defaults.
-    """
+    """Newmark steps of one experiment."""
 
     def __init__(self, experiment: Experiment, theta: Array, options: NewtonOptions | None) -> None:
         self.experiment = experiment
@@ -277,14 +238,7 @@ class _Stepper:
         self._prescribed_dofs = prescribed_dofs(experiment.grasps)
 
     def initial_state(self) -> _State:
-        """Return the initial state of the experiment, with accelerations in balance with the
-        forces.
-
-        Raises
-        ------
-        SimulationError
-            If no stable equilibrium is found, where the experiment starts in one.
-        """
+        """Return the initial state, with accelerations in balance with the forces."""
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
         x, v = initial_state(self.experiment, self._forces(time_s), solver)
@@ -297,16 +251,7 @@ class _Stepper:
         return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float, loads: _Loads) -> _State:
-        """Return the state at `target_s` [s] under the `loads` of the step to there; where Newton's
-        method fails, in steps that are halved.
-
-        Loads and holding grasps are those of `target_s` throughout.
-
-        Raises
-        ------
-        SimulationError
-            If a step fails after `max_halvings` halvings.
-        """
+        """Return the state at `target_s` [s] under its loads; steps that fail are halved."""
         whole = step = target_s - state.t_s
         smallest = step * 0.5**self.options.max_halvings
         state = self._after_release(state, target_s)
@@ -354,7 +299,6 @@ class _Stepper:
         return total_n
 
     def _solver(self, time_s: float) -> NewtonSolver:
-        """Return the solver with the dofs that are prescribed at a time."""
         return self.solvers.for_prescribed(self.experiment.is_prescribed(time_s)[0])
 
     def _mass(self, time_s: float) -> Array:
@@ -380,7 +324,6 @@ class _Stepper:
         return replace(state, a=acceleration)
 
     def _step(self, solver: NewtonSolver, state: _State, end_s: float, loads: _Loads) -> _State:
-        """Return the state after one step to `end_s` [s]."""
         h = end_s - state.t_s
         forces = insert_previous_states(loads.forces, state.previous_histories, interval_s=h)
         held = np.searchsorted(self._prescribed_dofs, solver.is_prescribed)
@@ -424,13 +367,9 @@ class _Stepper:
         )
 
     def loads(self, end_s: Array, load_s: Array, step_s: float) -> _Loads:
-        """Return the loads at the times `load_s` (T,) [s], over which local forces are averaged, and
-        the motion at `end_s` (T,), by central differences over `step_s` [s], of the dofs that are
-        prescribed at `load_s`.
-
-        At the ends of a grasp's time, differences are one-sided and the acceleration is zero if
-        there is no later pose.
-        """
+        """Return the loads at `load_s` (T,) [s]; the motion is that at `end_s` by differences."""
+        # At the ends of a grasp's time, differences are one-sided and the acceleration is zero if
+        # there is no later pose.
         experiment = self.experiment
         motion = np.zeros((3, len(end_s), len(self._prescribed_dofs)))
         for grasp in experiment.grasps:

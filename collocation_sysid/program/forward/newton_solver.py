@@ -61,8 +61,6 @@ Linearise = Callable[[Array], NewtonLinearisation]
 
 
 class _Iterate(NamedTuple):
-    """Iterate of Newton's method."""
-
     x: Array  # (3n,): state [m]
     # Factor with which the step was computed; that of the previous iterate for a last step.
     factor: Factor
@@ -278,7 +276,6 @@ class NewtonSolver:
         return solution
 
     def _solve_step(self, x: Array, equations: StepEquations) -> Array:
-        """Return the solution of `solve_step`."""
         if equations.local.has_forces and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(x, _CondensedIteration(self, equations))
             if done:
@@ -308,7 +305,6 @@ class NewtonSolver:
         raise self._iteration_failure(iterate)
 
     def _iteration_failure(self, iterate: _Iterate) -> NewtonFailure:
-        """Return the failure of a search that has taken the largest number of iterations."""
         return NewtonFailure(
             iterate.x, f"Newton's method took more than {self.options.max_iterations} iterations"
         )
@@ -321,10 +317,7 @@ class NewtonSolver:
         return _Iterate(x, factor, step=self.step(factor, at.residual))
 
     def _with_known_factor(self, x: Array, residual: Residual) -> tuple[Array, bool]:
-        """Return a state nearer to an equilibrium by chord steps with `definite_factor`, and
-        whether it is the equilibrium; x (3n,) [m] itself and false where they do not shrink fast,
-        or without a factor.
-        """
+        """Return x after chord steps with `definite_factor`, and whether it is the equilibrium."""
         factor = self.definite_factor
         if factor is None:
             return x, False
@@ -335,10 +328,7 @@ class NewtonSolver:
         return (x, False) if chords is None else chords
 
     def _static_chords(self, iterate: _Iterate, residual: Residual) -> tuple[Array, bool] | None:
-        """Return the state (3n,) [m] after chord steps from an iterate towards an equilibrium, as
-        long as they shrink by `SLOWEST_CHORD_RATE` each, and whether its expected error is
-        negligible; None if the first one does not, or inverts an element.
-        """
+        """Return x after chord steps, and whether its error is negligible; None if they fail."""
         goal_m = self.size_m * max(
             STATIC_CHORD_SHARE * self.options.tolerance, STATIC_CHORD_ROUNDING
         )
@@ -369,12 +359,7 @@ class NewtonSolver:
         return (x, False) if has_moved else None
 
     def _simplified_newton(self, x: Array, iteration: ChordIteration) -> tuple[Array, bool]:
-        """Iterate with few factorisations (simplified Newton method); the last factor is stored,
-        and x is not modified.
-
-        It ends without a solution when a new factor does not improve the state, or cannot be
-        computed.
-        """
+        """Iterate with few factorisations (simplified Newton method); the last factor is stored."""
         is_own = False
         for _ in range(self.options.max_iterations):
             try:
@@ -410,10 +395,7 @@ class NewtonSolver:
         return (improved, done) if self.has_no_inverted_element(improved) else (x, False)
 
     def _with_prescribed(self, x: Array, goal: Array, linearise: Linearise) -> Array:
-        """Return the state x (3n,) [m] with the prescribed dofs at `goal` (prescribed,), and the
-        free dofs in equilibrium to first order; only the prescribed dofs change if they are there
-        already, up to the tolerance.
-        """
+        """Return x with prescribed dofs at `goal`, and free ones in equilibrium to first order."""
         state = x.copy()
         way = np.zeros_like(x)
         way[self.is_prescribed] = goal - x[self.is_prescribed]
@@ -487,9 +469,7 @@ class NewtonSolver:
         return Retraction(self.body, prescribed.reshape(-1, 3))
 
     def _is_last(self, step: Array, share: float = 1.0) -> bool:
-        """Whether the largest entry of a step (free or 3n,) [m] is at most `share` times the
-        tolerance.
-        """
+        """Whether the largest entry of a step [m] is at most `share` times the tolerance."""
         tolerance = share * self.options.tolerance * self.size_m
         return bool(np.abs(step).max(initial=0.0) <= tolerance)
 
@@ -551,9 +531,6 @@ class NewtonSolver:
         return bool(self.body.volume_ratios(x).min() > 0)
 
     def _require_upright(self, x: Array) -> None:
-        """Raise NewtonFailure if an element is inverted (det F ≤ 0 at a quadrature point) at x
-        (3n,) [m].
-        """
         if not self.has_no_inverted_element(x):
             raise NewtonFailure(x, "an element is inverted before the first iteration")
 
@@ -632,15 +609,7 @@ class _CompleteIteration:
 
 
 class _CondensedIteration:
-    """Steps with the factor of the body without local forces, which are condensed.
-
-    Parameters
-    ----------
-    solver : NewtonSolver
-        Stores the factor and its compliance.
-    equations : StepEquations
-        Equations of the step.
-    """
+    """Steps with the factor of the body without local forces, which are condensed."""
 
     def __init__(self, solver: NewtonSolver, equations: StepEquations) -> None:
         self._solver = solver
@@ -666,7 +635,6 @@ class _CondensedIteration:
             return self._steps.step_from(x)
 
     def _use_compliance(self) -> None:
-        """Prepare steps with the compliance of the solver, if there is one."""
         compliance = self._solver.compliance
         self._steps = (
             None

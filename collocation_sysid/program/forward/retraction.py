@@ -63,9 +63,7 @@ class Retraction:
         self._axes = [known[column.tobytes()] for column in prescribed.T]
 
     def __call__(self, x: Array, increment: Array) -> Array:
-        """Return the positions (3n,) [m] after an increment (3n,) of the positions x (3n,) [m],
-        neither of which is modified; the deformation gradients of x must be regular.
-        """
+        """Return positions (3n,) [m] after an increment; the gradients of x must be regular."""
         moved = (x + increment).reshape(-1, 3)
         right = self._gradient.T @ (self._weights[:, None] * self._target(x, increment))
         right += self._anchor[:, None] * moved
@@ -80,11 +78,7 @@ class Retraction:
         return self._deformation(increment) @ np.linalg.inv(self._deformation(x))
 
     def _target(self, x: Array, increment: Array) -> Array:
-        """Return the new deformation gradients at all quadrature points after an increment (3n,) of
-        positions x (3n,) [m], (3 · points, 3), derivatives along X first.
-
-        The spin of the increment is applied as a finite rotation.
-        """
+        """Return gradients (3 · points, 3) after an increment, whose spin is a finite rotation."""
         deformation = self._deformation(x)
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
         relative = np.nan_to_num(relative).clip(-LONGEST_STEP, LONGEST_STEP)
@@ -111,9 +105,7 @@ def _exponential(strain: Array) -> Array:
 def _axis(
     normal: sp.csc_array, prescribed: NDArray[np.bool_]
 ) -> tuple[Index, Index, SuperLU, sp.csc_array]:
-    """Return free and prescribed nodes of a coordinate, the factor of the normal equations of the
-    free ones, and their coupling to the prescribed ones.
-    """
+    """Return free and prescribed nodes, the factor of the normal equations, and the coupling."""
     free = np.flatnonzero(~prescribed)
     fixed = np.flatnonzero(prescribed)
     rows = normal[free]

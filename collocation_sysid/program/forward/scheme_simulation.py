@@ -179,9 +179,7 @@ def continue_simulation(
 
 
 def _body_failure(dynamics: Dynamics) -> SimulationError | None:
-    """Return the error for constants with which the body cannot be simulated at all, because a node
-    has no mass or there is no stress-free shape; None if there is no such reason.
-    """
+    """Return why the body cannot be simulated at all: a node without mass, or no rest shape."""
     massless = dynamics.body.mass_problem(dynamics.theta)
     if massless is not None:
         return SimulationError(massless, float(dynamics.t_s[0]))
@@ -217,10 +215,7 @@ def extrapolate(x: Array, first_step: Array) -> Array:
 
 
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
-    """Return an extrapolation (3n,) of the next equilibrium from equilibria x (k, 3n): the last
-    increment, scaled by that of the prescribed dofs towards `goal` (prescribed,); the last
-    equilibrium if there is only one.
-    """
+    """Return the last equilibrium plus the last increment, scaled by the prescribed dofs."""
     if len(x) < 2:
         return x[-1]
     before = x[-1, prescribed] - x[-2, prescribed]

@@ -122,9 +122,7 @@ def find_branch_change(experiment: Experiment, dynamics: Dynamics, x: Array) -> 
 def _first_equations(
     experiment: Experiment, dynamics: Dynamics, solver: NewtonSolver, goal_m: Array
 ) -> Equations:
-    """Return the equations between the body without loads, carried by its grasps, and the first
-    sample.
-    """
+    """Return the equations from the body without loads, carried by grasps, to the first sample."""
     time_s = float(dynamics.t_s[0])
     forces = Forces.from_experiment(experiment, time_s, theta=dynamics.theta)
     shape = experiment.rigid_positions([time_s])[0]
@@ -143,8 +141,6 @@ def _first_equations(
 
 
 def _row_equations(row: RowEquations, origin_m: Array, goal_m: Array) -> Equations:
-    """Return the equations between two samples."""
-
     def at(share: float) -> tuple[Residual, Linearise, Array]:
         equations = row.with_load_step(share)
         goal = goal_m if share == 1 else origin_m + share * (goal_m - origin_m)
@@ -154,17 +150,7 @@ def _row_equations(row: RowEquations, origin_m: Array, goal_m: Array) -> Equatio
 
 
 def _follow(solver: NewtonSolver, equations: Equations, x: Array) -> tuple[Array, float, bool]:
-    """Follow the path from an equilibrium x (3n,) [m] as far as it is stable.
-
-    Returns
-    -------
-    (3n,) array
-        Last equilibrium on the path [m].
-    float
-        Its share of the way; 1 at the end.
-    bool
-        Whether the path ends there for certain: because it is complete, or unstable from there on.
-    """
+    """Return the last stable equilibrium (3n,) [m], its share, and whether the path ends there."""
     share = 0.0
     longest = 1.0
     stable = None

@@ -87,29 +87,22 @@ class LiftedCollocation(Collocation):
         )
 
     def _additional_equations(self, parts: Sequence[ExperimentIterate], z: Array) -> list[Array]:
-        """Return the equations of each group of lifted variables."""
         return [each.residuals(parts[each.transcription_index], z) for each in self.lifted]
 
     def _additional_jacobian_entries(self) -> list[tuple[Index, Index]]:
-        """Return the Jacobian's entries of each group of lifted variables."""
         return [each.jacobian_entries() for each in self.lifted]
 
     def _additional_jacobian(
         self, parts: Sequence[ExperimentIterate], z: Array
     ) -> list[tuple[Array, Array]]:
-        """Return equations and derivatives of each group of lifted variables."""
         return [each.jacobian_values(parts[each.transcription_index], z) for each in self.lifted]
 
     def _additional_gradients(self, parts: Sequence[ExperimentIterate]) -> list[Array]:
-        """Return the gradient of the loss by each group of lifted variables."""
         return [each.loss_gradient(parts[each.transcription_index]) for each in self.lifted]
 
     def _additional_weights(
         self, number: int, part: ExperimentIterate, multipliers: Array
     ) -> tuple[Array | float, list[WeightedHistory]]:
-        """Return the weights of the residuals c and of the history variables in the equations of
-        the lifted variables of one experiment.
-        """
         own = [each for each in self.lifted if each.transcription_index == number]
         histories = [
             each.weighted_history(part, multipliers)
@@ -120,7 +113,6 @@ class LiftedCollocation(Collocation):
         return of_rows, histories
 
     def _additional_hessian_entries(self) -> list[tuple[Index, Index]]:
-        """Return the Hessian's entries of each group of lifted variables."""
         return [each.hessian_entries() for each in self.lifted]
 
     def _additional_hessian(
@@ -131,7 +123,6 @@ class LiftedCollocation(Collocation):
         multipliers: Array,
         weights: Sequence[RowWeights],
     ) -> list[Array]:
-        """Return the second derivatives of each group of lifted variables."""
         return [
             each.hessian_values(
                 parts[each.transcription_index],

@@ -147,9 +147,7 @@ class ExpressionPattern:
         return self._assemble(self.expression.evaluate(self._input_values(z), self.data), count)
 
     def _assemble(self, y: Array, count: int) -> Array:
-        """Return the sums (count,) of values y (m, I) over the constraints to which they belong,
-        each value divided by the unit of its row.
-        """
+        """Return sums (count,) of values (m, I) over their constraints, in units of the rows."""
         assembled = np.zeros(count)
         np.add.at(assembled, self.rows.indices, y / self.rows.unit)
         return assembled
@@ -172,9 +170,7 @@ class ExpressionPattern:
 
     @cached_property
     def _hessian_pairs(self) -> tuple[Index, Index, NDArray[np.bool_]]:
-        """Pairs (h,) of inputs with second derivatives, in both orders, and the instances (h, I) at
-        which a pair is in the upper triangle of the Hessian by z.
-        """
+        """Pairs (h,) of inputs in both orders, and instances (h, I) in the upper triangle."""
         i, j = np.nonzero(self.expression.hessian_pattern)
         indices = self.inputs.indices
         return i, j, indices[i] <= indices[j]
@@ -201,7 +197,5 @@ class ExpressionPattern:
 
 
 def _at_evaluations(indices: PatternIndices, evaluations: Index) -> PatternIndices:
-    """Return the indices (k, E, …) at other evaluations, given by their indices (E,); units must be
-    the same at all evaluations.
-    """
+    """Return indices (k, E, …) at other evaluations; units are the same at all of them."""
     return PatternIndices(indices.indices[:, evaluations], indices.unit)

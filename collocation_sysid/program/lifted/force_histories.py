@@ -110,7 +110,6 @@ class LiftedForceHistory(LiftedVariables):
         return self._history_of(iterate), np.concatenate([mu, np.zeros_like(mu[:, :1])], axis=1)
 
     def _history_of(self, iterate: ExperimentIterate) -> ForceHistory:
-        """Return the force history at an iterate."""
         history = iterate.histories[self.history_index]
         assert isinstance(history, ForceHistory)
         return history
@@ -145,9 +144,7 @@ class LiftedForceHistory(LiftedVariables):
                 yield here, x, of_p[k], of_q[k]
 
     def _position_derivatives(self, first: int, derivatives: LawDerivatives) -> Iterator[Array]:
-        """Yield derivatives (a, T, P) by positions at each lag of `_position_lags`, from
-        derivatives (a, …) by position and velocity at N − 1 evaluations from `first` on.
-        """
+        """Yield derivatives (a, T, P) by positions at each lag, from evaluations on `first`."""
         instance, local, _, weight = self._points.nonzero_weights
         by_y = derivatives.y[:, local, :, instance].transpose(1, 2, 0) * weight
         by_v = (
@@ -159,11 +156,7 @@ class LiftedForceHistory(LiftedVariables):
             yield by_y[:, here] * p + (by_v[:, here] * q if isinstance(by_v, np.ndarray) else 0.0)
 
     def _motion_entries(self) -> Iterator[tuple[Index, Index, Index, Array]]:
-        """Iterate over the entries of equations of motion that contain b.
-
-        Yields indices (K,) of the pairs of points, evaluations (T,), rows (T, K) in g, and the
-        weights (T, K) of the force in them.
-        """
+        """Yield point pairs (K,), evaluations (T,), rows (T, K) in g and weights (T, K) of b."""
         dynamics = self.transcription.dynamics
         first_row = self.transcription.dynamics.first_row
         _, _, of_pairs, shares = self._points.nonzero_weights
@@ -190,9 +183,7 @@ class LiftedForceHistory(LiftedVariables):
                 yield pairs, k[:, 0], row, weight / self.transcription.force_n
 
     def _jacobian_blocks(self) -> Iterator[EntryBlock]:
-        """Yield the entries of the equations by b, by x and by the dynamic parameters, then
-        those of the motion by b.
-        """
+        """Yield the entries of the equations by b, x and parameters, then of the motion by b."""
         rows = self.offsets.row + self._indices
         columns = self.offsets.variable + self._indices
         instance = self._points.nonzero_weights[0]
@@ -207,9 +198,7 @@ class LiftedForceHistory(LiftedVariables):
             )
 
     def _hessian_blocks(self) -> Iterator[EntryBlock]:
-        """Yield the Hessian's entries in the columns of b: by b, by x and by the dynamic
-        parameters.
-        """
+        """Yield the Hessian's entries in the columns of b: by b, by x and by parameters."""
         columns = self.offsets.variable + self._indices
         i, j = np.triu_indices(self.shape[0])
         yield EntryBlock([columns[i]], [columns[j]])
@@ -235,9 +224,7 @@ class LiftedForceHistory(LiftedVariables):
         return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])
 
     def _motion_derivatives(self, slopes: LawDerivatives) -> Iterator[Array]:
-        """Yield derivatives of the scaled equations of motion by the scaled b, in the order of
-        `_motion_entries`, from derivatives of the force at all N evaluations.
-        """
+        """Yield derivatives of the scaled motion by scaled b, in the order of `_motion_entries`."""
         instance, local, *_ = self._points.nonzero_weights
         for pairs, k, _, weight in self._motion_entries():
             by_b = slopes.b[local[pairs], :, :, instance[pairs]][:, :, k]

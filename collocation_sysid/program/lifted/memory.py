@@ -148,7 +148,6 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def _stress_entries(self) -> _StressEntries:
-        """Derivatives of the stresses of all branches, branch by branch."""
         entries = self.transcription.body.stresses.jacobian_entries
         index_arrays = []
         for number, branch in enumerate(self.transcription.body.memory.branches):
@@ -161,9 +160,7 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def _motion_entries(self) -> list[_MotionEntries]:
-        """Sets of equations of motion (and of lifted reaction forces) that contain the memory, with
-        the entries of each.
-        """
+        """Equations of motion, and of lifted reactions, that contain the memory, with entries."""
         entries = []
         dofs = self._stress_entries.dofs
         for rows in motion_equations(self.transcription, self.reactions):
@@ -187,9 +184,7 @@ class LiftedMemory(LiftedVariables):
 
     @staticmethod
     def _nonzero_lags(table: Array, first: int, stop: int) -> list[_Lag]:
-        """Return the lags of a stencil table (N, lags) that has a non-zero coefficient of them,
-        each for those of the evaluations `first` … `stop` − 1 that have a position at this lag.
-        """
+        """Return the lags with a non-zero coefficient, for evaluations with a position there."""
         columns = enumerate(table.T)
         return [
             _Lag(lag, max(lag, first), stop=stop, factors=column)
@@ -199,9 +194,7 @@ class LiftedMemory(LiftedVariables):
 
     @cached_property
     def _force_lags(self) -> list[_Lag]:
-        """Lags j of c_{k+j} by the forces at evaluation k, for the evaluations k with a past whose
-        row k + j exists.
-        """
+        """Lags j of c_{k+j} by the forces at evaluations k with a past whose row k + j exists."""
         table = self.transcription.dynamics.tables.w
         count = self.transcription.grid_times
         lags = [
@@ -216,15 +209,11 @@ class LiftedMemory(LiftedVariables):
         return [each for each in lags if each.factors.any()]
 
     def _memory_columns(self, lag: _Lag, variables: Index) -> list[Index | int]:
-        """Return arrays whose sum are the columns (T, K) in z of history variables m_{k−1} at the
-        evaluations k of a lag, which are given by their indices (K,).
-        """
+        """Return arrays whose sum are the columns (T, K) in z of m_{k−1} at a lag."""
         return [self.offsets.variable, (lag.select_evaluations() - 1) * self.shape[1], variables]
 
     def _position_columns(self, lag: _Lag, dofs: Index) -> list[Index | int]:
-        """Return arrays whose sum are the columns (T, K) in z of the positions of dofs (K,) at the
-        times k − lag, for the evaluations k of a lag.
-        """
+        """Return arrays whose sum are the columns (T, K) in z of positions at the times k − lag."""
         return [
             self.transcription.offsets.variable,
             (lag.select_evaluations() - lag.lag) * self.transcription.dof_count,
@@ -232,9 +221,7 @@ class LiftedMemory(LiftedVariables):
         ]
 
     def _jacobian_blocks(self) -> list[EntryBlock]:
-        """Return the entries of r by q, by m_{k−1}, by m_{k−2} and by x, then those of the
-        equations of motion by m.
-        """
+        """Return the entries of r by q, m_{k−1}, m_{k−2} and x, then of the motion by m."""
         own = self._stress_entries.variables
         dofs = self._stress_entries.dofs
         equations, variables = (np.arange(s.start, s.stop) for s in (self.rows, self.columns))
@@ -303,9 +290,7 @@ class LiftedMemory(LiftedVariables):
         return rows, np.concatenate([each.ravel() for each in values])
 
     def _parameter_derivatives(self, history: MemoryHistory, theta_q: Array) -> Array:
-        """Return the derivatives (nq, N − 1, width) of the scaled equations r by q, from the
-        derivatives `theta_q` (k, nq) of the k constants θ by q.
-        """
+        """Return derivatives (nq, N − 1, width) of the scaled r by q, from `theta_q` (k, nq)."""
         memory = history.body.memory
         derivatives = np.empty((theta_q.shape[1], *self.shape))
         d_q, a_q = (
@@ -322,9 +307,7 @@ class LiftedMemory(LiftedVariables):
         return derivatives / self.unit_pa
 
     def _stress_derivatives(self, history: MemoryHistory) -> list[Array]:
-        """Return the derivatives of the scaled equations r by the scaled positions through the
-        stress, one array (T, K) for each of `_stress_lags`, with K as in `_stress_entries`.
-        """
+        """Return derivatives of the scaled r by scaled positions, (T, K) for each stress lag."""
         entries = self._stress_entries
         scale = -self.transcription.length_m / self.unit_pa[entries.variables]
         a = history.fading.a.T
@@ -337,9 +320,7 @@ class LiftedMemory(LiftedVariables):
         return self._scaled_by_lag(self._stress_lags, slopes)
 
     def _force_derivatives(self, history: MemoryHistory, changes: _MotionEntries) -> list[Array]:
-        """Return the derivatives of scaled equations of motion by the scaled m, one array (T, K)
-        for each of `_force_lags`, with K as in `changes`; zero in rows whose dof is prescribed.
-        """
+        """Return derivatives of the scaled motion by m, (T, K) for each lag; 0 if prescribed."""
         positions, own, dofs, _ = (
             each[changes.derivative_indices] for each in self._stress_entries
         )
@@ -412,7 +393,6 @@ class LiftedMemory(LiftedVariables):
 
 
 def _body_history(iterate: ExperimentIterate) -> MemoryHistory:
-    """Return the viscoelastic history of the body at an iterate, which must have one."""
     history = iterate.histories[0]
     assert isinstance(history, MemoryHistory)
     return history

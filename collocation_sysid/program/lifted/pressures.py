@@ -45,7 +45,6 @@ class LiftedPressure(LiftedForceHistory):
         return self._find_force().pressure_unit_m
 
     def _find_force(self) -> ComplementarityForce:
-        """Return the force that has the pressures."""
         term = self.transcription.dynamics.forces.external_terms[self.force_index]
         assert isinstance(term, ComplementarityForce)
         return term

@@ -64,9 +64,7 @@ class LiftedReactions(LiftedVariables):
 
     @cached_property
     def _motion_jacobian(self) -> MotionJacobian:
-        """Structure of ∂c/∂x at the sensed dofs, including forces on dofs while a grasp prescribes
-        them.
-        """
+        """Structure of ∂c/∂x at sensed dofs, including forces while a grasp prescribes them."""
         transcription = self.transcription
         dynamics = self.transcription.dynamics
         untaken = replace(
@@ -87,9 +85,7 @@ class LiftedReactions(LiftedVariables):
         return self._scaled(iterate.reactions.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
-        """Return forces (N, …) [N] as scaled values, without the rows before the first
-        equation of motion.
-        """
+        """Return scaled forces (N, …) without rows before the first equation of motion."""
         return newtons[self.transcription.dynamics.first_row :].ravel() / self.transcription.force_n
 
     def residuals(self, iterate: ExperimentIterate, z: Array) -> Array:

@@ -58,18 +58,15 @@ class LiftedResultant(LiftedVariables):
 
     @cached_property
     def _unit(self) -> Array:
-        """Unit (6,) of W and Y [N, N m], for which the mean loss has a curvature of about one; that
-        of reaction forces for components that are not measured.
-        """
+        """Unit (6,) of W and Y [N, N m], for which the mean loss has a curvature of about one."""
+        # That of reaction forces for components that are not measured.
         count = max(1, int(self.residual.is_compared.sum()))
         sigmas = self.residual.observable_sigmas
         return np.where(np.isfinite(sigmas), np.sqrt(count) * sigmas, self._compute_reaction_unit())
 
     @cached_property
     def _row_unit(self) -> Array:
-        """Unit (6,) of the equations [N, N m], between `_unit` and that of R for good
-        conditioning.
-        """
+        """Unit (6,) of the equations, between `_unit` and that of R for good conditioning."""
         return self._compute_reaction_unit() ** 0.75 * self._unit**0.25
 
     def _compute_reaction_unit(self) -> Array:
@@ -190,9 +187,7 @@ class LiftedResultant(LiftedVariables):
 
     @cached_property
     def _loss_entries(self) -> tuple[Index, Index]:
-        """Rows and columns among (Y, φ) of the Hessian of the loss by (scaled Y, φ), upper
-        triangle, sorted by column.
-        """
+        """Upper triangle among (Y, φ) of the Hessian of the loss by (scaled Y, φ), by column."""
         return self.residual.hessian_structure(self._unit_derivatives)
 
     def hessian_entries(self) -> tuple[Index, Index]:

@@ -180,9 +180,7 @@ class _ColumnBlock:
 
     @classmethod
     def from_blocks(cls, columns: int, blocks: Sequence[BandBlock], top: int) -> _ColumnBlock:
-        """Return the structure of a column block of `columns` columns: `top` dense rows, then the
-        blocks.
-        """
+        """Return the structure of a column block: `top` dense rows, then the blocks."""
         top_rows = np.tile(np.arange(top), columns)
         top_columns = np.repeat(np.arange(columns), top)
         rows = np.concatenate([top_rows, *(b.rows for b in blocks)])
@@ -207,32 +205,19 @@ class _ColumnBlock:
         )
 
     def row_indices(self, row_starts: Index, t: int) -> Index:
-        """Return the row in the matrix of every entry (entries,), in sorted order, for column block
-        t.
-        """
+        """Return the row in the matrix of every entry (entries,) of column block t."""
         base = np.array([row_starts[t + b.offset] for b in self.blocks] + [0])
         result = np.empty(self.entry_count, dtype=np.int64)
         result[self.sorted_positions] = base[self.block_indices] + self.rows
         return result
 
     def positions_of_block(self, block: int) -> Index:
-        """Return the position in the column block of each entry of block number `block` (an
-        index).
-        """
+        """Return the position in the column block of each entry of block number `block`."""
         first = self.top * self.columns + sum(len(b.rows) for b in self.blocks[:block])
         return self.sorted_positions[first : first + len(self.blocks[block].rows)]
 
     def locate(self, offset: int, rows: Index, columns: Index) -> Index:
-        """Return the positions in the column block of entries (rows, columns) of the block at a row
-        offset.
-
-        Raises
-        ------
-        IndexError
-            For entries that the block does not have.
-        ValueError
-            If there is no block at this offset.
-        """
+        """Return the positions of entries of the block at a row offset."""
         k = [b.offset for b in self.blocks].index(offset)
         block = self.blocks[k]
         width = int(max(block.rows.max(), np.max(rows, initial=0))) + 1

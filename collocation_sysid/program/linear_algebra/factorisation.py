@@ -97,9 +97,7 @@ class _BandFactor:
     positive_definite: bool = field(default=True, init=False)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, in the
-        precision of the factor; `transposed` has no effect on a symmetric matrix.
-        """
+        """`transposed` has no effect on a symmetric matrix."""
         permuted = right[self.order].astype(self.band.dtype)
         if right.ndim > 1 and right.shape[1] >= MANY_COLUMNS:
             solved = solve_band_in_blocks(self.band, permuted)
@@ -124,9 +122,6 @@ class _SkylineFactor:
     positive_definite: bool = field(default=True, init=False)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
-        transposed matrix if `transposed`.
-        """
         first = self.sides[-transposed]
         second = self.sides[transposed - 1]
         rows = np.atleast_2d(right.take(self.order, axis=0).T)
@@ -136,9 +131,7 @@ class _SkylineFactor:
 
 @dataclass(frozen=True, eq=False)
 class _RefinedFactor:
-    """Iterative refinement of the solutions of an approximate factor: that of the symmetric part,
-    or of rounded numbers, or both.
-    """
+    """Iterative refinement with a factor of the symmetric part, or of rounded numbers."""
 
     approximate: Factor  # factor of a matrix near `matrix`; symmetric
     matrix: sp.csr_array  # (k, k) sparse: the matrix
@@ -156,10 +149,7 @@ class _RefinedFactor:
     divergence_flags: list[bool] = field(default_factory=list)
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
-        transposed matrix if `transposed`. If the corrections do not shrink, the better factor is
-        computed, also for later calls.
-        """
+        """If the corrections do not shrink, the better factor is computed, also for later calls."""
         if self.divergence_flags:
             return self.factorise_complete().solve(right, transposed)
         matrix = self.matrix.T if transposed else self.matrix
@@ -184,9 +174,7 @@ class _RefinedFactor:
 
 
 class _OrderedColumns(NamedTuple):
-    """Structure of both triangles of a matrix in compressed columns, in the order in which SuperLU
-    fills in little.
-    """
+    """Both triangles in compressed columns, in the order in which SuperLU fills in little."""
 
     order: Index  # (k,): free dof of each row and column
     rank: Index  # (k,): row and column of each free dof
@@ -208,9 +196,6 @@ class _SparseFactor:
     positive_definite: bool  # see `Factor.positive_definite`
 
     def solve(self, right: Array, transposed: bool = False) -> Array:
-        """Return the solution for right-hand sides (k,) or (k, m) on the free dofs, of the
-        transposed matrix if `transposed`.
-        """
         ordered = right.take(self.order, axis=0)
         solved = self.lu.solve(ordered, "T" if transposed else "N")
         return solved.take(self.rank, axis=0)
@@ -307,7 +292,6 @@ class Factoriser:
         return wide and load_mkl() is not None
 
     def _estimate_band_work(self) -> int:
-        """Return the operations of a banded factorisation, up to a factor."""
         return self.size * self.half_bandwidth**2
 
     def estimate_factor_size(self) -> int:
@@ -346,7 +330,6 @@ class Factoriser:
         return make_skyline(self.size, *self._ranks, self._free_entries)
 
     def _estimate_sparse_work(self) -> float:
-        """Return the operations of a factorisation by SuperLU, up to a factor."""
         return float(np.sum(self._ordered_columns.counts.astype(float) ** 2))
 
     def factorise(
@@ -456,11 +439,8 @@ class Factoriser:
         return self._factorise_definite(values, is_single=True)
 
     def _factorise_definite(self, values: Array, is_single: bool = False) -> Factor | None:
-        """Return the factor of a symmetric matrix (entries of the lower triangle), or None if it is
-        not positive definite, or the skyline is used, which `_factorise_in_skyline` has tried
-        already. With `is_single`, values, factor and solutions are rounded to single precision,
-        except by SuperLU.
-        """
+        """None if not positive definite, or if `_factorise_in_skyline` has tried already."""
+        # With `is_single`, values, factor and solutions are rounded, except by SuperLU.
         if self.is_supernodal:
             pool = self._pools[is_single]
             try:
@@ -484,17 +464,12 @@ class Factoriser:
         return _BandFactor(band, self._order) if cholesky_in_place(band) else None
 
     def _pardiso(self, is_single: bool) -> Pardiso:
-        """Return a new PARDISO solver for the pattern, of single or double precision."""
         row_starts, columns, _ = self._upper
         return Pardiso(row_starts, columns, is_single=is_single)
 
     @cached_property
     def _supernodal_size(self) -> int:
-        """Number of floating-point numbers in a supernodal factor.
-
-        If the pool of single precision, which sweeps use, is empty, the matrix is analysed, and the
-        solver is added to the pool.
-        """
+        """Numbers in a supernodal factor; its solver joins the pool that sweeps use."""
         pool = self._pools[True]
         if not pool:
             pool.append(self._pardiso(is_single=True))
@@ -502,9 +477,7 @@ class Factoriser:
 
     @cached_property
     def _rows(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Index, Array]:
-        """Both triangles of the matrix on the free dofs, row by row: as `_upper`, and the sign of
-        the value of each entry of a skew matrix, relative to that of the lower triangle.
-        """
+        """Both triangles row by row, as `_upper`, and the sign of each entry of a skew matrix."""
         order = np.lexsort((self._full_columns, self._full_rows))
         starts = np.searchsorted(self._full_rows[order], np.arange(self.size + 1))
         # SciPy would convert longer integers with every matrix.
@@ -523,10 +496,7 @@ class Factoriser:
 
     @cached_property
     def _upper(self) -> tuple[Index, Index, Index]:
-        """Upper triangle of the matrix on the free dofs, row by row: index of the first entry of
-        each row, then the number of entries; column of each entry; and position of its value among
-        those of the lower triangle.
-        """
+        """Row starts and lengths, columns, and places of the values among the lower triangle."""
         here = self._full_rows <= self._full_columns
         rows = self._full_rows[here]
         columns = self._full_columns[here]
@@ -547,12 +517,7 @@ class Factoriser:
     def _factorise_in_skyline(
         self, values: Array, skew: Array, buffer: FactorMemory | None
     ) -> Factor | None:
-        """Return the factor within the skyline of a matrix with lower triangles `values` and
-        `skew`, or None if there is no skyline, or the matrix is not positive definite or needs row
-        exchanges.
-
-        The factor is written to `buffer`, or to new memory for None.
-        """
+        """None without a skyline, or if the matrix needs row exchanges; written to `buffer`."""
         skyline = self.skyline
         if skyline is None:
             return None
@@ -615,9 +580,7 @@ class Factoriser:
 
     @cached_property
     def _ordered_columns(self) -> _OrderedColumns:
-        """Structure for SuperLU, whose ordering is computed once, because it takes a quarter of the
-        time of a factorisation.
-        """
+        """The ordering is computed once: it takes a quarter of the time of a factorisation."""
         # Entries of a matrix that needs no row exchanges.
         values = np.full(self._entries, -1.0)
         degree = np.bincount(self._full_rows, minlength=self.size)
@@ -646,12 +609,10 @@ class Factoriser:
         )
 
     def _sparse_factor(self, lu: SuperLU, is_definite: bool) -> _SparseFactor:
-        """Return the factor of a factorisation by `_superlu`."""
         columns = self._ordered_columns
         return _SparseFactor(lu, columns.order, columns.rank, positive_definite=is_definite)
 
     def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
-        """Return the factorisation by SuperLU of the matrix in the order of `_ordered_columns`."""
         entries = values[self._full_source]
         if skew.size:
             entries += self._signs * skew[self._full_source]
@@ -678,7 +639,5 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
 
 @lru_cache(maxsize=LARGEST_CACHED_ANALYSIS_COUNT)
 def _cached_analysis(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
-    """Return the analysis of a pattern, of which the last ones are cached; `free` are the bytes of
-    an array of int64.
-    """
+    """The last analyses are cached; `free` are the bytes of an array of int64."""
     return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice=choice)

@@ -214,9 +214,7 @@ class _Columns:
         return self._inner(self.residual, self.residual)
 
     def correct(self, direction: Array) -> None:
-        """Add the multiple of a direction (k, active), made conjugate to earlier ones, that makes
-        the residuals smallest.
-        """
+        """Add the multiple of a direction, made conjugate, that makes the residuals smallest."""
         image = self.product(direction)
         for previous, previous_image, size in self._directions:
             share = self._inner(image, previous_image) / size
@@ -232,7 +230,6 @@ class _Columns:
         self._directions.append((direction, image, size))
 
     def keep(self, is_active: NDArray[np.bool_]) -> None:
-        """Continue with those of the active columns for which `is_active` (active,) is true."""
         if is_active.all():
             return
         self.active = self.active[is_active]
@@ -294,7 +291,6 @@ class ReusedFactor:
         return solution.reshape(right.shape)
 
     def _complete_factor(self) -> Factor:
-        """Return the factor of this matrix in double precision; it is computed once."""
         if self._complete is None:
             self._complete = self.sequence.factoriser.factorise(
                 self.matrix.values, self.matrix.skew
@@ -304,9 +300,7 @@ class ReusedFactor:
     def _solve_iteratively(
         self, right: Array, transposed: bool, guess: Array | None
     ) -> Array | None:
-        """Return the solution (k, m); None if even the factor of this matrix in single precision
-        does not lead to it.
-        """
+        """None if even the factor of this matrix in single precision does not lead to it."""
         sequence = self.sequence
         matrix = sequence.factoriser.complete_matrix(self.matrix.values, self.matrix.skew)
         diagonal = np.asarray(matrix.diagonal(), dtype=float)

@@ -148,7 +148,6 @@ class SparseAssembly:
 def _locate(
     structure: tuple[Index, Index], height: int, codes: Index
 ) -> tuple[Index, NDArray[np.bool_]]:
-    """Find entries in a structure."""
     indptr, indices = structure
     if not len(codes) or codes[0] >= (len(indptr) - 1) * height:
         return np.full(len(codes), len(indices)), np.ones(len(codes), dtype=bool)

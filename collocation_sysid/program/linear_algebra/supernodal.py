@@ -180,9 +180,7 @@ class Pardiso:
 
 
 def _pointer(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
-    """Return a pointer to the data of an array, which must be kept alive by the caller; None for
-    None.
-    """
+    """Return a pointer to the data of an array, which must be kept alive by the caller."""
     return None if array is None else ctypes.c_void_p(array.ctypes.data)
 
 

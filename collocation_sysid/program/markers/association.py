@@ -132,9 +132,7 @@ class MarkerAssociation:
         return self._coordinates(self.centre_places_m)
 
     def _coordinates(self, points_m: Array) -> Array:
-        """Return the coordinates (M, k) of places (M, 3) [m], in prior standard deviations along
-        `axes`; zero for exact places.
-        """
+        """Return coordinates (M, k) in prior standard deviations; zero for exact places."""
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
         return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
 
@@ -180,7 +178,6 @@ class MarkerAssociation:
 
     @cached_property
     def _shape(self) -> LocatedBody:
-        """Geometry of the undeformed body."""
         return LocatedBody(self.body.nodes_m, self.body)
 
     # Following the estimates ------------------------------------------------------------------
@@ -228,13 +225,9 @@ class MarkerAssociation:
         return association, association.centre_coordinates
 
     def _without_alternation(self, points_m: Array) -> MarkerAssociation:
-        """Return the association centred at places (M, 3) [m] such that none alternates between two
-        faces for ever.
-
-        Where a marker stands off an edge, the plane of each face may lead back to the other. A
-        place that has crossed the same edge `LARGEST_CROSSING_COUNT` times stays in its present
-        plane, even outside the surface.
-        """
+        """Return the association at places (M, 3) [m], of which none alternates for ever."""
+        # Where a marker stands off an edge, the plane of each face may lead back to the other. A
+        # place that has crossed the same edge `LARGEST_CROSSING_COUNT` times stays in its plane.
         centred = self.centred_at(points_m)
         if not self.on_surface:
             return centred
@@ -266,10 +259,7 @@ class MarkerAssociation:
         )
 
     def _is_outside(self, point: Array, cell: int) -> bool:
-        """Return whether another element contains a point (3,) of the undeformed body better than
-        the element with index `cell`, by more than `BETTER` in the smallest barycentric coordinate;
-        false for NaN.
-        """
+        """Whether another element contains a point better, by more than `BETTER`; false for NaN."""
         if not np.isfinite(point).all():
             return False
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
@@ -302,9 +292,7 @@ class MarkerAssociation:
 
 
 def _second_derivatives(element, local: Array) -> Array:
-    """Return ∂²N/∂L² (m, npe, 4, 4) by barycentric coordinates L (m, 4) of the shape functions of
-    an element type, whose gradients must be linear in L.
-    """
+    """Return ∂²N/∂L² (m, npe, 4, 4) at L (m, 4), for gradients that are linear in L."""
     at = element.shape_gradients(local)
     steps = [element.shape_gradients(local + unit) - at for unit in np.eye(4)]
     return np.stack(steps, axis=3)

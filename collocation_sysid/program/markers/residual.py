@@ -107,9 +107,7 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _neighbour_count(self) -> int:
-        """Number of samples that a marker is interpolated from; 1 if no clock is estimated, and all
-        frames have the times of their samples.
-        """
+        """1 if no clock is estimated, and all frames have the times of their samples."""
         is_shifted = len(self.nuisance.clock_indices) > 0 or self.markers.offsets_s is not None
         return min(NEIGHBOURS, self.observable.count) if is_shifted else 1
 
@@ -121,9 +119,7 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _first_neighbour(self) -> Index:
-        """Index (T,) of the first of the observable's times from which each sample is interpolated;
-        negative before the start, where the body rests in its first state.
-        """
+        """Index (T,) of the first time for each sample; negative before the start, at rest."""
         first = np.arange(len(self.t_s)) + self.clock_samples - self._neighbour_count // 2
         first = np.minimum(first, self.observable.count - self._neighbour_count)
         return first if self.is_initially_at_rest else np.maximum(first, 0)
@@ -135,9 +131,7 @@ class MarkerResidual(MeasurementResidual):
 
     @cached_property
     def _stencil(self) -> RowStencil:
-        """Stencil of all samples; its data are the position of the frame among its neighbours, in
-        samples, and the frame's time [s].
-        """
+        """Data are the position of the frame among its neighbours, in samples, and its time [s]."""
         count = len(self.markers.names)
         indices = np.arange(len(self.t_s)) - self._first_neighbour
         place = np.array(

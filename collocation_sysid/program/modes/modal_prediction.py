@@ -224,17 +224,13 @@ class ModalResponse:
         )
 
     def _frequencies(self, scale: float) -> Array:
-        """Return the angular frequencies (`STIFFNESSES`, K) [rad/s] of the assumed stiffnesses,
-        ascending, for a mesh scale.
-        """
+        """Return the angular frequencies (`STIFFNESSES`, K) [rad/s] for a mesh scale, ascending."""
         softest = np.sqrt(STANDARD_GRAVITY_M_S2 / (SOFTEST_SAG * scale * self.size_m))
         stiffnesses = softest * np.geomspace(1.0, STIFFEST, STIFFNESSES)
         return np.asarray(np.outer(stiffnesses, self.relative_frequencies), dtype=np.float64)
 
     def _modal_loads(self, declared: DeclaredMotion) -> Array:
-        """Return the modal loads (T, K) of gravity and of the grasp's acceleration, for a declared
-        motion.
-        """
+        """Return the modal loads (T, K) of gravity and of the grasp's acceleration."""
         inverse = declared.rotations.transpose(0, 2, 1)
         step_s = float(declared.t_s[1] - declared.t_s[0])
         lift = declared.gravity_m_s2 - _second_differences(declared.translations_m, step_s)
@@ -258,9 +254,7 @@ def delayed_tracks(predictions: Array, t_s: Array, lag_s: float) -> Array:
 
 
 def _second_differences(x: Array, step_s: float) -> Array:
-    """Return second differences of (T, ...) over the step [1/s²]; the motion is symmetric in time
-    about the first sample, so that its velocity there is zero, and the last value is repeated.
-    """
+    """Return second differences [1/s²]: zero velocity at the first sample, last one repeated."""
     padded = np.concatenate([x[1:2], x, x[-1:]])
     second = (padded[2:] - 2 * padded[1:-1] + padded[:-2]) / step_s**2
     second[-1] = second[-2]

@@ -95,11 +95,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
 
 
 def _dense_modes(stiffness: sp.csc_array, mass: Array, requested: int) -> tuple[Array, Array]:
-    """Return the `requested` lowest eigenvalues (k,) [1/s²], ascending, and eigenvectors (n, k) of
-    K φ = λ M φ by a dense solver; k = n if n is smaller.
-
-    Eigenvectors have φᵀ M φ = 1.
-    """
+    """Return the lowest λ (k,) [1/s²] and φ (n, k), φᵀ M φ = 1, of K φ = λ M φ (dense)."""
     root = np.sqrt(mass)
     scaled = stiffness.toarray() / np.outer(root, root)
     last = min(requested, len(mass)) - 1
@@ -108,15 +104,7 @@ def _dense_modes(stiffness: sp.csc_array, mass: Array, requested: int) -> tuple[
 
 
 class _ShiftedInverse(LinearOperator):
-    """Operator (K − shift · M)⁻¹ of a factorised matrix.
-
-    Parameters
-    ----------
-    factor : Factor
-        Factor of K − shift · M.
-    size : int
-        Number of rows n.
-    """
+    """Operator (K − shift · M)⁻¹ of a factorised matrix."""
 
     def __init__(self, factor: Factor, size: int) -> None:
         super().__init__(np.dtype(float), (size, size))
@@ -129,9 +117,7 @@ class _ShiftedInverse(LinearOperator):
 def _lanczos_modes(
     stiffness: sp.csc_array, mass: Array, factor: Factor, shift_1_s2: float, requested: int
 ) -> tuple[Array, Array]:
-    """Return the `requested` eigenvalues [1/s²] and eigenvectors (n, k) of K φ = λ M φ nearest to a
-    shift, by shift-invert Lanczos iterations, ascending; eigenvectors have φᵀ M φ = 1.
-    """
+    """Return the λ [1/s²] nearest to a shift and φ (n, k), φᵀ M φ = 1, by Lanczos iterations."""
     squares, vectors = eigsh(
         stiffness,
         requested,

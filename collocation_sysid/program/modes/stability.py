@@ -61,9 +61,7 @@ def find_instabilities(collocation: Collocation, z: Array) -> tuple[Instability,
 
 
 def _instability(iterate: ExperimentIterate) -> Instability | None:
-    """Return the instability of one experiment's motion, or None if all examined states (up to
-    `STATES` samples) are stable.
-    """
+    """None if all examined states, up to `STATES` samples, are stable."""
     experiment = iterate.transcription.experiment
     last = len(experiment.t_s) - 1
     samples = np.unique(np.linspace(0, last, STATES).round().astype(int))
@@ -140,9 +138,7 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, v: Array | None 
 
 
 def _viscous_volume_stiffness(forces: Forces, x: Array, v: Array) -> Array:
-    """Return the lower triangle [N/m] that the viscous mean stresses of the elements at positions
-    [m] and velocities [m/s] (3n,) add to K.
-    """
+    """Return the lower triangle [N/m] that viscous mean stresses of the elements add to K."""
     state = x.reshape(1, -1)
     moving = forces.mean_stresses(state, v.reshape(1, -1))
     still = forces.mean_stresses(state, np.zeros_like(state))
@@ -151,9 +147,7 @@ def _viscous_volume_stiffness(forces: Forces, x: Array, v: Array) -> Array:
 
 
 def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
-    """Return whether a matrix on the free dofs is positive semidefinite up to rounding; true for a
-    matrix with a zero diagonal.
-    """
+    """Whether positive semidefinite up to rounding; true for a zero diagonal."""
     own = pattern.diagonal[free_dofs]
     largest = float((lower[own] / mass).max())
     if largest <= 0:
@@ -164,9 +158,7 @@ def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass
 
 
 def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
-    """Return the largest Re(s) [1/s] of the exponents s of s² + D s + K, for mass-normalised
-    matrices (n, n); for large matrices at least 0.
-    """
+    """Return the largest Re(s) [1/s] of s² + D s + K, mass-normalised; if large at least 0."""
     size = len(stiffness.diagonal())
     if size <= DENSE:
         return float(_exponents(stiffness.toarray(), damping.toarray()).real.max())
@@ -179,12 +171,9 @@ def _fastest_growth(stiffness: sp.csc_array, damping: sp.csc_array) -> float:
 
 
 def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
-    """Return vectors (n, `DIRECTIONS`) with the smallest eigenvalues of a symmetric matrix; if the
-    iteration stops early, those that have converged and the start vector.
-
-    The matrix is inverted with a shift below its smallest eigenvalue: in a nearly incompressible
-    body the largest ones are so large that without it the iteration hardly converges.
-    """
+    """Return vectors (n, `DIRECTIONS`) of the smallest eigenvalues, as far as they converge."""
+    # A shift below the smallest eigenvalue: in a nearly incompressible body the largest ones are so
+    # large that without it the iteration hardly converges.
     start = np.random.default_rng(0).normal(size=len(matrix.diagonal()))
     options = {"sigma": -_definite_shift(matrix), "tol": TOLERANCE, "v0": start}
     try:
@@ -194,9 +183,7 @@ def _lowest_eigenvectors(matrix: sp.csc_array) -> Array:
 
 
 def _definite_shift(matrix: sp.csc_array) -> float:
-    """Return a shift σ > 0 with which the matrix + σ is positive definite, less than ten times the
-    least one, but for rounding errors.
-    """
+    """Return σ > 0 with which matrix + σ is positive definite, below ten times the least."""
     size = len(matrix.diagonal())
     shift = SHIFT * float(abs(matrix).sum(axis=1).max())
     while True:
@@ -246,9 +233,7 @@ class _CayleyTransform(LinearOperator):
 
 
 def _growth_about(stiffness: sp.csc_array, damping: sp.csc_array, sigma: float) -> float:
-    """Return the largest Re(s) of the exponents s with |s| of about `sigma` [1/s] that solve det(s²
-    + D s + K) = 0, for sparse matrices; at least 0.
-    """
+    """Return the largest Re(s) of det(s² + D s + K) = 0 about `sigma` [1/s]; at least 0."""
     turning = _CayleyTransform(stiffness, damping, sigma=sigma)
     try:
         eigenpairs = eigs(

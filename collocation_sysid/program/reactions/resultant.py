@@ -298,9 +298,7 @@ class ReactionResultant:
         )
 
     def _tool_load(self, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the expression of force and torque (6,) of the tool in the sensor's axes
-        [N, N m], from its parameters φ and the data of `tool_inputs`.
-        """
+        """Return force and torque (6,) of the tool in the sensor's axes [N, N m]."""
         axes, turn, turn_rate, shift, shift_rate = ca.vertsplit(data, np.cumsum([0, *TOOL_DATA]))
         axes, turn, turn_rate = (ca.reshape(each, 3, 3).T for each in (axes, turn, turn_rate))
         count = len(self.tool_parameters) - len(self.nuisance.gravity_indices)
@@ -508,16 +506,13 @@ def sensed_dofs(experiment: Experiment) -> Index:
 
 
 def _reactions_of(motion: ObservedMotion) -> ReactionForces:
-    """Return the reaction forces of a motion."""
     if motion.reactions is None:
         raise ValueError("a resultant needs the reaction forces of the motion")
     return motion.reactions
 
 
 def _moment(u: ca.SX, data: ca.SX) -> ca.SX:
-    """Return the expression of force and torque (6,) of one node, from u = (x_g, R_g) and the data
-    of `MOMENT`; components that the grasp does not prescribe have no force.
-    """
+    """Return force and torque (6,) of a node, from u = (x_g, R_g) and the data of `MOMENT`."""
     place, reaction = ca.vertsplit(u, 3)
     axes, point, is_prescribed = ca.vertsplit(data, [0, 9, 12, 15])
     axes = ca.reshape(axes, 3, 3)
@@ -542,9 +537,7 @@ def _by_dof(by_node: Array) -> Array:
 
 
 def _low_pass_step(before: ca.SX, now: ca.SX, last: ca.SX, lag: ca.SX, data: ca.SX) -> ca.SX:
-    """Return Y after one step of Y' = (W − Y) / T, with W linear between grid times and Y = W at
-    the first. The difference W − Y relaxes with the time constant T.
-    """
+    """Return Y after one step of Y' = (W − Y) / T, with W linear between grid times."""
     began = data[0]
     e, c = relaxation_coefficients(lag * data[1])
     difference = e * (last - before) + c * (now - last)

@@ -122,7 +122,6 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
 
 
 def _camera_of_topic(address: TopicAddress) -> Calibration:
-    """Return the camera of the first message of a topic."""
     with open_log(address.log, address.episode) as log:
         message = log.first(address.topic)
     if not is_camera_model(message):
@@ -172,7 +171,6 @@ def _cameras_of(content: Mapping[str, Any]) -> list[Calibration]:
 
 
 def _archive(file: Path) -> Mapping[str, Any]:
-    """Return the arrays of an archive of NumPy as lists."""
     try:
         return {name: array.tolist() for name, array in load_arrays(file).items()}
     except InputError:
@@ -184,7 +182,6 @@ def _archive(file: Path) -> Mapping[str, Any]:
 
 
 def _parsed(text: str) -> Mapping[str, Any]:
-    """Return the table of a TOML, JSON or YAML file."""
     # OpenCV writes a directive and tags that other readers of YAML refuse.
     plain = re.sub(r"^%YAML[: ][^\n]*\n", "", text.lstrip("\ufeff")).replace("!!opencv-matrix", "")
     readers: tuple[Callable[[str], Any], ...] = (
@@ -208,7 +205,6 @@ def _parsed(text: str) -> Mapping[str, Any]:
 
 
 def _opencv_xml(text: str) -> Any:
-    """Return the table of an XML file of OpenCV; None for any other."""
     if not text.lstrip().startswith("<") or "<!" in re.sub(
         r"<!--.*?-->", "", text, flags=re.DOTALL
     ):
@@ -298,7 +294,6 @@ def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _opencv_camera(content: Mapping[str, Any]) -> Calibration:
-    """Return the camera of a file of OpenCV or ROS."""
     matrix_key, matrix = _value(content, MATRIX_KEYS)
     if matrix is None:
         raise InputError(

@@ -275,7 +275,6 @@ def _find_columns(
     mapped: Mapping[str, str],
     column_advice: Callable[[Table], str] | None = None,
 ) -> dict[str, tuple[int, float]]:
-    """Return index and factor to SI of each quantity that the table has, by key."""
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
@@ -297,12 +296,8 @@ def _find_columns(
 def _column_named_by_user(
     grid: Table, quantity: Quantity, name: str, where: str = ""
 ) -> tuple[int, float]:
-    """Return index and factor to SI of the column that the user names for a quantity.
-
-    The unit is in the name of the column or else behind it in `name`, as in "Load (N)"; a quantity
-    that is `unitless` needs none. A number at the end of a name, as in "lambda_2", is no unit; only
-    a 1 is, if there is no other.
-    """
+    """The unit is in the name of the column, or behind it in `name`, as in "Load (N)"."""
+    # A number at the end, as in "lambda_2", is no unit; only a 1 is, if there is no other.
     bare, unit_of_user = name_and_unit(name)
     column = name if name in grid.columns else bare
     if grid.columns.count(column) != 1:
@@ -400,7 +395,6 @@ def _fitting_names(grid: Table, quantity: Quantity) -> Mapping[int, str | None]:
 
 
 def _fitting_columns(grid: Table, quantity: Quantity) -> list[tuple[int, float]]:
-    """Return index and factor to SI of each column whose name and unit fit a quantity."""
     factors = {
         k: si_factor(unit, quantity.dimension)
         for k, unit in _fitting_names(grid, quantity).items()
@@ -463,10 +457,8 @@ def column_statement(names: Mapping[str, str]) -> str:
 
 
 def _name_fits(column: str, quantity: Quantity) -> bool:
-    """Return whether the name of a column, without its unit, is the key of a quantity, or contains
-    one of its words and exactly the quantity's qualifier: "true stress" fits `TRUE_STRESS`, not
-    `STRESS`.
-    """
+    """Return whether a name has the quantity's key, or one of its words and its qualifier."""
+    # "true stress" fits `TRUE_STRESS`, not `STRESS`.
     name, _ = name_and_unit(column)
     words = _words(name)
     called = words & set(quantity.words.split())
@@ -498,9 +490,7 @@ def other_columns_text(grid: Table, quantities: Sequence[Quantity] = ()) -> str:
 
 
 def _other_word(column: str, own: Collection[str] = ()) -> str:
-    """Return the word that makes a column another quantity than any that is read, or "": a word of
-    other qualifiers than those of the quantities that are read, by their keys.
-    """
+    """Return the word that makes a column another quantity than any that is read, or ""."""
     keys = ("other", "difference", "storage", "loss", "modulus", *(("deformed",) if own else ()))
     words = _words(name_and_unit(column)[0])
     others = (words & QUALIFIERS[key] for key in keys if key not in own)
@@ -536,9 +526,7 @@ def names_compression(column: str) -> bool:
 
 
 def _words(name: str) -> set[str]:
-    """Return the words of a name in lower case, its longest sequences of letters, also without the
-    ending of a plural, and of a compound also its last part and a qualifier that is its first.
-    """
+    """Return sequences of letters in lower case, also as singulars and parts of compounds."""
     words = set(re.findall(r"[^\W\d_]+", name.lower()))
     words |= {word[: -len(end)] for word in words for end in ("s", "es") if word.endswith(end)}
     compounds = [*filter(None, map(_COMPOUND.fullmatch, words))]
@@ -550,7 +538,6 @@ def _words(name: str) -> set[str]:
 
 
 def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: bool) -> None:
-    """Check that every column holds a known quantity."""
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
     for column in grid.columns:
         if name_and_unit(column)[0].lower() not in known:
@@ -563,7 +550,6 @@ def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: 
 def _columns_error(
     grid: Table, quantities: Sequence[Quantity], all_of: bool, why: str = "", advice: str = ""
 ) -> InputError:
-    """Return the error for a table without the wanted columns."""
     expected = ", ".join(quantity.column for quantity in quantities)
     needed = [
         f"; a {quantity.key} needs {size} of the undeformed specimen"
@@ -579,7 +565,6 @@ def _columns_error(
 
 
 def _unit_error(grid: Table, column: str, unit: str | None, quantity: Quantity) -> InputError:
-    """Return the error for a column without unit, or with one of another dimension."""
     name = name_and_unit(column)[0] or column
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = (

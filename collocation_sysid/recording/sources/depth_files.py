@@ -67,9 +67,7 @@ class DepthFileContent:
 
 @dataclass(frozen=True, eq=False)
 class _LazyImages(Sequence[Array]):
-    """Images [m] of messages, decoded when they are accessed, as all of them may not fit into
-    memory.
-    """
+    """Images [m] that are decoded when accessed, as all of them may not fit into memory."""
 
     messages: Sequence[Any]
     count_m: float | None  # depth of one count of an integer image; None for a millimetre
@@ -79,7 +77,6 @@ class _LazyImages(Sequence[Array]):
         return len(self.messages)
 
     def __getitem__(self, place: Any) -> Any:
-        """Return an image (rows, columns) [m], decoded now."""
         with located(self.path):
             return _in_metres(decode_image(self.messages[place]), self.count_m)
 
@@ -142,7 +139,6 @@ def read_depth(
 def _read_topic(
     path: Path, address: TopicAddress, count_m: float | None, length_m: float, known: Container[str]
 ) -> DepthFileContent:
-    """Read the messages of a topic in the order of their times, and the camera model beside them."""
     with open_log(address.log, address.episode) as log:
         t_s, messages = log.read(address.topic)
         camera = _camera_of_topic(log, address.topic)
@@ -182,7 +178,6 @@ def _camera_of_topic(log: Log, topic: str) -> tuple[str, Any] | None:
 
 
 def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFileContent:
-    """Read all depth files of a folder, in the order of their names."""
     kinds = (*IMAGES, *CLOUDS)
     files = in_counting_order(each for each in path.iterdir() if each.suffix.lower() in kinds)
     if not files:
@@ -210,9 +205,7 @@ def _read_folder(path: Path, count_m: float | None, length_m: float) -> DepthFil
 
 
 def _in_metres(image: Array, count_m: float | None) -> Array:
-    """Return depths [m] of an image (rows, columns) of integer counts, each `count_m` [m] or a
-    millimetre if None, or of floats in metres; 0 and NaN stay.
-    """
+    """Return depths [m]; integers are counts of `count_m` [m] or millimetres, floats are metres."""
     if image.ndim != 2:
         raise InputError(
             f"the image has the shape {image.shape}; expected (rows, columns): one channel with "
@@ -251,11 +244,7 @@ def _scaled_cloud(points: Array, length_m: float) -> Array:
 
 
 def _read_npz(path: Path) -> DepthFileContent:
-    """Read depth_m, depth_counts or points_m, and the camera model, from a NumPy archive.
-
-    One image or cloud may lack the axis of samples. Counts are multiplied by count_m, by default
-    `USUAL_COUNT_M`.
-    """
+    """One image or cloud may lack the axis of samples; counts are in `USUAL_COUNT_M` by default."""
     arrays = load_arrays(path)
     names = [name for name in ("depth_m", "depth_counts", "points_m") if name in arrays]
     if len(names) != 1:

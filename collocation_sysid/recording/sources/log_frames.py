@@ -155,9 +155,7 @@ def _first_matrix(poses: Mapping[float, tuple[float, ...]]) -> Array:
 def _pose_along(
     path: Iterable[Edge], parent: str, child: str, pose_of: Callable[[Edge], Array]
 ) -> Array:
-    """Return the pose (…, 4, 4) of a frame in another one, from those of the edges of the path
-    between them.
-    """
+    """Return the pose (…, 4, 4) of a frame in another one, along the path between them."""
     above = {edge[1]: edge for edge in path}
 
     def in_root(frame: str) -> Array:

@@ -181,7 +181,6 @@ def require_packages(*modules: str) -> None:
 
 @contextmanager
 def _bag(path: Path) -> Iterator[Log]:
-    """Open a ROS bag through rosbags."""
     require_packages("rosbags")
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -201,9 +200,6 @@ def _bag(path: Path) -> Iterator[Log]:
 
 @contextmanager
 def _mcap(path: Path) -> Iterator[Log]:
-    """Open an MCAP file with messages of ROS 2, protobuf or JSON; an `InputError` if it has no
-    summary.
-    """
     require_packages("mcap", "mcap_ros2", "mcap_protobuf")
     from mcap.reader import make_reader
     from mcap_protobuf.decoder import DecoderFactory as Protobuf
@@ -231,8 +227,6 @@ def _mcap(path: Path) -> Iterator[Log]:
 
 
 class _Json:
-    """Decodes JSON messages of MCAP files."""
-
     def decoder_for(self, message_encoding: str, schema: Any) -> Any:
         """Return the decoder to objects; None for another encoding than "json"."""
         if message_encoding != "json":
@@ -242,12 +236,7 @@ class _Json:
 
 @contextmanager
 def _dataset(path: Path, episode: int | None) -> Iterator[Log]:
-    """Open a LeRobot dataset: its topics are the features, its messages the frames of an episode, as
-    objects with `name` and `position` like joint states.
-
-    Indices, timestamps and features without numbers are no topics. The messages of a topic are
-    refused if no episode is stated and there are several, or the episode does not exist.
-    """
+    """The topics are the features, the messages the frames of an episode, like joint states."""
     require_packages("pyarrow")
     info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
     features = {
@@ -285,10 +274,7 @@ def _dataset(path: Path, episode: int | None) -> Iterator[Log]:
 
 
 def _component_names(feature: Any, name: str) -> list[str]:
-    """Return the names of the numbers of a feature; older datasets nest them in a dictionary.
-
-    Without one name for each number they are `name`, or, of several numbers, `name` with _0, _1, ….
-    """
+    """Return the names of the numbers of a feature; older datasets nest them in a dictionary."""
     names = feature.get("names")
     while isinstance(names, dict):
         names = next(iter(names.values()), None)

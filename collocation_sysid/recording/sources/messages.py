@@ -184,16 +184,13 @@ def first_list(message: Any) -> Any:
 
 
 def _position_of_item(item: Any) -> tuple[float, ...] | None:
-    """Return the position of an item of a list; None if it has none."""
     if _is_vector(item):
         return _vector(item)
     return next((_vector(p) for name in _POINTS if _is_vector(p := nested_field(item, name))), None)
 
 
 def _item_name(item: Any, index: int, *, by_namespace: bool) -> str:
-    """Return the name of an item of a list; its number, `index` + 1, if it has none. With
-    `by_namespace` its namespace and a slash are put before it, if it has one.
-    """
+    """Return the name of an item, after namespace and slash if asked; without one `index` + 1."""
     names = (nested_field(item, name) for name in _NAMES)
     name = str(next((name for name in names if name not in (None, "")), index + 1))
     return (
@@ -211,12 +208,10 @@ def nested_field(message: Any, path: str) -> Any:
 
 
 def _is_vector(value: Any) -> bool:
-    """Return whether a value has the fields x, y and z."""
     return all(hasattr(value, axis) for axis in AXES)
 
 
 def _vector(value: Any) -> tuple[float, ...]:
-    """Return the fields x, y and z as numbers."""
     return tuple(float(getattr(value, axis)) for axis in AXES)
 
 

@@ -74,12 +74,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
 
 
 def _column_headings(above: Sequence[Row], axes: Row) -> list[tuple[str, str, str, str]]:
-    """Return type, name, quantity and axis of every column, from the rows of the header `above` and
-    the row of the axes.
-
-    Older files do not label the rows of the header; the first two are then types and names. The
-    quantities are in the last one. Missing cells are blank.
-    """
+    """Return type, name, quantity and axis of every column."""
+    # Older files do not label the rows of the header; the first two are then types and names.
     width = len(axes.cells)
     padded = [(row.cells + [""] * width)[:width] for row in above]
     labelled = {cells[1]: cells for cells in padded}
@@ -91,9 +87,7 @@ def _column_headings(above: Sequence[Row], axes: Row) -> list[tuple[str, str, st
 def _marker_columns(
     heads: Sequence[tuple[str, str, str, str]], line: int
 ) -> dict[str, tuple[str, tuple[int, int, int]]]:
-    """Return the type of every marker's columns and the indices of its columns of x, y and z, by its
-    name, in the order of the columns; measured columns have priority over fitted ones.
-    """
+    """Return type and columns of x, y, z by marker; measured columns come before fitted ones."""
     by_kind: dict[tuple[str, str], dict[str, int]] = {}
     for column, (kind, name, quantity, axis) in enumerate(heads):
         if not kind.endswith(_MEASURED) or quantity != "Position":

@@ -52,9 +52,7 @@ def read(given: Table, choose: LabelChooser) -> RawTracks:
 
 
 def _without_units(table: Table) -> tuple[Table, str | None, float]:
-    """Return the table with times called t_s and coordinates without units in brackets, the unit of
-    the coordinates, None if there is none, and the factor from the times to seconds.
-    """
+    """Return the table without units, the unit of the coordinates, and the factor to seconds."""
     columns = [*table.columns]
     units: dict[str | None, str] = {}
     places = []
@@ -85,10 +83,7 @@ def _without_units(table: Table) -> tuple[Table, str | None, float]:
 
 
 def _read_wide(table: Table, choose: LabelChooser, to_seconds: float) -> RawTracks:
-    """Read a table with three columns for each marker, in metres unless the user states another
-    unit; `choose` returns the indices of the markers to read from their labels. Errors as of
-    `_wide_labels` and `tracks_of_table`.
-    """
+    """Read a table with three columns for each marker, in metres unless another unit is stated."""
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
@@ -113,11 +108,7 @@ def _read_wide(table: Table, choose: LabelChooser, to_seconds: float) -> RawTrac
 
 
 def _wide_labels(table: Table) -> list[str]:
-    """Return the names of the markers in the file, in the order of their first columns.
-
-    The columns are t_s and, for each marker, <name>_x, <name>_y and <name>_z, in any order and
-    without a unit in their names.
-    """
+    """The columns are t_s and, for each marker, <name>_x, <name>_y and <name>_z, in any order."""
     header = [column for column in table.columns if column not in _IGNORED]
     labels = dict.fromkeys(
         column[:-2] for column in header if len(column) > 2 and column[-2:] in ("_x", "_y", "_z")
@@ -147,11 +138,7 @@ def _first_columns(columns: Sequence[str]) -> str:
 
 
 def _read_long(table: Table, choose: LabelChooser, to_seconds: float) -> RawTracks:
-    """Read a table with one row for each marker and time; `choose` returns the indices of the
-    markers to read from their labels.
-
-    The times of the result are those of all rows, sorted. Only rows of chosen markers are checked.
-    """
+    """Read a table with one row for each marker and time; only chosen markers are checked."""
     axes, unit = _long_columns(table)
     of_row = table.cells[:, table.columns.index("marker")].tolist()
     if "" in of_row:
@@ -180,9 +167,7 @@ def _read_long(table: Table, choose: LabelChooser, to_seconds: float) -> RawTrac
 
 
 def _long_columns(table: Table) -> tuple[list[str], str | None]:
-    """Return the names of the columns of x, y and z, and the unit in these names, such as "mm" of
-    x_mm; None if they name none.
-    """
+    """Return the columns of x, y and z, and the unit in their names, such as "mm" of x_mm."""
     for unit in (None, *METRES_PER_UNIT):
         axes = [f"{axis}_{unit}" if unit else axis for axis in "xyz"]
         if sorted(table.columns) == sorted(["t_s", "marker", *axes]):

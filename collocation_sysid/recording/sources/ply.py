@@ -99,7 +99,6 @@ def _plain_columns(content: bytes) -> Mapping[str, Array] | None:
 
 
 def _refuse_short(expected: int, count: int) -> None:
-    """Raise an `InputError` that a file has `count` points instead of the `expected` ones."""
     raise InputError(
         f"the file has {count} points; expected {expected}, as its header states: it may be "
         "truncated"

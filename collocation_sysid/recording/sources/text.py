@@ -84,7 +84,6 @@ def names_file_in_errors(
 
     @wraps(read)
     def reader(path: Any, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call the reader; its `InputError`s name `path`."""
         with located(path):
             return read(path, *args, **kwargs)
 
@@ -111,11 +110,8 @@ def decode(content: bytes) -> str:
 
 
 def _decoded(content: bytes, encoding: str) -> str | None:
-    """Return the text of bytes in an encoding; None if it is not text in that encoding.
-
-    Text with a NUL character is none. Other encodings than UTF-8, which decode anything, must also
-    have a separator of cells and no control characters; UTF-16 needs a byte order mark.
-    """
+    """Return the text of bytes in an encoding; None if it is not text in that encoding."""
+    # Encodings that decode anything must also have separators and no control characters.
     if encoding == "utf-16" and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
         return None
     try:

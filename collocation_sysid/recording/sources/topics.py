@@ -136,11 +136,7 @@ def _table(columns: Iterable[str], t_s: Array, values: Array) -> Table:
 
 
 def _points_table(log: Log, topics: Sequence[str]) -> Table:
-    """Return one marker table of several topics with one point each, such as PointStamped.
-
-    Times are those of the topic with the most messages; points of the others are interpolated
-    linearly between their own times, and are missing beyond them or in gaps.
-    """
+    """The times are those of the longest topic; the points of others are interpolated."""
     tracks = []
     frames: dict[str, set[str]] = {}
     for topic in topics:
@@ -170,9 +166,7 @@ def _points_table(log: Log, topics: Sequence[str]) -> Table:
 
 
 def _marker_names(topics: Iterable[str]) -> list[str]:
-    """Return a name for the marker of each topic: the topics without the parts that all have in
-    common at their beginning and their end, with slashes between the remaining parts.
-    """
+    """Return the topics without the parts that all have at their beginning and their end."""
     paths = [topic.strip("/").split("/") for topic in topics]
     for _ in range(2):  # from the beginning, then from the end
         levels = [len({*names}) for names in zip(*paths, strict=False)][:-1]
@@ -182,7 +176,6 @@ def _marker_names(topics: Iterable[str]) -> list[str]:
 
 
 def _transforms(log: Log, topic: str) -> Edges:
-    """Return the transforms in a topic, and the fixed ones in its static topic."""
     topics = (topic + STATIC_TOPIC_SUFFIX, topic)
     return read_transforms(log, [name for name in topics if name in log.topics])
 
@@ -190,7 +183,6 @@ def _transforms(log: Log, topic: str) -> Edges:
 def _describe_topic(
     log: Log, path: Path, name: str, marker_frames: Iterable[str], together: Iterable[str]
 ) -> LogTopic:
-    """Return type, count, rate, possible uses and addresses of a topic."""
     kind, count = log.topics[name]
     first = list(islice(log.messages(name), _FIRST))
     span = first[-1][0] - first[0][0] if len(first) > 1 else 0
@@ -225,7 +217,6 @@ def _describe_topic(
 
 
 def _possible_uses(messages: Sequence[Any]) -> str:
-    """Return the possible uses of the messages of a topic as text; "" without any."""
     if use := use_of_camera_message(messages[0]):
         return use
     columns = set[str]().union(*message_rows(messages))
