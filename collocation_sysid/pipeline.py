@@ -152,7 +152,6 @@ class Run(SolvedProblem):
 
         Parameters
         ----------
-        folder : str or Path
         frames : bool
             Whether to write ParaView files of the motion.
         pictures : bool

@@ -19,8 +19,6 @@ def gripper_transforms(
     ----------
     problem : Problem
         Problem; its file has the key.
-    experiment : str
-        Name of the experiment.
     grasps : iterable of int
         Indices of grasps, obstacles after them, counted from 0.
 

@@ -113,8 +113,6 @@ def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
 
     Parameters
     ----------
-    path : Path
-        File.
     what : str
         Kind of file that is expected, for messages.
 

@@ -29,8 +29,6 @@ def explain_validation_error(
 
     Parameters
     ----------
-    error : ValidationError
-        Error of pydantic.
     content : dict
         Content that was validated, without [experiment_defaults] inserted.
     path : Path

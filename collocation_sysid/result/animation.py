@@ -90,8 +90,6 @@ def animate(
 
     Parameters
     ----------
-    run : str or Path
-        A run folder.
     file : str or Path, optional
         A file ending in .mp4, which needs ffmpeg, or .gif; by default <experiment>.gif in the run
         folder. An existing file is replaced at the end.

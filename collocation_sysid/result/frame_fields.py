@@ -25,8 +25,6 @@ def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
 
     Parameters
     ----------
-    run : str or Path
-        The run folder.
     replay : MotionRecord
         Experiment of this run.
     field : str

@@ -89,8 +89,6 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
     ----------
     result : Result
         Content of ``result.json``.
-    folder : Path
-        The run folder.
     solve_command : str
         The command with which it was solved.
     """

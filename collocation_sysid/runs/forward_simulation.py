@@ -143,8 +143,6 @@ def simulate_experiment(
     ----------
     problem : Problem
         Problem with the options of forward simulations.
-    solution : Solution
-        Solution of the problem.
     experiment : Experiment
         Fitted experiment or one for validation.
     report : callable, optional
@@ -323,8 +321,6 @@ def step_error(
 
     Parameters
     ----------
-    solution : Solution
-        Converged solution.
     fit : LinearisedFit
         The measurements linearised at the solution.
     rollouts : mapping of experiment name to ForwardSimulation or str

@@ -53,8 +53,6 @@ def estimate_mesh_error(
 
     Parameters
     ----------
-    solution : Solution
-        Converged solution.
     fit : LinearisedFit
         The measurements linearised at the solution.
     estimates : mapping of str to Estimate

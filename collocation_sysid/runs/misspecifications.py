@@ -27,8 +27,6 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
 
     Parameters
     ----------
-    solution : Solution
-        The fit.
     budget : int, optional
         Largest number of sweeps over the first samples for all refits together; by default five
         times the work of the fit, at most 200, and those of the mirror images of a body that the

@@ -126,8 +126,6 @@ def solve_refined(
     ----------
     problem : Problem
         Problem that was solved; its experiments for validation are left out.
-    solution : WarmStart
-        The solution of the problem.
     estimates : mapping of name to Estimate
         Estimates of that solution, with their statistical intervals.
     levels : int

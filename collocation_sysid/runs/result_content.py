@@ -439,8 +439,6 @@ class Result:
 
         Parameters
         ----------
-        run : str or Path
-            The run folder.
         expected : str
             What is expected, for the message if the folder has no result.
 

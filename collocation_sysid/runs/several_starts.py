@@ -110,7 +110,6 @@ def follow_starts(
         much faster, and the result has no solution: the solver goes on from the best start.
     start : Start
         With the guesses of the scan's best stiffness.
-    scan : Scan
     solve : callable
         ``solve(method, collocation)``, with renewed correspondences.
 

@@ -375,8 +375,6 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
     ----------
     solver : Method
         Method to use, also with workers, see `with_workers`.
-    first : Solution
-        Solution of the first search.
     watch : callable or None
         Called with every iteration of the other searches.
     """

@@ -103,8 +103,6 @@ def collocation_with_all_points(problem: Problem, thinned: Solution) -> Collocat
 
     Parameters
     ----------
-    problem : Problem
-        Given problem.
     thinned : Solution
         Solution of a `ThinnedStart`'s problem.
     """

@@ -444,8 +444,6 @@ def nuisance_concerns(
 
     Parameters
     ----------
-    names : iterable of str
-        Labels.
     deviations : iterable of float
         Estimates φ in standard deviations of their priors.
     low, high : iterables of float
@@ -494,8 +492,6 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
 
     Parameters
     ----------
-    name : str
-        Name of the experiment.
     shift_s : float
         Estimated shift; positive if the markers were measured later than their times state [s].
     prior_s : float
@@ -549,8 +545,6 @@ def validation_concerns(
 
     Parameters
     ----------
-    name : str
-        Name of the experiment.
     misfit : InstrumentMisfit
         Misfit of the prediction: "check" above `PREDICTION`, "doubtful" above `GROSS_PREDICTION`
         times the larger of `level` and the noise; none if χ² is as large by chance (p > `RARE`).
@@ -609,12 +603,8 @@ def prediction_concerns(
 
     Parameters
     ----------
-    name : str
-        Name of the experiment.
     what : str
         Name of the measured quantity.
-    sigma_key : str
-        Key of its σ in the problem.
     sigmas : float
         Root mean square difference over σ, for the message only.
     robust_sigmas : float
@@ -709,8 +699,6 @@ def scheme_concerns(
 
     Parameters
     ----------
-    name : str
-        Name of the experiment.
     damping_ratio : float
         Damping ratio of the mode at the answer.
     added_ratio : float

@@ -225,7 +225,6 @@ class Combination:
 
         Parameters
         ----------
-        names : sequence of k str
         covariance, noise : (k, k) arrays
             Covariance of relative deviations, and its part by noise, which repetitions reduce.
         """
@@ -253,8 +252,6 @@ def find_combinations(
 
     Parameters
     ----------
-    names : sequence of k str
-        Constants.
     values : (k,) array
         Their values.
     covariance : (k, k) array

@@ -204,8 +204,6 @@ def field_estimates(
 
     Parameters
     ----------
-    parameters : Parameters
-        Shared parameters.
     q : (nq,) array
         Estimates in the solver's coordinates.
     uncertainty : Uncertainty, (nq, nq) array or None

@@ -27,8 +27,6 @@ def identifiability_sentences(
 
     Parameters
     ----------
-    uncertainty : Uncertainty
-        Statistical uncertainty.
     combinations : sequence of Combination
         Combinations of parameters that are determined.
 

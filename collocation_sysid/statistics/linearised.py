@@ -273,8 +273,6 @@ def linearise_fit(collocation: Collocation, z: Array) -> LinearisedFit:
 
     Parameters
     ----------
-    collocation : Collocation
-        The program.
     z : (variables,) array
         The optimum, which satisfies the equations of motion.
 

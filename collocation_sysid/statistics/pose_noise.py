@@ -88,8 +88,6 @@ def with_pose_noise(
 
     Parameters
     ----------
-    collocation : Collocation
-        The program.
     z : (variables,) array
         The optimum.
     seed : int

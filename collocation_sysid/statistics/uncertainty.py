@@ -191,10 +191,6 @@ def uncertainty_from_fit(
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The fit at its answer.
-    parameters : Parameters
-        Shared parameters.
     q : (nq,) array
         Estimates in the solver's coordinates.
     error_model : ErrorModel

@@ -163,8 +163,6 @@ class IdentifiedBody:
 
         Parameters
         ----------
-        run : str or Path
-            A run folder.
         experiment : str, optional
             Name of a fitted experiment; the first by default.
         allow_code : bool

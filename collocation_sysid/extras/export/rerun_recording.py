@@ -53,8 +53,6 @@ def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = No
 
     Parameters
     ----------
-    run : str or Path
-        A run folder.
     folder : str or Path
         Written completely or not at all; an earlier recording there is replaced.
     experiment : str, optional

@@ -207,8 +207,6 @@ def equilibria(body: IdentifiedBody, samples: int = 1) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    body : IdentifiedBody
-        Body with its recording.
     samples : int
         Number of samples; more than one for static recordings only.
 

@@ -306,7 +306,7 @@ def _require_region(
 def _law_changes(
     body: Mapping[str, Any], laws: Mapping[str, str], region: str | None
 ) -> dict[str, Any]:
-    """Return the complete list of tables "object.region"; laws of the body remove others."""
+    """Return values by dotted key; the value of "object.region" is the complete list of tables."""
     regions = [dict(each) for each in body.get("region", [])]
     for each in regions:
         if region is None:

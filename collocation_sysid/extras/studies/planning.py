@@ -107,8 +107,6 @@ class Starts:
 
         Parameters
         ----------
-        problem : Problem
-            Problem with its parameters.
         truth : mapping of str to float
             True values by name; parameters that it lacks are distributed around their guess.
         start : int
@@ -201,8 +199,6 @@ def plan_models(
 
     Parameters
     ----------
-    problem : Problem
-        Problem with the recordings.
     method : str, optional
         Name of the method; the file's own by default.
     allow_code : bool

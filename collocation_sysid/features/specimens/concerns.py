@@ -51,8 +51,6 @@ def as_specimen_concerns(
     ----------
     concerns : iterable of Concern
         Concerns from the residuals and the error bars of the fit.
-    experiments : sequence of Experiment
-        Fitted experiments.
     """
     if not experiments or any(each.specimen is None for each in experiments):
         return list(concerns)

@@ -22,13 +22,6 @@ def one_kind_notes(experiments: Sequence[Experiment], parameters: Parameters) ->
     Nothing is yielded if another kind of test is predicted, if another recording is fitted, for
     biaxial tests, or unless at least `FEWEST_CONSTANTS` elastic constants are estimated, of which
     one belongs to the law and is no usual modulus (`MODULI`).
-
-    Parameters
-    ----------
-    experiments : sequence of Experiment
-        All experiments of the problem.
-    parameters : Parameters
-        Shared parameters.
     """
     if any(each.specimen is None for each in experiments):
         return

@@ -36,8 +36,6 @@ def stress_offset_notes(fit: LinearisedFit, experiments: Sequence[Experiment]) -
     ----------
     fit : LinearisedFit
         Fit of specimens, linearised at its answer.
-    experiments : sequence of Experiment
-        Fitted experiments.
     """
     if any(each.specimen is None for each in experiments):
         return []

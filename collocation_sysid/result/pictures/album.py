@@ -203,8 +203,6 @@ def redraw_pictures(
 
     Parameters
     ----------
-    run : str or Path
-        The run folder.
     folder : str or Path
         Folder to write into, made if missing; existing pictures are replaced.
     say : callable, optional

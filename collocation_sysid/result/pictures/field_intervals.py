@@ -53,8 +53,6 @@ def field_picture(replay: MotionRecord, name: str, values: Array) -> Figure:
     ----------
     replay : MotionRecord
         An experiment with this body.
-    name : str
-        Name of the constant.
     values : (E, 4)
         Its values in each element, see `MotionRecord.fields`; not all NaN.
     """

@@ -227,8 +227,6 @@ def draw_scale(axes: Axes, mm_per_m: float, corner_mm: ArrayLike, longest_mm: fl
 
     Parameters
     ----------
-    axes : Axes
-        Axes of a `sheet`.
     mm_per_m : float
         Scale of the view.
     corner_mm : (2,)

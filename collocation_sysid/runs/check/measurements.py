@@ -135,8 +135,6 @@ def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Conce
 
     Parameters
     ----------
-    recording : RecordingCheck
-        Recording to judge.
     body : BodyCheck
         Its body, which gives the scale of distances.
     """

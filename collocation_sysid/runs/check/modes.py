@@ -80,8 +80,6 @@ def check_modes(experiment: Experiment, scheme: Scheme, step_s: float, theta: Ar
 
     Parameters
     ----------
-    experiment : Experiment
-        Experiment that moves.
     scheme : Scheme
         Time scheme of the solve.
     step_s : float

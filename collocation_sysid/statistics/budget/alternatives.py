@@ -130,12 +130,6 @@ def origin_answers(
     ----------
     sources : VarianceSources
         Sensitivities of the fit.
-    lines : mapping of str to BudgetLine
-        Uncertainty budgets.
-    parameters : Parameters
-        Parameters with their coordinates.
-    stated : Assumptions
-        Stated deviations.
     """
     rows = [row for row in ASSUMPTIONS if row.by_origin and vars(stated)[row.name] is None]
     for key, words, own, other in (

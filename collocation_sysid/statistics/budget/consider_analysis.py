@@ -121,8 +121,6 @@ def changes_of_assumptions(
 
     Parameters
     ----------
-    collocation : Collocation
-        The program.
     z : (variables,) array
         Variables that satisfy the equations of motion.
     deviations : mapping of str to float or None
@@ -214,8 +212,6 @@ def changed_residuals(
 
     Parameters
     ----------
-    collocation : Collocation
-        The program.
     z : (variables,) array
         Variables that satisfy the equations of motion.
     assumptions : sequence of (Deviation, float)
@@ -303,8 +299,6 @@ def propagate_columns(
 
     Parameters
     ----------
-    iterate : ExperimentIterate
-        The experiment at the answer.
     solver : Sweep
         Factorised time steps.
     columns : SweepColumns

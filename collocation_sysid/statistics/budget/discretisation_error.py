@@ -195,8 +195,6 @@ class Refinement:
         ----------
         estimates : mapping of str to Estimate
             Estimates before the correction.
-        order : float
-            Order of the scheme.
 
         Notes
         -----
@@ -245,8 +243,6 @@ class _Extrapolation:
         ----------
         x : (levels,) sequence of float
             Values in the coordinate of the estimate, the coarsest first.
-        order : float
-            Theoretical order.
         least : float
             Lowest order that is considered if there are two values.
         """
@@ -290,8 +286,6 @@ def discretisation_error(
         The answer with its statistical interval.
     by_step, by_mesh : sequences of float
         Values with the step, or the edge lengths, halved once, twice and so on; may be empty.
-    step_order : float
-        Order of the scheme.
     linear : bool
         Whether the parameter is its own coordinate.
 
@@ -339,12 +333,8 @@ def discretisation_errors(
 
     Parameters
     ----------
-    estimates : mapping of str to Estimate
-        Answers.
     by_step, by_mesh : sequences of mappings of str to float
         Values by name at each finer level, see `discretisation_error`.
-    step_order : float
-        Order of the scheme.
     linear : container of str
         Names of the parameters that are their own coordinates.
     """
@@ -378,8 +368,6 @@ def with_estimated_mesh(
     ----------
     known : Refinement or None
         Errors of the step; None if they are unknown.
-    estimates : mapping of str to Estimate
-        Answers.
     halved : mapping of str to float
         Values by name with half the edge lengths, to first order.
     least_order : float

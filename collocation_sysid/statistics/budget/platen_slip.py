@@ -40,8 +40,6 @@ def slip_displacements_m(
 
     Parameters
     ----------
-    iterate : ExperimentIterate
-        The experiment at the answer.
     theta : (k,) array
         Constants of the body.
     reactions_n : (N, g) array
@@ -93,8 +91,6 @@ def sticking_change_n(iterate: ExperimentIterate, theta: Array) -> Array | None:
 
     Parameters
     ----------
-    iterate : ExperimentIterate
-        The experiment at the answer.
     theta : (k,) array
         Constants of the body.
 

@@ -152,12 +152,6 @@ class VarianceSources:
 
         Parameters
         ----------
-        fit : LinearisedFit
-            The fit at its answer.
-        assumed : ResidualChanges
-            Changes of its residuals by the assumptions.
-        parameters : Parameters
-            Shared parameters.
         q : (nq,) array
             Estimates in the solver's coordinates.
         uncertainty : Uncertainty
@@ -384,8 +378,6 @@ def rescaled(step: Array, parameters: Parameters, is_proportional: Callable[[str
     ----------
     step : (nq,) array
         Linear changes.
-    parameters : Parameters
-        Shared parameters.
     is_proportional : callable
         Whether the forces are proportional to a constant, by name. Of several the largest K counts.
     """

@@ -189,8 +189,6 @@ def screened_bodies(
 
     Parameters
     ----------
-    solution : Solution
-        The fit.
     experiment : Experiment
         The experiment that is changed.
     is_far : bool

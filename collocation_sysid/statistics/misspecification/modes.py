@@ -65,8 +65,6 @@ def find_misspecifications_by_modes(
 
     Parameters
     ----------
-    experiment : Experiment
-        The recording.
     constants : mapping of str to float
         Constants of the body; only ratios of stiffness within it matter.
     huber : float, optional

@@ -439,8 +439,6 @@ def name_exchange_hypotheses(
 
     Parameters
     ----------
-    experiment : Experiment
-        The recording.
     huber : float, optional
         Threshold of Huber's loss, which tolerates short exchanges; None means a quadratic loss.
     """

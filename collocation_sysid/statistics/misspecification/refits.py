@@ -100,8 +100,6 @@ def motion_misspecifications(
 
     Parameters
     ----------
-    solution : Solution
-        The fit.
     known : sequence of Hypothesis
         Other hypotheses; nothing is fitted again if one of these, or of the natural modes, is
         nearly certain (`CERTAIN`).

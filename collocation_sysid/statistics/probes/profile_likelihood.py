@@ -194,10 +194,6 @@ def profile_of_solution(
 
     Parameters
     ----------
-    solution : Solution
-        Converged solution.
-    fit : LinearisedFit
-        The fit at its answer.
     uncertainty : Uncertainty
         Its error bars, which determine the first step and the threshold.
     name : str

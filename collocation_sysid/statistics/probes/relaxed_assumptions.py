@@ -163,8 +163,6 @@ def probed_changes(
 
     Parameters
     ----------
-    collocation : Collocation
-        The program.
     z : (variables,) array
         The answer.
     deviations : mapping of str to float or None

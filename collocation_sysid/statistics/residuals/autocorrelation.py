@@ -354,11 +354,6 @@ def error_processes(fit: LinearisedFit, information: Information) -> tuple[Error
     The order of the autoregression is at most `MAX_ORDER`, and one per `SAMPLES_PER_ORDER` samples.
     Autocovariances at few and at longer lags are computed in turn, `ROUNDS` times or until they
     change by less than `SETTLED`.
-
-    Parameters
-    ----------
-    information : Information
-        Information of the fit.
     """
     orders = [min(MAX_ORDER, len(block.t_s) // SAMPLES_PER_ORDER) for block in fit.blocks]
     moments = lagged_products(fit, information, lags=[max(1, order) for order in orders])
@@ -468,10 +463,6 @@ def score_covariance(
 
     Parameters
     ----------
-    information : Information
-        Information of the fit.
-    processes : tuple of ErrorProcess
-        Error process of each block.
     shared : int
         Number of shared parameters.
 

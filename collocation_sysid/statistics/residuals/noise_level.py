@@ -97,8 +97,6 @@ class NoiseLevel:
         ----------
         kind : {"given", "estimated", "by-marker"}
             Source of the variance: stated σ, `pooled` or `variances`.
-        information : Information
-            Information of the fit.
         shared : int
             Number of shared parameters.
 
@@ -204,8 +202,6 @@ def project_errors(information: Information, errors: Sequence[Array]) -> tuple[A
 
     Parameters
     ----------
-    information : Information
-        Information of the fit.
     errors : sequence of (K, T, M, 3) arrays
         Samples for each block, zero where nothing is measured.
 

@@ -169,8 +169,6 @@ def compare_recordings(
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The joint fit.
     alone : mapping
         By recording, at least one: its estimates of q less those of the joint fit (nq,), their
         variances, NaN or infinite where it does not determine them, and the variances for
