@@ -5,14 +5,11 @@ swung for half a second. Six markers with 0.1 mm of noise are measured; Young's 
 ratio and the damping time are unknown. Every candidate has the same recording, mesh, guess and
 bounds, one core and a separate process. The answer is reached when all parameters stay within
 1 % of the best answer, the least-squares estimate at sixteen time steps per sample. Times are
-computing times: unlike elapsed times they do not depend on what else the machine does.
+computing times: unlike elapsed times they do not depend on what else the machine does. MuJoCo with
+its extra is required: ``pip install 'mujoco[sysid]'``.
 
     python scripts benchmark_peers
-    python scripts benchmark_peers --only reduced-space mujoco-sysid --out peers.md
-
-MuJoCo is required, because it simulates the recording: ``pip install 'mujoco[sysid]'``, whose extra
-its own candidates need. Other tools are optional; a row of the table names those that are not
-installed.
+    python scripts benchmark_peers --only reduced-space mujoco-sysid
 """
 
 from __future__ import annotations
@@ -25,10 +22,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from importlib.metadata import version
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +36,8 @@ from peer_case import (
     cylinder,
     recording,
 )
-from peer_simulators import MUJOCO_STEP_S, RECORDING_STEP_S, UnstableSimulationError, simulate_flex
-from scipy.optimize import least_squares, minimize
+from peer_simulators import RECORDING_STEP_S, UnstableSimulationError, simulate_flex
+from scipy.optimize import least_squares
 from script_arguments import make_parser
 from studies import markdown
 
@@ -59,17 +53,8 @@ REACHED_SHARE = 0.01
 BEST_STEPS_PER_SAMPLE = 16
 # Residuals of a simulation that fails, in standard deviations of the noise.
 FAILED_RESIDUAL = 1e3
-# Computing time after which a candidate is stopped [s].
-LIMIT_S = 600.0
 # Step of forward differences of simulations that are solved to about 1e-8 [relative].
 DIFFERENCE_STEP = 1e-4
-# Step of MuJoCo's implicit integrator; a simulation takes two thirds of
-# the time of one with explicit steps [s].
-DISCRETE_STEP_S = 5e-4
-
-
-class LimitReachedError(Exception):
-    """The computing time of a candidate is over."""
 
 
 def computing_time_s() -> float:
@@ -98,16 +83,11 @@ class Progress:
         return computing_time_s() - self.began_s
 
     def record(self, values: Mapping[str, float], loss: float) -> None:
-        """Count a simulation, and append an entry if its loss is the smallest so far.
-
-        Raises LimitReachedError when the computing time is over.
-        """
+        """Count a simulation, and append an entry if its loss is the smallest so far."""
         self.simulations += 1
         if loss < self.best_loss:
             self.best_loss = loss
             self.append(values, self.passed_s)
-        if self.passed_s > LIMIT_S:
-            raise LimitReachedError
 
     def append(self, values: Mapping[str, float], time_s: float) -> None:
         """Append the values of the parameters at a time, with the number of simulations so far."""
@@ -125,7 +105,6 @@ class Track:
     counts: list[int]  # simulated motions until the entries; for interior point iterations
     total_s: float  # time until the candidate stops [s]
     simulations: int  # simulated motions until the candidate stops
-    has_ended: bool  # False: the candidate was stopped at the limit of computing time
 
 
 # Candidates ---------------------------------------------------------------------------------------
@@ -208,47 +187,8 @@ def search_with_own_simulation(experiment: cs.Experiment, progress: Progress) ->
     search(simulate, experiment, progress)
 
 
-def descend_with_warp(experiment: cs.Experiment, progress: Progress) -> None:
-    """Minimise the loss by L-BFGS-B, with gradients through a simulation in Warp.
-
-    The loss is scaled so that the first step changes the logarithms of the parameters by
-    `peer_gradient.FIRST_CHANGE`; without a scale, the first step ends at the bounds.
-    """
-    from peer_gradient import FIRST_CHANGE, WarpCylinder
-
-    body = WarpCylinder(np.asarray(experiment.markers.positions_m))
-    start = np.log(list(GUESS.values()))
-    first = body.evaluate(start)
-    progress.record(GUESS, first.loss)
-    scale = FIRST_CHANGE / float(np.linalg.norm(first.gradient))
-
-    def evaluate(x: Array) -> tuple[float, Array]:
-        evaluation = body.evaluate(x)
-        if not np.isfinite(evaluation.loss):
-            progress.record(parameter_values(x), np.inf)
-            loss = FAILED_RESIDUAL**2 * experiment.markers.positions_m.size
-            return scale * loss, np.zeros(len(x))
-        progress.record(parameter_values(x), evaluation.loss)
-        return scale * evaluation.loss, scale * evaluation.gradient
-
-    bounds = [tuple(np.log(limits)) for limits in BOUNDS.values()]
-    minimize(
-        evaluate,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"ftol": 1e-12, "gtol": 1e-12},
-    )
-
-
 def solve_with_mujoco(
-    experiment: cs.Experiment,
-    progress: Progress,
-    *,
-    step_s: float,
-    integrator: str,
-    backend: Literal["scipy", "mujoco"],
+    experiment: cs.Experiment, progress: Progress, *, backend: Literal["scipy", "mujoco"]
 ) -> None:
     """Search by a backend of `mujoco.sysid` with MuJoCo's own simulation."""
     from mujoco import sysid
@@ -256,7 +196,7 @@ def solve_with_mujoco(
     mesh = cylinder()
 
     def simulate(values: dict[str, float]) -> Array:
-        return simulate_flex(mesh, values, step_s=step_s, integrator=integrator)
+        return simulate_flex(mesh, values)
 
     residuals_of_one = counted_residuals(simulate, experiment, progress)
     parameters = sysid.ParameterDict()
@@ -273,66 +213,29 @@ def solve_with_mujoco(
     sysid.optimize(parameters, residuals, optimizer=backend, verbose=False)
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """Tool that identifies the parameters."""
-
-    title: str
-    # Function of the experiment and a `Progress`, in which it records its search.
-    run: Callable[[cs.Experiment, Progress], None]
-    package: str | None = None  # distribution that it needs; None: none
-    module: str | None = None  # module of the distribution, or None where both names are the same
-    is_compiled: bool = False  # True: the first run compiles code, and the second one is measured
-
-    def missing_requirement(self) -> str | None:
-        """Return how to install what is missing, or None."""
-        module = self.module or self.package
-        if module is not None and find_spec(module) is None:
-            return f"`pip install {self.package}`"
-        return None
-
-    def version(self) -> str | None:
-        """Return the name and version of the distribution, or None if not needed."""
-        if self.package is not None:
-            return f"{self.package} {version(self.package)}"
-        return None
-
-
-CANDIDATES = {
-    "reduced-space": Candidate(
-        "this project, reduced space", partial(solve_with, "reduced-space"), is_compiled=True
-    ),
-    "interior-point": Candidate(
+# Titles of the candidates, functions of the experiment and of a `Progress` in which they record their
+# search, and whether the first run compiles code, so that the second one is measured.
+CANDIDATES: dict[str, tuple[str, Callable[[cs.Experiment, Progress], None], bool]] = {
+    "reduced-space": ("this project, reduced space", partial(solve_with, "reduced-space"), True),
+    "interior-point": (
         "this project, interior point (IPOPT)",
         partial(solve_with, "interior-point"),
-        is_compiled=True,
+        True,
     ),
-    "scipy-ours": Candidate(
-        "SciPy `least_squares` with the simulation of this project",
+    "scipy-ours": (
+        "SciPy `least_squares` around the simulation of this project",
         search_with_own_simulation,
-        is_compiled=True,
+        True,
     ),
-    "mujoco-sysid": Candidate(
+    "mujoco-sysid": (
         "`mujoco.sysid`, SciPy's trust region, explicit steps of 0.05 ms",
-        partial(solve_with_mujoco, step_s=MUJOCO_STEP_S, integrator="Euler", backend="scipy"),
-        package="mujoco",
+        partial(solve_with_mujoco, backend="scipy"),
+        False,
     ),
-    "mujoco-sysid-implicit": Candidate(
-        "`mujoco.sysid`, SciPy's trust region, implicit steps of 0.5 ms",
-        partial(solve_with_mujoco, step_s=DISCRETE_STEP_S, integrator="discrete", backend="scipy"),
-        package="mujoco",
-    ),
-    "mujoco-sysid-default": Candidate(
+    "mujoco-sysid-default": (
         "`mujoco.sysid`, its default optimiser, explicit steps of 0.05 ms",
-        partial(solve_with_mujoco, step_s=MUJOCO_STEP_S, integrator="Euler", backend="mujoco"),
-        package="mujoco",
-    ),
-    "warp": Candidate(
-        "L-BFGS-B, gradients through a simulation in Warp",
-        descend_with_warp,
-        package="warp-lang",
-        module="warp",
-        is_compiled=True,
+        partial(solve_with_mujoco, backend="mujoco"),
+        False,
     ),
 }
 # Name of the process that computes the best answer.
@@ -362,23 +265,12 @@ def measure(name: str) -> Track:
     truth_m = simulate_flex(mesh, TRUTH, step_s=RECORDING_STEP_S)
     experiment = recording(mesh, truth_m)
     progress = Progress()
-    has_ended = True
-    try:
-        if name == BEST:
-            solve_with(
-                "reduced-space", experiment, progress, steps_per_sample=BEST_STEPS_PER_SAMPLE
-            )
-        else:
-            CANDIDATES[name].run(experiment, progress)
-    except LimitReachedError:
-        has_ended = False
+    if name == BEST:
+        solve_with("reduced-space", experiment, progress, steps_per_sample=BEST_STEPS_PER_SAMPLE)
+    else:
+        CANDIDATES[name][1](experiment, progress)
     return Track(
-        progress.times_s,
-        progress.values,
-        progress.counts,
-        progress.passed_s,
-        progress.simulations,
-        has_ended,
+        progress.times_s, progress.values, progress.counts, progress.passed_s, progress.simulations
     )
 
 
@@ -398,109 +290,50 @@ def measure_in_own_process(name: str) -> Track:
     return Track(**json.loads(done.stdout.splitlines()[-1]))
 
 
-def row(
-    name: str, track: Track, best: Mapping[str, float], reduced_space_s: float | None
-) -> tuple[str, ...]:
-    """Return a row of the table."""
-    entry = reached_entry(track, best)
-    reached_s = None if entry is None else track.times_s[entry]
-    ratio = reached_s / reduced_space_s if reached_s and reduced_space_s else None
-    last = track.values[-1] if track.values else {}
-    return (
-        CANDIDATES[name].title,
-        "–" if ratio is None else f"{ratio:.3g}",
-        "not reached" if reached_s is None else f"{reached_s:.3g}",
-        "–" if entry is None else str(track.counts[entry]),
-        f"{track.total_s:.3g}" + ("" if track.has_ended else " (limit)"),
-        str(track.simulations),
-        *(f"{100 * (last[each] / best[each] - 1):+.2f} %" if last else "–" for each in best),
-    )
-
-
-def table(
-    tracks: Mapping[str, Track], failures: Mapping[str, str], best: Mapping[str, float]
-) -> str:
-    """Return the results as a Markdown table."""
+def table(tracks: Mapping[str, Track], best: Mapping[str, float]) -> str:
+    """Return the results as a Markdown table; ratios are those to the first row."""
     heads = (
-        "candidate",
-        "time to 1 % over that of this project",
+        "tool",
         "time to 1 %, s",
+        "relative to the first row",
         "simulations to 1 %",
-        "time until it stops, s",
+        "time until the search stops, s",
         "simulations until it stops",
         *best,
     )
-    reduced_space_track = tracks.get("reduced-space")
-    entry = None if reduced_space_track is None else reached_entry(reduced_space_track, best)
-    reduced_space_s = (
-        None if reduced_space_track is None or entry is None else reduced_space_track.times_s[entry]
-    )
-    rows = [row(name, track, best, reduced_space_s) for name, track in tracks.items()]
-    empty = [""] * (len(heads) - 2)
-    rows += [(CANDIDATES[name].title, reason, *empty) for name, reason in failures.items()]
+    rows = []
+    first_s = None
+    for name, track in tracks.items():
+        entry = reached_entry(track, best)
+        reached = ("not reached", "–", "–")
+        if entry is not None:
+            reached_s = track.times_s[entry]
+            first_s = first_s or reached_s
+            reached = f"{reached_s:.3g}", f"{reached_s / first_s:.3g}", str(track.counts[entry])
+        total = f"{track.total_s:.3g}", str(track.simulations)
+        last = track.values[-1] if track.values else {}
+        errors = [f"{100 * (last[each] / best[each] - 1):+.2f} %" if last else "–" for each in best]
+        rows.append((CANDIDATES[name][0], *reached, *total, *errors))
     return markdown(heads, rows)
 
 
-def report(
-    tracks: Mapping[str, Track], failures: Mapping[str, str], best: Mapping[str, float]
-) -> str:
-    """Return the table with the best answer and the versions of the tools."""
-    errors = ", ".join(f"{name} {100 * (best[name] / TRUTH[name] - 1):+.2f} %" for name in best)
-    tool_versions = [CANDIDATES[name].version() for name in tracks]
-    versions = dict.fromkeys(each for each in tool_versions if each is not None)
-    common_versions = (f"{each} {version(each)}" for each in ("scipy", "casadi"))
-    return (
-        f"{table(tracks, failures, best)}\n\n"
-        f"Errors of the best answer: {errors}.\n"
-        f"Versions: {', '.join((*common_versions, *versions))}.\n"
-    )
-
-
-def compare(names: list[str], out: Path | None) -> None:
-    """Run candidates one after the other, and print the table after each."""
-    best = measure_in_own_process(BEST).values[-1]
-    tracks = {}
-    failures = {}
-    for name in names:
-        installation = CANDIDATES[name].missing_requirement()
-        if installation is not None:
-            failures[name] = f"not installed: {installation}"
-            continue
-        try:
-            if CANDIDATES[name].is_compiled:
-                measure_in_own_process(name)
-            tracks[name] = measure_in_own_process(name)
-        except subprocess.CalledProcessError as error:
-            failures[name] = f"failed with exit code {error.returncode}"
-            continue
-        print(table(tracks, failures, best), flush=True)
-    text = report(tracks, failures, best)
-    print(text)
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text, encoding="utf-8")
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; return the exit code, 2 if MuJoCo is missing."""
+def main() -> None:
+    """Run candidates one after the other, and print the table."""
     parser = make_parser(__doc__)
     parser.add_argument("--only", nargs="+", choices=list(CANDIDATES), default=list(CANDIDATES))
-    parser.add_argument("--out", type=Path, help="file for the table; without it, only print")
     parser.add_argument("--candidate", choices=[*CANDIDATES, BEST], help=argparse.SUPPRESS)
-    options: Any = parser.parse_args(arguments)
-    if find_spec("mujoco") is None:
-        print(
-            "benchmark_peers: MuJoCo simulates the recording but is not "
-            "installed; run: pip install mujoco",
-            file=sys.stderr,
-        )
-        return 2
+    options = parser.parse_args()
     if options.candidate:
         print(json.dumps(asdict(measure(options.candidate))))
-        return 0
-    compare(options.only, options.out)
-    return 0
+        return
+    best = measure_in_own_process(BEST).values[-1]
+    tracks = {}
+    for name in options.only:
+        if CANDIDATES[name][2]:
+            measure_in_own_process(name)
+        tracks[name] = measure_in_own_process(name)
+    print(table(tracks, best))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -30,13 +30,9 @@ class UnstableSimulationError(RuntimeError):
 
 
 def simulate_flex(
-    mesh: cs.TetMesh,
-    values: Mapping[str, float],
-    *,
-    step_s: float = MUJOCO_STEP_S,
-    integrator: str = "Euler",
+    mesh: cs.TetMesh, values: Mapping[str, float], *, step_s: float = MUJOCO_STEP_S
 ) -> Array:
-    """Simulate the cylinder by MuJoCo."""
+    """Simulate the cylinder by MuJoCo's explicit integrator."""
     mujoco: Any = import_module("mujoco")
     # Without this, MuJoCo writes its warnings to a file in the current folder.
     mujoco.set_mju_user_warning(lambda _: None)
@@ -49,8 +45,7 @@ def simulate_flex(
     # The iterative solver of large steps warns of its last digits.
     for warning in data.warning:
         warning.number = 0
-    if integrator == "Euler":
-        model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
     model.opt.timestep = step_s
     positions_m = np.empty((SAMPLE_COUNT, len(mesh.points_m), 3))
     steps = round(SAMPLE_S / step_s)
@@ -66,8 +61,7 @@ def simulate_flex(
         mujoco.mj_step(model, data)
         if step % steps == 0 and _has_failed(mujoco, data):
             raise UnstableSimulationError(
-                f"MuJoCo, {integrator}, steps of {step_s:g} s: unstable "
-                f"at {step * step_s:.3g} s with {dict(values)}"
+                f"MuJoCo: unstable at {step * step_s:.3g} s with {dict(values)}"
             )
     return positions_m
 
