@@ -22,8 +22,8 @@ T = TypeVar("T")
 
 
 def optional() -> Any:
-    """Return a dataclass field with the default None that is omitted from JSON if it is None; all
-    other fields are written, None as null.
+    """Return a dataclass field with the default None that is omitted from JSON if it is None, as all
+    fields of a class with ``OMITS_NONE``; all other fields are written, None as null.
     """
     return field(default=None, metadata={"optional": True})
 
@@ -39,7 +39,7 @@ def content(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
         own |= {name: getattr(value, name) for name in getattr(value, "SERIALISED_PROPERTIES", ())}
-        omitted = {f.name for f in fields(value) if _is_optional(f) and own[f.name] is None}
+        omitted = {f.name for f in fields(value) if _is_optional(value, f) and own[f.name] is None}
         return {name: content(each) for name, each in own.items() if name not in omitted}
     if isinstance(value, Mapping):
         return {key: content(each) for key, each in value.items()}
@@ -101,7 +101,7 @@ def read(kind: Any, content: Any) -> Any:
     """
     if is_dataclass(kind):
         hints = _hints(kind)
-        there = (f for f in fields(kind) if not _is_optional(f) or f.name in content)
+        there = (f for f in fields(kind) if not _is_optional(kind, f) or f.name in content)
         return kind(**{f.name: read(hints[f.name], content[f.name]) for f in there})  # type: ignore
     origin = get_origin(kind)
     inner = get_args(kind)
@@ -127,8 +127,8 @@ def read(kind: Any, content: Any) -> Any:
     return float(content) if kind is float else content
 
 
-def _is_optional(field: Field[Any]) -> bool:
-    return "optional" in field.metadata
+def _is_optional(of: Any, field: Field[Any]) -> bool:
+    return "optional" in field.metadata or hasattr(of, "OMITS_NONE")
 
 
 @cache

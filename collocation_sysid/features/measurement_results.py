@@ -5,8 +5,9 @@ The fields of each class name the kinds of measurements; `measurements` computes
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,41 +76,33 @@ class CopyError:
     error: PredictionErrors  # errors of its measurements as a prediction
 
 
-@dataclass(frozen=True)
-class FittedExperiment:
-    """Residuals of the fit of an experiment."""
+@dataclass(frozen=True, kw_only=True)
+class FittedExperiment(PredictionErrors):
+    """Residuals of the fit of an experiment; `rms_m` is 0 without markers, and `max_m` is None."""
 
-    rms_m: float  # RMS distance of the markers from the fit [m]; 0 without markers
+    OMITS_NONE: ClassVar = True
+
     # Numbers of marker samples that are present, and that are missing.
     samples: int
     missing: int
     static: bool  # whether it is a series of equilibria
     notes: tuple[str, ...]  # sentences on the nuisance parameters of this recording
-    # RMS differences of forces [N] and torques [N m]; None if not measured.
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    # mapping of name to float, or None: RMS differences of custom sensors in their units; None
-    # without any.
-    reading_rms: Mapping[str, float] | None = optional()
     # Stated standard deviations of the noise of forces [N] and torques [N m]; None if not measured.
-    wrench_sigma_n: float | None = optional()
-    wrench_sigma_nm: float | None = optional()
+    wrench_sigma_n: float | None = None
+    wrench_sigma_nm: float | None = None
     # mapping of name to float, or None: stated standard deviations of the noise of custom sensors;
     # None without any.
-    reading_sigma: Mapping[str, float] | None = optional()
+    reading_sigma: Mapping[str, float] | None = None
     # mapping of name to str, or None: units of the custom sensors that state one; None if none
     # does.
-    reading_unit: Mapping[str, str] | None = optional()
+    reading_unit: Mapping[str, str] | None = None
     # mapping of obstacle to FrictionSummary, or None: friction of the obstacles that have some;
     # None without any.
-    friction: Mapping[str, FrictionSummary] | None = optional()
-    # mapping of depth camera to DepthError, or None: distances of its points from the fitted
-    # surface; None without depth cameras.
-    depth: Mapping[str, DepthError] | None = optional()
+    friction: Mapping[str, FrictionSummary] | None = None
     # Density of the air around the body in the model; zero in a vacuum.
     air_density_kg_m3: float = 0.0
     # Kind of material test of a specimen without a mesh; None for other experiments.
-    test: str | None = optional()
+    test: str | None = None
 
     def lines(self, name: str, is_symmetric: bool) -> Iterator[str]:
         """Yield lines of a summary on the sensors and the friction of the experiment `name`; of a
@@ -151,10 +144,10 @@ class FitResult:
     symmetry: Mapping[str, int] | None = optional()
 
 
-@dataclass(frozen=True)
-class SimulatedExperiment:
+@dataclass(frozen=True, kw_only=True)
+class SimulatedExperiment(PredictionErrors):
     """Errors of the forward simulation of an experiment; if `failed` is set, all else but `fitted`
-    is None.
+    is None. `rms_m` and `max_m` are 0 without markers.
 
     Attributes
     ----------
@@ -162,20 +155,13 @@ class SimulatedExperiment:
         Whether the experiment was fitted, not only predicted.
     failed : str or None
         Why there is no simulation; None if there is one.
-    rms_m, max_m : float or None
-        RMS and largest distance of the markers [m]; 0 without markers.
-    wrench_rms_n, wrench_rms_nm : float or None
-        RMS differences of forces [N] and torques [N m]; None if not measured.
-    reading_rms : mapping of name to float, or None
-        RMS differences of custom sensors in their units; None without any.
     reading_unit : mapping of name to str, or None
         Units of the custom sensors that state one; None if none does.
     nuisance, places_m : mapping or None
         Nuisance parameters and marker places with which a recording for validation was predicted:
         those of the fitted recordings, and its own onsets where they are declared as unknown; empty
-        for fitted experiments.
-    depth : mapping of depth camera to DepthError, or None
-        Distances of its points from the simulated surface; None without depth cameras.
+        for fitted experiments. Nuisance parameters of places are displacements from their start;
+        places are on the undeformed body.
     own : PredictionErrors or None
         Of an experiment for validation, the errors that remain if its nuisance parameters are
         fitted to it, whatever they absorb; None without any, and for fitted experiments.
@@ -192,22 +178,18 @@ class SimulatedExperiment:
         Why there is no such copy; empty for fitted experiments.
     """
 
+    OMITS_NONE: ClassVar = True
+
     fitted: bool
-    failed: str | None = optional()
-    rms_m: float | None = optional()
-    max_m: float | None = optional()
-    reading_unit: Mapping[str, str] | None = optional()
-    nuisance: Mapping[str, float] | None = optional()
-    places_m: Mapping[str, tuple[float, ...]] | None = optional()
-    wrench_rms_n: float | None = optional()
-    wrench_rms_nm: float | None = optional()
-    reading_rms: Mapping[str, float] | None = optional()
-    depth: Mapping[str, DepthError] | None = optional()
-    own: PredictionErrors | None = optional()  # noqa: RUF009, it returns a field
-    own_deviations: Mapping[str, float] | None = optional()
-    own_onsets: Mapping[str, float] | None = optional()
-    copied: CopyError | None = optional()  # noqa: RUF009, it returns a field
-    not_copied: str | None = optional()
+    failed: str | None = None
+    reading_unit: Mapping[str, str] | None = None
+    nuisance: Mapping[str, float] | None = None
+    places_m: Mapping[str, Sequence[float]] | None = None
+    own: PredictionErrors | None = None
+    own_deviations: Mapping[str, float] | None = None
+    own_onsets: Mapping[str, float] | None = None
+    copied: CopyError | None = None
+    not_copied: str | None = None
 
 
 @dataclass(frozen=True)

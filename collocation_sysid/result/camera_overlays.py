@@ -210,7 +210,7 @@ def visible_points(finished: SolvedProblem, experiment: Experiment) -> dict[str,
     if part is not None:
         predicted = finished.solution.fitted_values[experiment.name]
     elif isinstance(rollout, ForwardSimulation):
-        predicted = rollout.predicted
+        predicted = rollout.trajectory.predicted
     return {
         name: surface_rows(surface, experiment.upward_direction)
         for name, surface in surfaces(experiment, predicted).items()

@@ -258,7 +258,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
         rolled_out = None
         predicted = None
         if isinstance(rollout, ForwardSimulation):
-            predicted = rollout.predicted
+            predicted = rollout.trajectory.predicted
             rolled_out = (rollout.trajectory.positions_m, rollout.trajectory.markers_m)
         fit = fitted.get(experiment.name)
         if (shown := fit or rolled_out) is not None:
@@ -333,7 +333,7 @@ def _marker_places_m(finished: SolvedProblem, experiment: str) -> Array | None:
     rollout = finished.rollouts[experiment]
     if not isinstance(rollout, ForwardSimulation):
         return None
-    return np.array([*rollout.places_m.values()]).reshape(-1, 3)
+    return np.array([*(rollout.places_m or {}).values()]).reshape(-1, 3)
 
 
 def _trajectory_arrays(replays: Sequence[MotionRecord]) -> dict[str, Array]:

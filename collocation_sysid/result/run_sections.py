@@ -30,9 +30,9 @@ from ..common.display import (
 )
 from ..common.files import is_own
 from ..common.pages import explain_command, page_url
-from ..common.serialisation import content, copy_fields
+from ..common.serialisation import content
 from ..errors import listed
-from ..features.measurement_results import PredictionErrors, SimulatedExperiment
+from ..features.measurement_results import SimulatedExperiment
 from ..fem.laws.constants import symbol_of, unit_of
 from ..recording.deviation import in_readable_unit
 from ..runs.result_content import Elapsed, Result
@@ -474,11 +474,10 @@ def _simulation_lines(name: str, simulated: SimulatedExperiment) -> Iterator[str
     if simulated.failed is not None:
         yield f"{kind} '{name}': failed: {simulated.failed}"
         return
-    error = copy_fields(PredictionErrors, simulated)
     units = simulated.reading_unit
     onsets = _deviations_text(simulated.own_onsets)
     yield (
-        f"{kind} '{name}': {error.text(units) or 'no measurements to compare with'}"
+        f"{kind} '{name}': {simulated.text(units) or 'no measurements to compare with'}"
         + (f", with {onsets} from this recording" if onsets else "")
     )
     if simulated.fitted:

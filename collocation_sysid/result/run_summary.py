@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ..common.display import Line, Shown, Table, flattened_parts, number, quantity
-from ..common.serialisation import copy_fields
 from ..errors import listed
-from ..features.measurement_results import FittedExperiment, PredictionErrors, SimulatedExperiment
+from ..features.measurement_results import SimulatedExperiment
 from ..fem.laws.constants import (
     INSTANTANEOUS,
     KAPPA,
@@ -246,7 +245,7 @@ def _fit(result: Result) -> Iterator[Shown]:
         quality.append(f"reduced χ² {number(result.uncertainty.reduced_chi_squared, 3)}")
     if len(simulated) == 1:
         (name,) = simulated
-        errors = _fit_errors(replace(fitted[name], samples=0))
+        errors = replace(fitted[name], rms_m=None).text(fitted[name].reading_unit)
         own = [errors] if errors else []
         prediction = _simulation_text(simulated[name])
         if errors == prediction:  # as of equilibria
@@ -258,7 +257,7 @@ def _fit(result: Result) -> Iterator[Shown]:
     rows = tuple(
         (
             name,
-            _fit_errors(fitted[name]) if name in fitted else "validation",
+            fitted[name].text(fitted[name].reading_unit) if name in fitted else "validation",
             _simulation_text(each),
         )
         for name, each in simulated.items()
@@ -266,22 +265,10 @@ def _fit(result: Result) -> Iterator[Shown]:
     yield Table("", ("recording", "fit", "forward simulation"), rows=rows, names=3)
 
 
-def _fit_errors(fitted: FittedExperiment) -> str:
-    errors = PredictionErrors(
-        rms_m=fitted.rms_m if fitted.samples else None,
-        wrench_rms_n=fitted.wrench_rms_n,
-        wrench_rms_nm=fitted.wrench_rms_nm,
-        reading_rms=fitted.reading_rms,
-        depth=fitted.depth,
-    )
-    return errors.text(fitted.reading_unit)
-
-
 def _simulation_text(simulated: SimulatedExperiment) -> str:
     if simulated.failed is not None:
         return f"failed: {simulated.failed}"
-    own = copy_fields(PredictionErrors, simulated)
-    text = own.text(simulated.reading_unit) or "no measurements to compare with"
+    text = simulated.text(simulated.reading_unit) or "no measurements to compare with"
     if simulated.copied is not None:
         copied = simulated.copied.error.text(simulated.reading_unit)
         text += f" (measurements of '{simulated.copied.copied}' as the prediction: {copied})"

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ..common.array_types import Array
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
-from ..features.measurement_results import CopyError, PredictionErrors
-from ..features.measurements import Predictions, instrument_misfits, prediction_error
+from ..features.measurement_results import CopyError, SimulatedExperiment
+from ..features.measurements import instrument_misfits, prediction_error, units_by_name
 from ..fem.kernels import map_experiments
 from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
@@ -42,53 +43,24 @@ LEAST_STEP_RATIO = 1.99
 SMOOTH_SAMPLES = 4
 
 
-@dataclass(frozen=True, eq=False)
-class OwnFit:
-    """Simulation of a recording for validation with nuisance parameters that are fitted to it."""
-
-    # Its errors, which the nuisance parameters decrease whatever their cause.
-    error: PredictionErrors
-    misfits: tuple[InstrumentMisfit, ...]  # differences of each instrument over its stated σ
-    # mapping of name to float: nuisance parameters less those of the prediction, in standard
-    # deviations of their priors.
-    deviations: Mapping[str, float]
-    # mapping of name to float: times that the description declares as unknown, and the prediction
-    # has from this fit, in standard deviations of their priors.
-    onsets: Mapping[str, float]
-
-    @property
-    def is_plausible(self) -> bool:
-        """Whether no deviation is larger than chance allows for so many."""
-        sizes = [abs(each) for each in (*self.deviations.values(), *self.onsets.values())]
-        return max(sizes, default=0.0) <= largest_deviation(len(sizes))
-
-
-@dataclass(frozen=True, eq=False)
-class ForwardSimulation:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ForwardSimulation(SimulatedExperiment):
     """A forward simulation with the estimated parameters, compared with the measurements."""
 
-    # RMS and largest distance of the markers from the measurements [m]; zero without markers.
-    rms_m: float
-    max_m: float
-    trajectory: Trajectory  # its markers are predicted with the experiment's nuisance parameters
-    # mapping of name to value: nuisance parameters with which an experiment for validation is
-    # predicted: those of the fitted recordings, and its own onsets where the description says that
-    # they are unknown; those of places are displacements from their start. Empty for fitted
-    # experiments.
-    nuisance: Mapping[str, float]
-    # mapping of marker to place [x, y, z]: marker places on the undeformed body, likewise; empty
-    # for fitted experiments.
-    places_m: Mapping[str, list[float]]
-    # sequence of (S, m) or SurfaceComparison: prediction of each of `Experiment.measurements`.
-    predicted: Predictions
-    error: PredictionErrors  # their RMS and largest differences from the measurements
-    misfits: tuple[InstrumentMisfit, ...] = ()  # differences of each instrument over its stated σ
-    # Of an experiment for validation: the errors that remain if all its nuisance parameters are
-    # fitted to it; None without any, or where that fails.
-    own: OwnFit | None = None
-    # Of an experiment for validation: the error of a fitted recording's measurements, or why there
-    # is none. Empty for fitted experiments.
-    copy_error: CopyError | str = ""
+    trajectory: Trajectory  # its measurements are predicted with the nuisance parameters
+    # Differences of each instrument over its stated σ, also of an experiment for validation.
+    misfits: tuple[InstrumentMisfit, ...] = ()
+    # The same with nuisance parameters that are fitted to an experiment for validation.
+    own_misfits: tuple[InstrumentMisfit, ...] = ()
+
+    @property
+    def judged_misfits(self) -> tuple[InstrumentMisfit, ...]:
+        """Misfits by which an experiment for validation is judged: those with its own nuisance
+        parameters if no deviation is larger than chance allows for so many.
+        """
+        deviations = {**(self.own_deviations or {}), **(self.own_onsets or {})}
+        largest = max(map(abs, deviations.values()), default=np.inf)
+        return self.own_misfits if largest <= largest_deviation(len(deviations)) else self.misfits
 
 
 def simulate_experiments(
@@ -172,7 +144,7 @@ def simulate_experiment(
     nuisance = transcription.nuisance
     places_m = transcription.marker_places_m(phi).tolist()
     fitted = [part.transcription.experiment for part in solution.parts]
-    own = None
+    known: dict[str, Any] = {}
     if nuisance.size:
         try:
             with_own = simulated(phi=own_phi)
@@ -180,24 +152,23 @@ def simulate_experiment(
             pass
         else:
             onsets = unknown_onsets(transcription)
-            own = OwnFit(
-                with_own.error,
-                with_own.misfits,
-                deviations={
-                    name: float(change)
-                    for k, (name, change) in enumerate(
-                        zip(nuisance.names, own_phi - phi, strict=True)
-                    )
-                    if k not in onsets
+            changes = dict(enumerate((own_phi - phi).tolist()))
+            known = {
+                "own": prediction_error(experiment, with_own.trajectory.predicted),
+                "own_misfits": with_own.misfits,
+                "own_onsets": {nuisance.names[k]: float(own_phi[k]) for k in onsets},
+                "own_deviations": {
+                    nuisance.names[k]: each for k, each in changes.items() if k not in onsets
                 },
-                onsets={nuisance.names[k]: float(own_phi[k]) for k in onsets},
-            )
+            }
+    copied = nearest_recording_error(experiment, fitted)
     return replace(
         rollout,
         nuisance=dict(zip(nuisance.names, (phi * nuisance.scales).tolist(), strict=True)),
         places_m=dict(zip(experiment.markers.names, places_m, strict=True)),
-        own=own,
-        copy_error=nearest_recording_error(experiment, fitted),
+        copied=copied if isinstance(copied, CopyError) else None,
+        not_copied=copied if isinstance(copied, str) else None,
+        **known,
     )
 
 
@@ -231,7 +202,7 @@ def simulate_with_parameters(
     Returns
     -------
     ForwardSimulation
-        `nuisance`, `places_m`, `own` and `copy_error` are empty or None.
+        `nuisance` and `places_m` are empty, `own` and `copied` are None.
 
     Raises
     ------
@@ -250,15 +221,15 @@ def simulate_with_parameters(
         is_measured=False,
     )
     predicted = simulated_values(transcription, trajectory, phi)
-    error = prediction_error(experiment, predicted)
+    errors = prediction_error(experiment, predicted)
     return ForwardSimulation(
-        rms_m=error.rms_m or 0.0,
-        max_m=error.max_m or 0.0,
-        trajectory=replace(trajectory, predicted=predicted),
+        **vars(replace(errors, rms_m=errors.rms_m or 0.0, max_m=errors.max_m or 0.0)),
+        fitted=not experiment.validation,
+        reading_unit=units_by_name(experiment),
         nuisance={},
         places_m={},
-        predicted=predicted,
-        error=error,
+        not_copied="",
+        trajectory=replace(trajectory, predicted=predicted),
         misfits=tuple(instrument_misfits(experiment, predicted)),
     )
 

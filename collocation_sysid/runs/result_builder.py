@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import replace
 
 import casadi
 import numpy as np
@@ -16,14 +16,12 @@ from ..common.files import SCHEMA
 from ..common.installation import package_version
 from ..common.serialisation import copy_fields
 from ..features.measurement_results import (
-    CopyError,
     FitResult,
     FittedExperiment,
     ForwardResult,
-    PredictionErrors,
     SimulatedExperiment,
 )
-from ..features.measurements import prediction_error, stated_sigmas, units_by_name
+from ..features.measurements import prediction_error, stated_sigmas
 from ..fem.laws.constants import GAMMA_R
 from ..methods.solution import pooled_wrench_rms
 from ..methods.starts.start import ScanSummary
@@ -32,13 +30,11 @@ from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..recording.deviation import in_readable_unit
-from ..recording.experiment import Experiment
 from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import ScaleReference, scale_reference
 from ..statistics.uncertainty import MarkerPlace
-from .forward_simulation import ForwardSimulation
 from .result_content import (
     DynamicsResult,
     FieldResult,
@@ -250,14 +246,14 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         name = experiment.name
         markers = experiment.markers
         friction = friction_summaries(experiment, part.equations.dynamics, x=part.x)
+        errors = prediction_error(experiment, solution.fitted_values[name])
         experiments[name] = FittedExperiment(
-            solution.rms_by_experiment_m[name],
-            markers.sample_count,
-            int(markers.missing_count.sum()),
-            experiment.is_static,
-            (*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
+            **vars(replace(errors, rms_m=errors.rms_m or 0.0, max_m=None)),
+            samples=markers.sample_count,
+            missing=int(markers.missing_count.sum()),
+            static=experiment.is_static,
+            notes=(*_place_sentences(answer.places[name]), *_nuisance_sentences(part, answer)),
             **stated_sigmas(experiment),
-            **_sensor_errors(prediction_error(experiment, solution.fitted_values[name])),
             friction=friction or None,
             air_density_kg_m3=experiment.air_density_kg_m3,
             test=experiment.specimen and experiment.specimen.test,
@@ -278,46 +274,23 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
     )
 
 
-def _sensor_errors(error: PredictionErrors) -> dict[str, Any]:
-    return {key: value for key, value in vars(error).items() if key not in ("rms_m", "max_m")}
-
-
 def _forward_results(answer: SolvedProblem) -> ForwardResult:
-    experiments = {}
-    squares = []
-    largest = []
+    simulated = {}
+    fitted = []
     for experiment in answer.problem.experiments:
-        experiments[experiment.name] = compared = _forward_result(answer, experiment)
-        if compared.fitted and compared.rms_m is not None and compared.max_m is not None:
-            squares.append(experiment.markers.sample_count * np.array([compared.rms_m**2, 1.0]))
-            largest.append(compared.max_m)
-    if not largest:
-        return ForwardResult(None, None, experiments=experiments)
-    total, count = np.sum(squares, axis=0)
-    return ForwardResult(
-        float(np.sqrt(total / max(1, count))), max(largest), experiments=experiments
-    )
-
-
-def _forward_result(answer: SolvedProblem, experiment: Experiment) -> SimulatedExperiment:
-    fitted = experiment.name in answer.solution.rms_by_experiment_m
-    simulated = answer.rollouts[experiment.name]
-    if not isinstance(simulated, ForwardSimulation):
-        return SimulatedExperiment(fitted, failed=simulated)
-    own = simulated.own
-    return copy_fields(
-        SimulatedExperiment,
-        simulated,
-        fitted=fitted,
-        failed=None,
-        **_sensor_errors(simulated.error),
-        reading_unit=units_by_name(experiment),
-        own=own.error if own else None,
-        own_deviations=own.deviations if own else None,
-        own_onsets=own.onsets if own else None,
-        copied=simulated.copy_error if isinstance(simulated.copy_error, CopyError) else None,
-        not_copied=simulated.copy_error if isinstance(simulated.copy_error, str) else None,
-    )
+        rollout = answer.rollouts[experiment.name]
+        if isinstance(rollout, str):
+            failed = SimulatedExperiment(fitted=not experiment.validation, failed=rollout)
+            simulated[experiment.name] = failed
+            continue
+        simulated[experiment.name] = copy_fields(SimulatedExperiment, rollout)
+        if rollout.fitted:
+            fitted.append((experiment.markers.sample_count, rollout.rms_m, rollout.max_m))
+    if not fitted:
+        return ForwardResult(None, None, experiments=simulated)
+    counts, rms_m, max_m = np.transpose(fitted)
+    total = float(np.sqrt(counts @ rms_m**2 / max(1, counts.sum())))
+    return ForwardResult(total, float(max_m.max()), experiments=simulated)
 
 
 # What was estimated of a recording alone ----------------------------------------------------------

@@ -132,7 +132,7 @@ def solution_concerns(
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation):
             for feature in FEATURES:
-                yield from feature.simulation_concerns(name, rollout.error)
+                yield from feature.simulation_concerns(name, rollout)
         yield from _forward_concerns(name, rollout, fitted)
     collocation = solution.collocation
     for transcription in collocation.transcriptions:
@@ -226,18 +226,16 @@ def _forward_concerns(
             if simulated.what in of_fit:
                 yield from forward_simulation_concerns(name, simulated, of_fit[simulated.what])
         return
-    own = rollout.own
-    for label, deviation in (own.onsets if own else {}).items():
+    for label, deviation in (rollout.own_onsets or {}).items():
         yield from onset_concerns(name, label, deviation)
-    # An error within what the description leaves open is no contradiction.
-    judged = own.misfits if own is not None and own.is_plausible else rollout.misfits
     levels: dict[str, list[float]] = {}
     for misfit in (each for row in fitted.values() for each in row):
         levels.setdefault(misfit.what, []).append(misfit.robust_sigmas)
-    for misfit in judged:
+    # An error within what the description leaves open is no contradiction.
+    for misfit in rollout.judged_misfits:
         level = root_mean(np.square(levels.get(misfit.what, [1.0])))
         yield from validation_concerns(
-            name, misfit, level=level, deviations=own.deviations if own else {}
+            name, misfit, level=level, deviations=rollout.own_deviations or {}
         )
 
 

@@ -140,8 +140,8 @@ def test_a_result_read_back_is_shown_unchanged(run_folder: Path):
 
 def test_failures_and_predictions_are_reported():
     experiments = {
-        "a": SimulatedExperiment(True, failed="no step"),
-        "b": SimulatedExperiment(False, rms_m=3e-3, max_m=4e-3),
+        "a": SimulatedExperiment(fitted=True, failed="no step"),
+        "b": SimulatedExperiment(fitted=False, rms_m=3e-3, max_m=4e-3),
     }
     told = a_result(rollout=replace(ROLLOUT, experiments=experiments))
     said = plain_text(run_summary(told, Path("run"))).splitlines()

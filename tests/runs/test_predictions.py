@@ -141,7 +141,7 @@ def image_predicted(young_pa: float) -> cs.Run:
 @pytest.mark.long
 def test_predicted_depth_is_compared_with_the_image_and_graded():
     right, wrong = image_predicted(1.5e5), image_predicted(0.3e5)
-    good, bad = (each.rollouts["experiment"].error.depth["front"] for each in (right, wrong))
+    good, bad = (each.rollouts["experiment"].depth["front"] for each in (right, wrong))
     assert right.trust.verdict == "good"
     assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
     assert good.share_beyond_gate == 0.0
@@ -155,7 +155,7 @@ def test_predicted_depth_is_compared_with_the_image_and_graded():
 
 
 def test_gate_and_rms_of_depth_belong_to_the_same_points():
-    bad = image_predicted(0.3e5).rollouts["experiment"].error.depth["front"]
+    bad = image_predicted(0.3e5).rollouts["experiment"].depth["front"]
     assert bad.gate_m == 0.01 < bad.reach_m
     assert bad.rms_within_gate_m <= bad.gate_m
     assert 0.1 < bad.share_beyond_gate < 0.9
@@ -189,7 +189,7 @@ def test_depth_of_a_validation_recording_is_compared_drawn_and_judged():
     wrong = replace(away, gravity_m_s2=(0.0, 0.0, -9.81), name="wrong")
     unknown = BAR_TRUTH | {"young_pa": cs.Unknown(1.4e5)}
     finished = cs.run(cs.Problem([fitted, away, wrong], unknown), seek_causes=False)
-    (predicted,) = finished.rollouts["away"].error.depth.values()
+    (predicted,) = finished.rollouts["away"].depth.values()
     assert isinstance(predicted, DepthError)
     assert predicted.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.3)
     drawn = {replay.name: replay.visible_points for replay in replays(finished)}["away"]["front"]
@@ -230,17 +230,17 @@ def test_the_error_of_a_validation_recording_is_that_of_a_blind_prediction():
     alike, other = validated(4e-3), validated(-4e-3)
     assert alike.rollouts["new"].rms_m == pytest.approx(np.sqrt(3) * 2e-4, rel=0.2)
     rollout = other.rollouts["new"]
-    assert rollout.rms_m == rollout.error.rms_m > 3 * rollout.own.error.rms_m
-    assert rollout.own.error.rms_m == pytest.approx(np.sqrt(3) * 2e-4, rel=0.2)
+    assert rollout.rms_m > 3 * rollout.own.rms_m
+    assert rollout.own.rms_m == pytest.approx(np.sqrt(3) * 2e-4, rel=0.2)
     assert rollout.nuisance["new: time shift [s]"] == pytest.approx(-4e-3, abs=3e-4)
-    assert rollout.own.deviations["new: time shift [s]"] == pytest.approx(1.6, abs=0.1)
+    assert rollout.own_deviations["new: time shift [s]"] == pytest.approx(1.6, abs=0.1)
     found = stored(other)["rollout"]
     assert found["new"]["rms_m"] == rollout.rms_m
-    assert found["new"]["own"]["rms_m"] == rollout.own.error.rms_m
+    assert found["new"]["own"]["rms_m"] == rollout.own.rms_m
     assert "own" not in found["fitted"]
     said = shown(other)
     assert f"validation 'new': {1e3 * rollout.rms_m:.3f} mm RMS" in said
-    assert f"fitted to it: {1e3 * rollout.own.error.rms_m:.3f} mm RMS" in said
+    assert f"fitted to it: {1e3 * rollout.own.rms_m:.3f} mm RMS" in said
     # The prior of the clock allows for the difference, so that it is no contradiction.
     assert "roll-out/predicted" not in [concern.code for concern in other.trust.concerns]
 
@@ -258,12 +258,12 @@ def test_a_clock_that_is_declared_as_unknown_is_estimated_and_its_size_reported(
     finished = validated(-4e-3, prior_s=1e-3)
     rollout = finished.rollouts["new"]
     assert rollout.rms_m == pytest.approx(np.sqrt(3) * 2e-4, rel=0.2)
-    assert rollout.own.onsets["new: time shift [s]"] == pytest.approx(4.0, abs=0.3)
+    assert rollout.own_onsets["new: time shift [s]"] == pytest.approx(4.0, abs=0.3)
     assert "with 'new: time shift [s]' at +4" in shown(finished)
     (concern,) = (c for c in finished.trust.concerns if c.code == "roll-out/onset")
     assert concern.grade == "check"
     certain = validated(-4e-3, prior_s=6e-3)
-    assert certain.rollouts["new"].own.onsets
+    assert certain.rollouts["new"].own_onsets
     assert "roll-out/onset" not in [c.code for c in certain.trust.concerns]
 
 
@@ -300,7 +300,7 @@ def test_predicted_stresses_enter_the_verdict_and_are_not_absorbed(test, factor,
     finished = stress_predicted(test, factor)
     rms_pa = np.sqrt(np.mean(((1 - factor) * STRESSES_PA[test]) ** 2 + 300.0**2))
     rollout = finished.rollouts[test]
-    assert rollout.error.reading_rms["stress"] == pytest.approx(rms_pa, rel=0.05, abs=1e3)
+    assert rollout.reading_rms["stress"] == pytest.approx(rms_pa, rel=0.05, abs=1e3)
     concerns = [c for c in finished.trust.concerns if c.topic == "roll-out"]
     assert [c.grade for c in concerns] == [grade] * (grade is not None)
     for concern in concerns:
@@ -310,7 +310,7 @@ def test_predicted_stresses_enter_the_verdict_and_are_not_absorbed(test, factor,
 
 def test_a_prediction_stands_beside_the_copy_of_a_fitted_recording():
     alike = validated(4e-3)
-    copied = alike.rollouts["new"].copy_error
+    copied = alike.rollouts["new"].copied
     assert isinstance(copied, CopyError)
     assert copied.copied == "fitted"
     assert copied.error.rms_m == pytest.approx(np.sqrt(6) * 2e-4, rel=0.1)  # the noise of both

@@ -589,7 +589,7 @@ def _prediction_error(
     experiment: Experiment, rollout: ForwardSimulation, start_s: float
 ) -> dict[str, Any]:
     """Return RMS, number of samples and sums of squares by block; missing ones do not count."""
-    residuals = judged_residuals(experiment, rollout.predicted)
+    residuals = judged_residuals(experiment, rollout.trajectory.predicted)
     is_test_sample = residuals.t_s > start_s
     squares = np.where(residuals.is_counted, np.nansum(residuals.values**2, axis=2), 0.0)[
         is_test_sample
