@@ -169,15 +169,6 @@ def test_an_interruption_keeps_the_best_iterate(plugin: str):
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
-def test_an_error_in_the_callers_function_reaches_the_caller(plugin: str):
-    def broken(iteration: Iteration) -> None:
-        raise ZeroDivisionError("in watch")
-
-    with pytest.raises(ZeroDivisionError, match="in watch"):
-        PLUGINS[plugin]()(cube(), watch=broken)
-
-
-@pytest.mark.parametrize("plugin", PLUGINS)
 def test_an_error_in_a_function_reaches_the_caller(plugin: str, monkeypatch):
     def broken(self, z, *rest):
         raise ZeroDivisionError("in an evaluation")

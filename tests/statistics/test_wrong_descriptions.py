@@ -110,7 +110,7 @@ def gripped(problem: Problem, reading: Callable[[PoseSequence], PoseSequence]):
     return replace(problem, experiments=[changed])
 
 
-@pytest.mark.parametrize(("name", "turn"), zip(BODIES, [1, -1], strict=True))
+@pytest.mark.parametrize(("name", "turn"), [*zip(BODIES, [1, -1], strict=True)])
 def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(name: str, turn: int):
     """Wrong poses place the markers at wrong points of the body, unless their places are stated."""
     wrong = gripped(soft(name), reordered(turn))
@@ -119,7 +119,7 @@ def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(name: s
     assert causes[0].strength > 2
 
 
-@pytest.mark.parametrize(("name", "seed"), zip(BODIES, [1, 2], strict=True))
+@pytest.mark.parametrize(("name", "seed"), [*zip(BODIES, [1, 2], strict=True)])
 def test_poses_of_a_gripper_without_stated_places_are_not_doubted(name: str, seed: int):
     right = gripped(soft(name, seed), lambda poses: poses)
     assert misspecification_hypotheses(right) == ()
