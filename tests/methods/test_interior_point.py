@@ -23,6 +23,7 @@ from kit.problems import (
     hung_cube,
     measured,
     noisy,
+    prescribed_positions,
     relative_errors,
     released_cube,
 )
@@ -121,7 +122,7 @@ def test_the_positions_satisfy_grasp_and_motion():
     positions = solution.positions_m[0]
     np.testing.assert_allclose(
         positions.reshape(len(positions), -1)[:, transcription.experiment.prescribed_dofs],
-        transcription.experiment.prescribed_positions(transcription.dynamics.t_s),
+        prescribed_positions(transcription.experiment, transcription.dynamics.t_s),
         atol=1e-9,
     )
     assert solution.multipliers.shape == (cube().constraint_count,)
@@ -167,7 +168,7 @@ def test_the_start_shape_is_carried_with_the_grasp():
     x = rigid_trajectory(transcription, as_theta(TRUTH)).reshape(transcription.grid_times, -1, 3)
     np.testing.assert_allclose(
         x.reshape(len(x), -1)[:, transcription.experiment.prescribed_dofs],
-        transcription.experiment.prescribed_positions(transcription.dynamics.t_s),
+        prescribed_positions(transcription.experiment, transcription.dynamics.t_s),
         atol=1e-12,
     )
     lengths = np.linalg.norm(x - x[:, :1], axis=2)

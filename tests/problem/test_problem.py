@@ -23,6 +23,7 @@ from kit.problem_files import (
     replace_text,
     write,
 )
+from kit.problems import prescribed_positions
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -426,7 +427,7 @@ def test_poses_of_another_rate_need_no_resampling(tiny):
     assert "recorded at 137.5 Hz, were interpolated (smooth) at the markers' times, 100 Hz" in note
     np.testing.assert_array_equal(experiment.t_s, expected.t_s)
     np.testing.assert_array_equal(experiment.markers.positions_m, expected.markers.positions_m)
-    held = [e.prescribed_positions(e.t_s) for e in (experiment, expected)]
+    held = [prescribed_positions(e, e.t_s) for e in (experiment, expected)]
     np.testing.assert_allclose(*held, atol=1e-5)
 
 
@@ -439,7 +440,7 @@ def test_poses_of_the_gripper_carry_the_held_body(tiny):
     write_poses_csv(tiny / POSES, poses.after(np.linalg.inv(of_body)))  # what the gripper did
     of_gripper = "{ position_m = [0.02, -0.3, 0.1], quaternion_xyzw = [0.5, -0.5, 0.5, 0.5] }"
     found = experiment_of(tiny, f"experiment.0.grasp.gripper_to_body={of_gripper}")
-    held = [e.prescribed_positions(e.t_s) for e in (found, expected)]
+    held = [prescribed_positions(e, e.t_s) for e in (found, expected)]
     np.testing.assert_allclose(*held, atol=1e-9)
 
 
@@ -452,8 +453,8 @@ def test_poses_may_be_faster_than_markers(tiny):
     np.testing.assert_allclose(experiment.t_s, poses.t_s[::2])
     assert len(experiment.grasps[0].poses.t_s) == len(poses.t_s)
     np.testing.assert_allclose(
-        experiment.prescribed_positions(poses.t_s),
-        every.prescribed_positions(poses.t_s),
+        prescribed_positions(experiment, poses.t_s),
+        prescribed_positions(every, poses.t_s),
         atol=1e-15,
     )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kit.problem_files import GRASP, replace_text
+from kit.problems import prescribed_positions
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -55,8 +56,8 @@ def tracked(tiny):
 def assert_same_motion(found, expected):
     np.testing.assert_allclose(found.t_s, expected.t_s)
     np.testing.assert_allclose(
-        found.prescribed_positions(found.t_s),
-        expected.prescribed_positions(expected.t_s),
+        prescribed_positions(found, found.t_s),
+        prescribed_positions(expected, expected.t_s),
         atol=1e-8,
     )
     assert found.markers.names == expected.markers.names

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kit.problems import prescribed_positions
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
@@ -74,7 +75,7 @@ def test_sizes_follow_from_times_and_grasps():
 
 def test_held_positions_follow_the_order_of_held_dofs():
     swing = experiment(grasps=(lifted([4, 1, 2]), lifted([0, 3], speed_m_s=-2.0)))
-    held = swing.prescribed_positions([0.0, 0.02]).reshape(2, 5, 3)
+    held = prescribed_positions(swing, [0.0, 0.02]).reshape(2, 5, 3)
     np.testing.assert_allclose(held[0], NODES)
     np.testing.assert_allclose(held[1, :, 2] - NODES[:, 2], [-0.04, 0.02, 0.02, -0.04, 0.02])
     np.testing.assert_allclose(held[1, 1, :2], [0.1 * np.cos(0.02), 0.1 * np.sin(0.02)])
@@ -90,7 +91,7 @@ def test_rigid_positions_carry_the_whole_body_with_the_first_grasp():
 def test_without_a_grasp_the_body_stays_undeformed_and_all_nodes_are_free():
     free = experiment(grasps=(), start="undeformed")
     np.testing.assert_array_equal(free.rigid_positions([0.0, 0.1]), [NODES, NODES])
-    assert free.prescribed_positions([0.0, 0.1]).shape == (2, 0)
+    assert prescribed_positions(free, [0.0, 0.1]).shape == (2, 0)
     np.testing.assert_array_equal(free.free_dofs, np.arange(15))
 
 
