@@ -26,8 +26,9 @@ def minimise_conjugate_gradients(
     """Minimise a merit function within its bounds, see `minimise_levenberg_marquardt`.
 
     The variables are z + s_i / √d_i with d the diagonal of the Gauss–Newton Hessian at the start:
-    columns of J for parameters are thousands of times as long as those for positions. Beyond a
-    bound the merit function is that at the bound.
+    columns of J for parameters are thousands of times as long as those for positions. A unit is at
+    most as long as the interval between the bounds. Beyond a bound the merit function is that at
+    the bound.
     """
     problem = merit.problem
     point = MeritPoint.evaluate(merit, z)
@@ -38,6 +39,9 @@ def minimise_conjugate_gradients(
     diagonal = hessian.diagonal() + merit.rho * point.jacobian.power(2).sum(axis=0)
     least = 1e-12 * diagonal[problem.is_free].max()
     unit = problem.is_free / np.sqrt(np.maximum(diagonal, least))
+    # A parameter that the loss hardly depends on would leap to a bound, where the derivative by its
+    # logarithm is within the tolerance.
+    unit = np.minimum(unit, problem.upper - problem.lower)
     height = abs(point.value)
     is_reached = False
 
