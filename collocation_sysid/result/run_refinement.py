@@ -19,10 +19,10 @@ from ..model.parameters import Parameters
 from ..problem import Problem
 from ..runs.mesh_resolution import MESH_ERROR
 from ..runs.numerical_error import solve_refined
-from ..runs.result_content import ReportedEstimate, Result
+from ..runs.result_content import Result
 from ..runs.warm_start import WarmStart
 from ..statistics.assessment import NUMERICAL, Assessment, numerical_concerns
-from ..statistics.budget.combined_intervals import combine
+from ..statistics.budget.combined_intervals import ReportedEstimate, combine
 from ..statistics.budget.discretisation_error import (
     DiscretisationError,
     Refinement,
@@ -182,7 +182,7 @@ def _corrected_estimate(
         linear=linear,
         bounds=bounds,
     )
-    return replace(before, **vars(combined), numerical_error=error)
+    return replace(combined, guess=before.guess, fixed=before.fixed, tied=before.tied)
 
 
 def _updated_shares(

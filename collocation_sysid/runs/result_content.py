@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,105 +19,14 @@ from ..methods.solution import Iteration, Timing
 from ..methods.starts.start import ScanSummary
 from ..statistics.assessment import Assessment
 from ..statistics.budget.alternatives import Alternative, OriginAnswer
+from ..statistics.budget.combined_intervals import ReportedEstimate
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
 from ..statistics.combinations import Combination, Direction
-from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.remedies import remedy_for
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import ScaleReference
 from ..statistics.uncertainty import MarkerPlace
-
-
-@dataclass(frozen=True)
-class ReportedEstimate(Estimate):
-    """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
-
-    `value` is corrected for the known discretisation error and for known effects, and
-    `statistical95` is centred on it.
-    """
-
-    # Standard uncertainty due to noise, discretisation and systematic effects; None if the quantity
-    # was not estimated or is at a bound, or if systematic effects were not evaluated.
-    combined_std_error: float | None = None
-    # (lower, upper) or None: 95 % interval due to the same, the one to publish; None as above.
-    combined95: tuple[float, float] | None = None
-    # The optimum of the discretised problem, without the correction; None in a study's summary.
-    optimum: float | None = None
-    # Standard deviation of the systematic effects in the coordinate of the estimate, see
-    # `statistics.budget.variance_sources`.
-    systematic: float | None = None
-    # Correction for known effects, such as the compliance of a machine, in the coordinate of the
-    # estimate; None if there is none.
-    known_effect: float | None = optional()
-    # The same correction as part of `value`; None if there is none.
-    known_correction: float | None = optional()
-    numerical_error: DiscretisationError | None = None  # discretisation error as far as it is known
-    guess: float | None = optional()  # initial guess
-    # Whether the parameter was not estimated, or followed another one.
-    fixed: bool | None = optional()
-    tied: bool | None = optional()
-
-    def at_optimum(self, name: str, *, linear: bool) -> Estimate:
-        """Return the estimate before the correction of the discretisation error: with the value
-        `optimum`, and the statistical interval and standard error moved with it.
-
-        Without an interval the standard error is unchanged, and without an `optimum` also the
-        value.
-
-        Parameters
-        ----------
-        name : str
-            Name of the estimate, which decides its coordinate.
-        linear : bool
-            Whether the parameter is its own coordinate, see `IntervalCoordinate`.
-        """
-        if self.optimum is None or self.statistical95 is None or self.optimum == self.value:
-            optimum = self.value if self.optimum is None else self.optimum
-            return replace(self._to_statistical(), value=optimum)
-        at = IntervalCoordinate.for_estimate(
-            name, (self.value, self.optimum, *self.statistical95), linear=linear
-        )
-        correction = at.from_value(self.value) - at.from_value(self.optimum)
-        low, high = (at.to_value(at.from_value(end) - correction) for end in self.statistical95)
-        spread = self.statistical_std_error
-        if spread is not None:
-            spread *= at.derivative(self.value) / at.derivative(self.optimum)
-        return Estimate(
-            self.optimum,
-            spread,
-            statistical95=(low, high),
-            at_bound=self.at_bound,
-            reason=self.reason,
-        )
-
-    def _to_statistical(self) -> Estimate:
-        """Return the estimate with its statistical uncertainty alone."""
-        return Estimate(
-            self.value,
-            self.statistical_std_error,
-            statistical95=self.statistical95,
-            at_bound=self.at_bound,
-            reason=self.reason,
-        )
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the combined interval is not wider than the value; false if there is none."""
-        if self.combined95 is None:
-            return False
-        low, high = self.combined95
-        return high - low <= abs(self.value)
-
-    @property
-    def systematic_std_error(self) -> float | None:
-        """Part of the combined standard uncertainty that is not statistical, √(combined²
-        − statistical²), at least 0; None if one of the two is unknown.
-        """
-        if self.combined_std_error is None or self.statistical_std_error is None:
-            return None
-        difference = self.combined_std_error**2 - self.statistical_std_error**2
-        return max(0.0, difference) ** 0.5
 
 
 @dataclass(frozen=True)

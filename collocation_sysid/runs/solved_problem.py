@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from typing import Any, Literal
@@ -25,7 +25,7 @@ from ..statistics.budget.alternatives import (
     modulus_axis_sentence,
     origin_answers,
 )
-from ..statistics.budget.combined_intervals import combine
+from ..statistics.budget.combined_intervals import ReportedEstimate, combine
 from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
 from ..statistics.budget.variance_sources import (
     MESH,
@@ -58,7 +58,7 @@ from .check.modes import ModesCheck
 from .ensemble import draw_samples
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
-from .result_content import Elapsed, ReportedEstimate
+from .result_content import Elapsed
 from .verdict import expected_rms_m, modes_by_experiment, solution_concerns
 
 
@@ -140,33 +140,21 @@ class SolvedProblem:
             None,
         )
         line = self.budget.get(name)
-        error = self.discretisation_errors.get(name)
         linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
-        systematic = None if line is None else line.systematic
-        known_effect = 0.0 if line is None else line.known_effect
         combined = combine(
             name,
             optimum,
-            error=error,
-            systematic=systematic,
-            known_effect=known_effect,
+            error=self.discretisation_errors.get(name),
+            systematic=None if line is None else line.systematic,
+            known_effect=0.0 if line is None else line.known_effect,
             linear=linear,
             bounds=bounds,
         )
-        guess = None if item is None else item.guess
-        tied = item is not None and item.tied is not None
-        return ReportedEstimate(
-            **vars(combined),
-            at_bound=optimum.at_bound,
-            reason=optimum.reason,
-            optimum=optimum.value,
-            systematic=systematic,
-            known_effect=known_effect or None,
-            numerical_error=error,
-            guess=np.nan if item is not None and guess is None else guess,
-            fixed=None if item is None else item.is_fixed or tied,
-            tied=tied or None,
-        )
+        if item is None:
+            return combined
+        guess = np.nan if item.guess is None else item.guess
+        tied = item.tied is not None
+        return replace(combined, guess=guess, fixed=item.is_fixed or tied, tied=tied or None)
 
     @cached_property
     def budget(self) -> dict[str, BudgetLine]:

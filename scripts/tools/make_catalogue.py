@@ -41,7 +41,8 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.laws.constants import is_damping, unit_of
 from collocation_sysid.fem.regions import BodyPart
 from collocation_sysid.result.replay import MotionRecord, read_run
-from collocation_sysid.runs.result_content import ReportedEstimate, Result
+from collocation_sysid.runs.result_content import Result
+from collocation_sysid.statistics.budget.combined_intervals import ReportedEstimate
 
 JSON_FILE = ROOT / "docs" / "catalogue.json"
 PAGE_FILE = ROOT / "docs" / "catalogue.md"

@@ -17,11 +17,11 @@ from collocation_sysid.runs.result_content import (
     ForwardResult,
     ProgramSize,
     Provenance,
-    ReportedEstimate,
     Result,
     UncertaintyResult,
 )
 from collocation_sysid.statistics.assessment import Assessment
+from collocation_sysid.statistics.budget.combined_intervals import ReportedEstimate
 
 FIT = FitResult(1e-3, 1e-3, {})
 ROLLOUT = ForwardResult(0.8e-3, 2e-3, {})

@@ -30,9 +30,10 @@ from ...result.replay import MotionRecord, damaged_run_refused, read_arrays
 from ...runs.ensemble import draw_samples
 from ...runs.forward_simulation import ForwardSimulation
 from ...runs.result_builder import build_result
-from ...runs.result_content import ReportedEstimate, Result
+from ...runs.result_content import Result
 from ...runs.solved_problem import SolvedProblem
 from ...runs.warm_start import WarmStart
+from ...statistics.budget.combined_intervals import ReportedEstimate
 
 
 @dataclass(frozen=True, eq=False)

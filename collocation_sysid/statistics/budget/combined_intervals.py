@@ -11,9 +11,11 @@ error is corrected, not only budgeted (ibid., 3.2.4): the reported value is the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from ...common.serialisation import optional
 from ..estimates import Estimate, IntervalCoordinate
 from .discretisation_error import DiscretisationError
 
@@ -24,23 +26,76 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class CombinedEstimate:
-    """A corrected value with its statistical and its combined uncertainty."""
+class ReportedEstimate(Estimate):
+    """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
 
-    # The estimate, corrected for the known discretisation error and effects of known size.
-    value: float
-    # Standard error due to noise and nuisance parameters; None if it has none.
-    statistical_std_error: float | None
-    # (lower, upper) or None: 95 % interval due to noise and nuisance parameters, about `value`;
-    # None if unknown.
-    statistical95: Interval | None
-    # Standard uncertainty due to all contributions; None if unknown.
+    `value` is corrected for the known discretisation error and for known effects, and
+    `statistical95` is centred on it.
+    """
+
+    # Standard uncertainty due to noise, discretisation and systematic effects; None if the quantity
+    # was not estimated or is at a bound, or if systematic effects were not evaluated.
     combined_std_error: float | None = None
-    # (lower, upper) or None: 95 % interval due to all contributions; None if unknown.
-    combined95: Interval | None = None
-    # Part of `value` that corrects for effects of known size, before bounds are applied; None if
-    # there are none. The correction of the discretisation error is not contained.
-    known_correction: float | None = None
+    # (lower, upper) or None: 95 % interval due to the same, the one to publish; None as above.
+    combined95: tuple[float, float] | None = None
+    # The optimum of the discretised problem, without the correction; None in a study's summary.
+    optimum: float | None = None
+    # Standard deviation of the systematic effects in the coordinate of the estimate, see
+    # `statistics.budget.variance_sources`.
+    systematic: float | None = None
+    # Correction for known effects, such as the compliance of a machine, in the coordinate of the
+    # estimate; None if there is none.
+    known_effect: float | None = optional()
+    # The same correction as part of `value`; None if there is none.
+    known_correction: float | None = optional()
+    numerical_error: DiscretisationError | None = None  # discretisation error as far as it is known
+    guess: float | None = optional()  # initial guess
+    # Whether the parameter was not estimated, or followed another one.
+    fixed: bool | None = optional()
+    tied: bool | None = optional()
+
+    def at_optimum(self, name: str, *, linear: bool) -> Estimate:
+        """Return the estimate before the correction of the discretisation error: with the value
+        `optimum`, and the statistical interval and standard error moved with it.
+
+        Without an interval the standard error is unchanged, and without an `optimum` also the
+        value.
+
+        Parameters
+        ----------
+        name : str
+            Name of the estimate, which decides its coordinate.
+        linear : bool
+            Whether the parameter is its own coordinate, see `IntervalCoordinate`.
+        """
+        optimum = self.value if self.optimum is None else self.optimum
+        spread, ends = self.statistical_std_error, self.statistical95
+        if ends is not None and optimum != self.value:
+            at = IntervalCoordinate.for_estimate(name, (self.value, optimum, *ends), linear=linear)
+            correction = at.from_value(self.value) - at.from_value(optimum)
+            low, high = (at.to_value(at.from_value(end) - correction) for end in ends)
+            ends = low, high
+            if spread is not None:
+                spread *= at.derivative(self.value) / at.derivative(optimum)
+        return Estimate(optimum, spread, ends, at_bound=self.at_bound, reason=self.reason)
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the combined interval is not wider than the value; false if there is none."""
+        if self.combined95 is None:
+            return False
+        low, high = self.combined95
+        return high - low <= abs(self.value)
+
+    @property
+    def systematic_std_error(self) -> float | None:
+        """Part of the combined standard uncertainty that is not statistical, √(combined²
+        − statistical²), at least 0; None if one of the two is unknown.
+        """
+        if self.combined_std_error is None or self.statistical_std_error is None:
+            return None
+        difference = self.combined_std_error**2 - self.statistical_std_error**2
+        return max(0.0, difference) ** 0.5
 
 
 def combine(
@@ -52,7 +107,7 @@ def combine(
     known_effect: float = 0.0,
     linear: bool = False,
     bounds: Interval = (-np.inf, np.inf),
-) -> CombinedEstimate:
+) -> ReportedEstimate:
     """Correct an estimate and combine the contributions to its uncertainty.
 
     An estimate at a bound is not corrected and has no uncertainty.
@@ -77,7 +132,7 @@ def combine(
 
     Returns
     -------
-    CombinedEstimate
+    ReportedEstimate
         Without a statistical interval of `estimate` there is no combined one.
 
     Notes
@@ -85,8 +140,17 @@ def combine(
     The coordinate is linear as well if the estimate or an end of an interval is not positive, see
     `IntervalCoordinate.for_estimate`. Intervals are shifted with the value.
     """
+    reported = partial(
+        ReportedEstimate,
+        at_bound=estimate.at_bound,
+        reason=estimate.reason,
+        optimum=estimate.value,
+        systematic=systematic,
+        known_effect=known_effect or None,
+        numerical_error=error,
+    )
     if estimate.at_bound:
-        return CombinedEstimate(estimate.value, None, statistical95=None)
+        return reported(estimate.value)
     is_corrected = error is not None or known_effect != 0.0
     known = [estimate.value, *(estimate.statistical95 or ())]
     corrections = () if error is None else (error.extrapolated, *(error.interval95 or ()))
@@ -100,16 +164,14 @@ def combine(
     if spread is not None:
         spread *= at.derivative(estimate.value) / at.derivative(at.to_value(centre))
     if estimate.statistical95 is None:
-        return CombinedEstimate(value, spread, statistical95=None, known_correction=correction)
+        return reported(value, spread, known_correction=correction)
     low, high = (at.from_value(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high=high, bounds=bounds)
     if not is_corrected:
         least, most = estimate.statistical95
         statistical95 = _clip(bounds, least), _clip(bounds, most)
     if systematic is None:
-        return CombinedEstimate(
-            value, spread, statistical95=statistical95, known_correction=correction
-        )
+        return reported(value, spread, statistical95, known_correction=correction)
     if error is not None and error.interval95 is not None:
         low, high = map(at.from_value, error.interval95)
         low = low + known_effect
@@ -117,10 +179,10 @@ def combine(
     low, high = widened_interval((low, high), centre, deviation=systematic)
     combined95 = _interval(at, low, high=high, bounds=bounds)
     deviation = (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
-    return CombinedEstimate(
+    return reported(
         value,
         spread,
-        statistical95=statistical95,
+        statistical95,
         combined_std_error=deviation,
         combined95=combined95,
         known_correction=correction,
