@@ -4,13 +4,12 @@ Call one function for each kind, in a test of your own. A check raises `Assertio
 sentence: which property failed, where, what was found and what was expected. See
 docs/howto/extend.md.
 
-- `material_check`: energy, stress, stiffness, objectivity, compiled forces.
-- `damping_check`: derivatives, dissipation, objectivity, compiled forces.
-- `force_check`, `sensor_check`: values and derivatives in small programs.
+- `material_check`: energy, stress, stiffness, objectivity.
+- `damping_check`: derivatives, dissipation, objectivity.
+- `force_check`, `sensor_check`: values, derivatives and predictions.
 - `method_check`: answer, history, restart and options.
-- `property_check`, `finite_differences`: comparisons; `program_derivatives`: matrices of a program;
-  `internal_force_check`: compiled internal forces;
-  `small_problems`: bodies and recordings of the checks.
+- `property_check`, `finite_differences`: comparisons.
+- `small_problems`: bodies and recordings of the checks.
 """
 
 from .damping_check import check_damping

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,8 +12,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.laws.damping_admissibility import viscous_stress
-from ..fem.laws.materials import DampingLaw, Energy, Material, as_damping, as_material
-from .internal_force_check import check_internal_forces, damping_stress
+from ..fem.laws.materials import DampingLaw, Energy, Material, as_damping, as_material, damped_psi
 from .material_check import deformation_gradients, random_rotation
 from .property_check import PropertyCheck
 from .small_problems import usual_constants
@@ -33,16 +32,14 @@ def check_damping(
     constants: Mapping[str, float] | None = None,
     is_objective: bool = True,
     is_dissipative: bool = True,
-    elements: Sequence[str] = ("tet4",),
     largest_strain: float = LARGEST_STRAIN,
 ) -> None:
-    """Check a damping law: derivatives, dissipation, objectivity and compiled forces.
+    """Check a damping law: derivatives, dissipation and objectivity.
 
     The stress or potential can be evaluated, and its result has the right shape. At random
     deformations the stress P_v is linear in the rate Ḟ, ∂P_v/∂Ḟ is symmetric, and a stated ∂P_v/∂F
     is the derivative of P_v by CasADi's automatic derivative and by central differences. The power
-    P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation only rotates P_v. The
-    compiled forces of a small body with this law are checked as by `check_material`.
+    P_v:Ḟ is not negative for any Ḟ, and a superposed spinning rotation only rotates P_v.
 
     Parameters
     ----------
@@ -54,8 +51,6 @@ def check_damping(
         Whether rotation is not damped; false for Rayleigh's law.
     is_dissipative : bool
         Whether the power never increases the energy at any strain; false for Rayleigh's law.
-    elements : sequence of str
-        Elements of the small body: "tet4", "tet10" and "tet10-p0".
     largest_strain : float
         Largest entry of F − I of the random deformations.
 
@@ -66,9 +61,8 @@ def check_damping(
 
     Notes
     -----
-    `largest_strain` does not change the deformation of the small body. An empty `elements` skips
-    the check of compiled forces. Values of `constants` that neither law nor material declares are
-    ignored; a constant without a value has that of `usual_constants`.
+    Values of `constants` that neither law nor material declares are ignored; a constant without a
+    value has that of `usual_constants`.
     """
     made = as_damping(law)
     known = as_material(material)
@@ -88,16 +82,36 @@ def check_damping(
             _check_dissipation(check, stress, F=F, where=where)
         if is_objective:
             _check_objectivity(check, stress, F=F, rate=rate, where=where)
-    for element in elements:
-        check_internal_forces(
-            check,
-            known,
-            damping=made,
-            values=values,
-            element=element,
-            is_objective=is_objective,
-            is_dissipative=is_dissipative,
-        )
+
+
+def damping_stress(
+    law: DampingLaw, material: Material, symbols: list[ca.SX]
+) -> tuple[ca.SX, ca.SX | None]:
+    """Return the stress P_v (9,) of a damping law, and the stated ∂P_v/∂F (9, 9).
+
+    Parameters
+    ----------
+    symbols : list of SX
+        F (9,), its rate (9,), the constants of the material and those of the law.
+
+    Returns
+    -------
+    tuple
+        The second entry is None if the law has a potential, whose derivatives are all generated.
+
+    Raises
+    ------
+    AssertionError
+        If the law has neither stress nor potential.
+    """
+    F, rate, material_values, law_values = symbols
+    psi = damped_psi(law, material, ca.reshape(F, 3, 3), material_values)
+    named = {c.name: law_values[k] for k, c in enumerate(law.constants)}
+    if law.stress is not None:
+        stress, slope = law.stress(psi, F, rate, **named)
+        return ca.SX(stress), ca.SX(slope)
+    assert law.potential is not None
+    return ca.gradient(law.potential(psi, F, rate, **named), F), None
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..errors import InputError
-from ..fem.body import Body
 from ..fem.node_force import CONTEXT_OFFSETS, CONTEXT_SIZE, ForceContext, Law, NodeForce
 from ..model.generated_functions import GeneratedFunction
-from .program_derivatives import check_program
 from .property_check import PropertyCheck
-from .small_problems import (
-    DENSITY_KG_M3,
-    TIMESTEP_S,
-    program_of,
-    swung_experiment,
-    uneven_box,
-    usual_constants,
-)
+from .small_problems import TIMESTEP_S, usual_constants
 
 # Number of random states, and of random velocities for the power at each.
 STATES = 3
@@ -49,15 +39,12 @@ def check_force(
     energy: Callable[..., Any] | None = None,
     is_dissipative: bool = False,
     is_zero_at_rest: bool = False,
-    positions_m: ArrayLike | None = None,
-    body: Body | None = None,
 ) -> None:
-    """Check a custom force: values, derivatives in programs, energy and dissipation.
+    """Check a custom force: values, derivatives, energy and dissipation.
 
     At random states the generated force equals the law called with numbers, its first and second
     derivatives by position, velocity, constants and internal variables are CasADi's automatic
-    derivatives of the plain law and agree with central differences, and so do gradient, Jacobian
-    and Hessian of a small program with the force.
+    derivatives of the plain law and agree with central differences.
 
     Parameters
     ----------
@@ -74,11 +61,6 @@ def check_force(
         f(x, 0))·v ≤ 0.
     is_zero_at_rest : bool
         Whether the force is zero at the undeformed place of a node that does not move.
-    positions_m : (k, 3) array, optional
-        Places at which to check; by default random places in a box of 0.1 m.
-    body : Body, optional
-        Body with the force, for the small program; by default a box with the force on all nodes
-        or faces.
 
     Raises
     ------
@@ -101,7 +83,9 @@ def check_force(
             f"force {made.name!r} is on faces, where an energy cannot be checked; leave out the energy"
         )
     law = ForceLaw(made, np.array([*values.values()]))
-    states = [law.random_state(check.rng, place) for place in _places(check.rng, positions_m)]
+    states = [
+        law.random_state(check.rng, place) for place in check.rng.uniform(0.01, 0.1, (STATES, 3))
+    ]
     for number, state in enumerate(states):
         where = f"at random state {number}"
         _check_derivatives(check, law, state=state, where=where)
@@ -115,16 +99,6 @@ def check_force(
         check.require_equal(
             found, np.zeros(law.dofs), statement="the force at rest is not zero", scale=1.0
         )
-    unplaced = replace(made, nodes=None)
-    small = body or Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[unplaced])
-    check_program(check, program_of(swung_experiment(small), values))
-
-
-def _places(rng: np.random.Generator, positions_m: ArrayLike | None) -> Array:
-    """Return given places (k, 3) [m], or `STATES` random ones in a box of 0.1 m."""
-    if positions_m is None:
-        return rng.uniform(0.01, 0.1, (STATES, 3))
-    return np.asarray(positions_m, dtype=float).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)

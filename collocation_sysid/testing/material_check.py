@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,12 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
-from ..fem.body import Body
-from ..fem.laws.materials import DAMPINGS, Energy, Material, as_material
-from .internal_force_check import check_internal_forces
-from .program_derivatives import check_program
+from ..fem.laws.materials import Energy, Material, as_material
 from .property_check import PropertyCheck
-from .small_problems import DENSITY_KG_M3, program_of, swung_experiment, uneven_box, usual_constants
+from .small_problems import usual_constants
 
 # Number of random deformations.
 DEFORMATIONS = 4
@@ -35,19 +32,15 @@ def check_material(
     *,
     constants: Mapping[str, float] | None = None,
     is_objective: bool = True,
-    elements: Sequence[str] = ("tet4",),
-    has_memory: bool = False,
     largest_strain: float = LARGEST_STRAIN,
 ) -> None:
-    """Check a material: energy, stress, stiffness, objectivity and compiled forces.
+    """Check a material: energy, stress, stiffness and objectivity.
 
     The undeformed material has no energy and no stress, and resists every small strain. Stress
     and stiffness at random deformations, and at deformations with equal principal stretches, are
     the derivatives of the energy, by central differences, and so are the derivatives of the
     stress by the constants; a rotation changes neither the energy nor the stress in the body's
-    axes. The compiled forces of a small body, and their derivatives of first and second order by
-    positions, velocities and constants, agree with a plain sum over its elements and CasADi's
-    automatic derivatives of it, and with central differences.
+    axes.
 
     Parameters
     ----------
@@ -58,10 +51,6 @@ def check_material(
         for constants of unknown size.
     is_objective : bool
         Whether the energy does not depend on rotations; false for linear elasticity.
-    elements : sequence of str
-        Elements of the small body: "tet4", "tet10" and "tet10-p0".
-    has_memory : bool
-        Whether to check a small program in which the material has a branch of memory, too.
     largest_strain : float
         Largest entry of F − I of the random deformations; smaller for materials with a limit.
 
@@ -74,8 +63,7 @@ def check_material(
 
     Notes
     -----
-    An empty `elements` skips the check of compiled forces. Entries of `constants` that the material
-    does not declare are ignored.
+    Entries of `constants` that the material does not declare are ignored.
     """
     made = as_material(material)
     check = PropertyCheck(f"material {made.name!r}")
@@ -86,19 +74,6 @@ def check_material(
         _check_derivatives(check, law, F=F, where=where)
         if is_objective:
             _check_objectivity(check, law, F=F, where=where)
-    for element in elements:
-        check_internal_forces(
-            check,
-            made,
-            damping=DAMPINGS["kelvin-voigt"],
-            values=values,
-            element=element,
-            is_objective=is_objective,
-            is_dissipative=True,
-        )
-    if has_memory:
-        body = Body(uneven_box(1), made, density_kg_m3=DENSITY_KG_M3, prony=["prony_1"])
-        check_program(check, program_of(swung_experiment(body), values))
 
 
 @dataclass(frozen=True, eq=False)

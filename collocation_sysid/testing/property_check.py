@@ -144,66 +144,17 @@ class PropertyCheck:
             ]
             return np.stack([np.ravel(column) for column in columns], axis=1)
 
-        size = _size(found, function(point))
+        size = derivative_size(found, function(point))
         self.require_equal(
             found,
-            _closest(found, differences, tolerance=tolerance * size),
-            statement=f"{statement}, by central differences",
-            tolerance=tolerance,
-            scale=size,
-        )
-
-    def require_product(
-        self,
-        function: Callable[[Array], ArrayLike],
-        product: ArrayLike,
-        point: Array,
-        direction: Array,
-        *,
-        statement: str,
-        tolerance: float = DIFFERENCES,
-    ) -> None:
-        """Compare the product of a derivative with one direction with central differences.
-
-        Parameters
-        ----------
-        function : callable
-            Function of an array like `point`.
-        product : array
-            Derivative times `direction`.
-        statement : str
-            What it means if they differ.
-        tolerance : float
-            Largest difference, relative to the largest entry of the product.
-
-        Raises
-        ------
-        AssertionError
-            If they differ.
-
-        Notes
-        -----
-        The largest entry is not taken below `ROUNDING` times the largest value of the function.
-        `direction` is a large change of `point`; of the differences with the `STEPS`, the closest
-        to the product count.
-        """
-        found = np.asarray(product, dtype=float)
-        size = _size(found, function(point))
-        expected = _closest(
-            found,
-            lambda step: directional_derivative(function, point, direction=direction, step=step),
-            tolerance=tolerance * size,
-        )
-        self.require_equal(
-            found,
-            expected,
+            closest(found, differences, tolerance=tolerance * size),
             statement=f"{statement}, by central differences",
             tolerance=tolerance,
             scale=size,
         )
 
 
-def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:
+def closest(found: Array, differences: Callable[[float], Array], *, tolerance: float) -> Array:
     """Return, of the differences with each of the `STEPS`, those closest to a derivative."""
     candidates = []
     distances = []
@@ -217,7 +168,7 @@ def _closest(found: Array, differences: Callable[[float], Array], *, tolerance: 
     return candidates[int(np.argmin(distances))]
 
 
-def _size(derivative: Array, value: ArrayLike) -> float:
+def derivative_size(derivative: Array, value: ArrayLike) -> float:
     """Return the largest absolute entry of a derivative, but not less than `ROUNDING` times the
     largest absolute value of the function, nor less than the smallest positive float.
     """

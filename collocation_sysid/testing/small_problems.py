@@ -11,11 +11,8 @@ from scipy.spatial.transform import Rotation
 from ..common.array_types import Array, Index
 from ..fem.body import Body
 from ..fem.laws.constants import Constant, is_modulus, usual_value
-from ..fem.meshes.mesh import TetMesh
-from ..fem.meshes.structured import box_mesh
 from ..model.parameters import Parameters, Unknown
 from ..program.collocation import Collocation
-from ..program.lifted.collocation import lifted_variables
 from ..recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 
 # A soft foam: stiffness [Pa], Poisson's ratio and density [kg/m³] of the bodies.
@@ -28,20 +25,6 @@ SMALL_MODULUS_PA = 30.0
 # need.
 TIMESTEP_S = 0.01
 STEPS = 6
-
-
-def uneven_box(divisions: int) -> TetMesh:
-    """Return the mesh of a box of about 0.10 × 0.12 × 0.09 m with randomly displaced nodes, so that
-    no two elements are alike; every call gives the same mesh.
-
-    Parameters
-    ----------
-    divisions : int
-        Number of cells along each edge; each consists of six tetrahedra.
-    """
-    mesh = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
-    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
-    return TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
 
 
 def smooth_poses(
@@ -152,30 +135,3 @@ def program_of(experiment: Experiment, values: Mapping[str, float]) -> Collocati
 def _unknown(value: float) -> Unknown | float:
     """Return an estimated constant with its guess; zero is fixed, as it has no scale."""
     return Unknown(value) if value else value
-
-
-def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Array:
-    """Return variables z of a program that satisfy no equation: rigid motions, parameters and
-    lifted variables with random errors.
-
-    Lags of sensors are positive. The collocation is not modified.
-
-    Parameters
-    ----------
-    collocation : Collocation
-        Program, with or without lifted variables.
-    """
-    positions = []
-    for transcription in collocation.transcriptions:
-        rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s)
-        rigid = rigid.reshape(-1, transcription.dof_count)
-        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
-    p = collocation.guess_p
-    p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
-    p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
-    is_lag = np.array(["lag of" in name for name in collocation.parameter_names], dtype=bool)
-    p[is_lag] = np.abs(p[is_lag]) + 0.1
-    z = collocation.pack(p, positions)
-    for lifted in lifted_variables(collocation):
-        z[lifted.columns] += 0.01 * rng.normal(size=lifted.count)
-    return z

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kit.internal_force_check import check_compiled_forces
 from kit.scikit_fem import Library
 from scipy.optimize import minimize
 
@@ -166,7 +167,9 @@ def test_energy_and_forces_with_hoops_are_those_of_scikit_fem(small_mesh, rng, e
     ],
 )
 def test_kernels_agree_with_the_plain_formula(matrix, law):
-    check_material(reinforced(MATERIALS[matrix], law))
+    material = reinforced(MATERIALS[matrix], law)
+    check_material(material)
+    check_compiled_forces(material)
 
 
 def test_a_field_of_directions_equals_regions_with_one_direction_each():

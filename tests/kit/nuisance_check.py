@@ -15,14 +15,10 @@ from collocation_sysid.program.markers.residual import MarkerResidual
 from collocation_sysid.recording.deviation import Deviation
 from collocation_sysid.recording.experiment import Experiment
 from collocation_sysid.recording.nuisance import KINDS
-from collocation_sysid.testing.program_derivatives import check_program
 from collocation_sysid.testing.property_check import PropertyCheck
-from collocation_sysid.testing.small_problems import (
-    DENSITY_KG_M3,
-    program_of,
-    swung_experiment,
-    uneven_box,
-)
+from collocation_sysid.testing.small_problems import DENSITY_KG_M3, program_of, swung_experiment
+from kit.problems import uneven_box
+from kit.program_derivatives import check_program
 
 # Standard deviation of a kind that has none by default.
 USUAL_SIGMA = 0.01

@@ -20,6 +20,7 @@ from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.parameters import Parameter, Parameters
 from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.collocation import lifted_variables
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import (
     Experiment,
@@ -35,8 +36,7 @@ from collocation_sysid.recording import (
     Sphere,
     Tendon,
 )
-from collocation_sysid.testing.small_problems import shaken_variables, smooth_poses
-from collocation_sysid.testing.small_problems import uneven_box as uneven_box
+from collocation_sysid.testing.small_problems import smooth_poses
 
 TRUTH = {"lambda_pa": 200.0, "mu_pa": 300.0, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
 GUESS = Parameters(
@@ -322,3 +322,44 @@ def prescribed_positions(experiment: Experiment, t_s: ArrayLike) -> Array:
     """Coordinates of the prescribed dofs (g,) at some times, (T, g); NaN where a dof is free."""
     positions = experiment.prescribed_displacements(t_s)[1]
     return positions.reshape(len(positions), -1)[:, experiment.prescribed_dofs]
+
+
+def uneven_box(divisions: int) -> TetMesh:
+    """Return the mesh of a box of about 0.10 × 0.12 × 0.09 m with randomly displaced nodes, so that
+    no two elements are alike; every call gives the same mesh.
+
+    Parameters
+    ----------
+    divisions : int
+        Number of cells along each edge; each consists of six tetrahedra.
+    """
+    mesh = box_mesh((0.10, 0.12, 0.09), (divisions,) * 3)
+    jitter = np.random.default_rng(1).uniform(-0.008, 0.008, mesh.points_m.shape)
+    return TetMesh(mesh.points_m + jitter, mesh.tetrahedra)
+
+
+def shaken_variables(collocation: Collocation, rng: np.random.Generator) -> Array:
+    """Return variables z of a program that satisfy no equation: rigid motions, parameters and
+    lifted variables with random errors.
+
+    Lags of sensors are positive. The collocation is not modified.
+
+    Parameters
+    ----------
+    collocation : Collocation
+        Program, with or without lifted variables.
+    """
+    positions = []
+    for transcription in collocation.transcriptions:
+        rigid = transcription.experiment.rigid_positions(transcription.dynamics.t_s)
+        rigid = rigid.reshape(-1, transcription.dof_count)
+        positions.append(rigid + 1e-3 * rng.normal(size=rigid.shape))
+    p = collocation.guess_p
+    p[: collocation.nq] += 0.1 * rng.normal(size=collocation.nq)
+    p[collocation.nq :] += 0.5 * rng.normal(size=collocation.nphi)
+    is_lag = np.array(["lag of" in name for name in collocation.parameter_names], dtype=bool)
+    p[is_lag] = np.abs(p[is_lag]) + 0.1
+    z = collocation.pack(p, positions)
+    for lifted in lifted_variables(collocation):
+        z[lifted.columns] += 0.01 * rng.normal(size=lifted.count)
+    return z

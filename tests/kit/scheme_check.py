@@ -14,8 +14,6 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.schemes import Scheme, Stencil, as_scheme
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.testing.finite_differences import observed_order
-from collocation_sysid.testing.program_derivatives import check_program
 from collocation_sysid.testing.property_check import PropertyCheck
 from collocation_sysid.testing.small_problems import (
     DENSITY_KG_M3,
@@ -23,6 +21,8 @@ from collocation_sysid.testing.small_problems import (
     swung_experiment,
     usual_constants,
 )
+from kit.checks import observed_order
+from kit.program_derivatives import check_program
 
 # Rounding of sums of coefficients.
 ROUNDING = 1e-12

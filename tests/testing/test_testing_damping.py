@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import casadi as ca
 import pytest
+from kit.internal_force_check import check_compiled_forces, check_internal_forces
 from kit.materials import CONSTANTS, ELASTIC
 
 from collocation_sysid.fem.laws.constants import GAMMA_R, Constant
 from collocation_sysid.fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, material_form
 from collocation_sysid.testing import check_damping
-from collocation_sysid.testing.internal_force_check import check_internal_forces
 from collocation_sysid.testing.property_check import PropertyCheck
 
 # Every law with linear and averaging elements, and with a linear material, which does not
@@ -28,21 +28,19 @@ CASES += [pytest.param(*each, marks=pytest.mark.long) for each in AVERAGED]
 @pytest.mark.long
 @pytest.mark.parametrize(("law", "material", "element"), CASES)
 def test_every_law_passes(law: str, material: str, element: str):
-    is_objective = law != "rayleigh" and material != "linear"
-    check_damping(
-        law,
-        material=material,
-        constants=CONSTANTS.get(material, ELASTIC),
-        is_objective=is_objective,
-        is_dissipative=law != "rayleigh",
-        elements=[element],
-        largest_strain=0.2 if law == "rayleigh" else 0.5,
-    )
+    properties = {
+        "constants": CONSTANTS.get(material, ELASTIC),
+        "is_objective": law != "rayleigh" and material != "linear",
+        "is_dissipative": law != "rayleigh",
+    }
+    largest_strain = 0.2 if law == "rayleigh" else 0.5
+    check_damping(law, material=material, largest_strain=largest_strain, **properties)
+    check_compiled_forces(material, element, law, **properties)
 
 
 @pytest.mark.parametrize("law", ["kelvin-voigt", "material"])
 def test_objective_laws_take_energy_out_at_large_strain(law: str):
-    check_damping(law, elements=[], largest_strain=1.5)
+    check_damping(law, largest_strain=1.5)
 
 
 def test_rayleighs_law_is_neither_objective_nor_dissipative():

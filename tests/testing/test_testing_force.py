@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import pytest
 from kit.forces import breath, foundation
+from kit.problems import uneven_box
+from kit.program_derivatives import check_program
 
 import collocation_sysid as cs
 from collocation_sysid.fem.air import unit_drag
 from collocation_sysid.testing import check_force
+from collocation_sysid.testing.property_check import PropertyCheck
+from collocation_sysid.testing.small_problems import DENSITY_KG_M3, program_of, swung_experiment
 
 
 def drag(x, v, at, drag_coefficient):
@@ -47,10 +53,6 @@ def quadratic_body() -> cs.Body:
 FORCES = {
     "foundation": (foundation, {"constants": {"whirl_n_m3": 4e4}}),
     "breath": (cs.NodeForce.from_law(breath, on="faces"), {"is_dissipative": True}),
-    "breath, quadratic": (
-        cs.NodeForce.from_law(breath, on="faces"),
-        {"is_dissipative": True, "body": quadratic_body()},
-    ),
     "drag": (drag, {"is_dissipative": True, "is_zero_at_rest": True}),
     "bed": (bed, {"energy": bed_energy, "is_zero_at_rest": True, "is_dissipative": True}),
     "lift": (lift, {"is_dissipative": True, "is_zero_at_rest": True}),
@@ -64,6 +66,14 @@ FORCES = {
 def test_every_kind_of_force_passes(name: str):
     force, options = FORCES[name]
     check_force(force, **options)
+    made = force if isinstance(force, cs.NodeForce) else cs.NodeForce.from_law(force)
+    constants = options.get("constants", {})
+    body = cs.Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[replace(made, nodes=None)])
+    check_program(PropertyCheck(name), program_of(swung_experiment(body), constants))
+
+
+def test_programs_of_a_force_on_quadratic_faces_pass():
+    check_program(PropertyCheck("breath"), program_of(swung_experiment(quadratic_body()), {}))
 
 
 def pushed(x, v, at, push_n_m):

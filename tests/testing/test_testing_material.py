@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import casadi as ca
 import pytest
+from kit.internal_force_check import check_compiled_forces
 from kit.materials import COMPILED, CONSTANTS, ELASTIC
+from kit.problems import uneven_box
+from kit.program_derivatives import check_program
 
+from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
 from collocation_sysid.fem.laws.materials import MATERIALS, Material
 from collocation_sysid.testing import check_material
+from collocation_sysid.testing.property_check import PropertyCheck
+from collocation_sysid.testing.small_problems import DENSITY_KG_M3, program_of, swung_experiment
 
 # Materials with elements: each kind of energy with linear elements, each element with one material.
 CASES = [(name, "tet4") for name in COMPILED] + [("neo-hookean", name) for name in ELEMENTS]
@@ -23,26 +29,28 @@ LIMITS = [("ogden-2", {"alpha_2": 0.0}), ("hyperfoam-1", {"beta_1": 0.0})]
 @pytest.mark.parametrize(("name", "element"), dict.fromkeys(CASES))
 def test_every_material_passes(name: str, element: str):
     constants = CONSTANTS.get(name, ELASTIC)
-    check_material(name, constants=constants, is_objective=name != "linear", elements=[element])
+    check_material(name, constants=constants, is_objective=name != "linear")
+    check_compiled_forces(name, element, constants=constants, is_objective=name != "linear")
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_every_number_of_terms_passes(name: str):
-    check_material(name, constants=CONSTANTS[name], elements=[])
+    check_material(name, constants=CONSTANTS[name])
 
 
 @pytest.mark.parametrize(("name", "limit"), LIMITS)
 def test_limits_of_exponents_pass(name: str, limit: dict):
-    check_material(name, constants=CONSTANTS[name] | limit, elements=[])
+    check_material(name, constants=CONSTANTS[name] | limit)
 
 
 @pytest.mark.parametrize(
     "name",
     ["neo-hookean", *(pytest.param(n, marks=pytest.mark.long) for n in ("ogden-1", "hyperfoam-1"))],
 )
-def test_a_material_with_memory_passes(name: str):
+def test_programs_of_a_material_with_memory_pass(name: str):
     constants = CONSTANTS.get(name, ELASTIC)
-    check_material(name, constants=constants, elements=[], has_memory=True)
+    body = Body(uneven_box(1), name, density_kg_m3=DENSITY_KG_M3, prony=["prony_1"])
+    check_program(PropertyCheck(name), program_of(swung_experiment(body), constants))
 
 
 def test_the_message_of_a_principal_stretch_that_is_not_smooth():
@@ -54,7 +62,7 @@ def test_the_message_of_a_principal_stretch_that_is_not_smooth():
         return mu_pa * (ca.sumsqr(strain) + ca.trace(strain) ** 2 * (1 + ca.fabs(difference)))
 
     with pytest.raises(AssertionError, match=r"∂P/∂F is wrong at a uniaxial stretch of 1\.2, by"):
-        check_material(Material.from_energy(kinked), is_objective=False, elements=[])
+        check_material(Material.from_energy(kinked), is_objective=False)
 
 
 def resists_rotation(F, mu_pa):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from kit.program_derivatives import require_product
 
 from collocation_sysid.testing.property_check import PropertyCheck
 
@@ -39,6 +40,6 @@ def test_a_derivative_with_a_wrong_sign_entry_or_missing_fails():
 def test_a_product_with_a_wrong_sign_fails():
     direction = np.array([1.0, 2.0])
     product = 3 * POINT**2 * direction
-    CHECK.require_product(cubes, product, POINT, direction, statement="the slope is wrong")
+    require_product(CHECK, cubes, product, POINT, direction, statement="the slope is wrong")
     with pytest.raises(AssertionError, match="the slope is wrong, by central differences, entry"):
-        CHECK.require_product(cubes, -product, POINT, direction, statement="the slope is wrong")
+        require_product(CHECK, cubes, -product, POINT, direction, statement="the slope is wrong")

@@ -7,10 +7,13 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from kit.program_derivatives import check_program
 
 import collocation_sysid as cs
 from collocation_sysid.program.custom_sensor_residual import CustomSensorResidual
 from collocation_sysid.testing import check_sensor
+from collocation_sysid.testing.property_check import PropertyCheck
+from collocation_sysid.testing.small_problems import DENSITY_KG_M3, program_of, swung_experiment
 
 TIMES_S = np.linspace(0.0, 0.1, 11)
 
@@ -49,7 +52,12 @@ SENSORS = {
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_every_kind_of_sensor_passes(name: str):
-    check_sensor(SENSORS[name])
+    sensor = SENSORS[name]
+    check_sensor(sensor)
+    box = cs.box_mesh((0.1, 0.1, 0.12), (1, 1, 2))
+    body = cs.Body(cs.TetMesh(box.points_m - 0.02, box.tetrahedra), density_kg_m3=DENSITY_KG_M3)
+    recorded = swung_experiment(body, readings=[sensor.with_samples(TIMES_S[:5] + 0.013, None)])
+    check_program(PropertyCheck(name), program_of(recorded, {}))
 
 
 def one_sided(at, scale):

@@ -8,6 +8,7 @@ deformation gradient at a point and contract afterwards.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,12 +16,21 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..common.array_types import Array, Index
-from ..fem.body import Body
-from ..fem.laws.materials import DampingLaw, Material, damped_psi
-from ..program.linear_algebra.block_band import full_matrix
-from .property_check import EXACT, PropertyCheck
-from .small_problems import DENSITY_KG_M3, uneven_box, usual_constants
+from collocation_sysid.common.array_types import Array, Index
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.laws.materials import (
+    DampingLaw,
+    Energy,
+    Material,
+    as_damping,
+    as_material,
+)
+from collocation_sysid.program.linear_algebra.block_band import full_matrix
+from collocation_sysid.testing.damping_check import damping_stress
+from collocation_sysid.testing.property_check import EXACT, PropertyCheck
+from collocation_sysid.testing.small_problems import DENSITY_KG_M3, usual_constants
+from kit.problems import uneven_box
+from kit.program_derivatives import require_product
 
 # Size of random displacements of nodes [m] and their velocities [m/s]; edges are about 0.1 m long.
 DISPLACEMENT_M = 4e-3
@@ -33,36 +43,6 @@ SPIN_RAD_S = 20.0
 SECOND_DERIVATIVES = 1e-8
 # Size of a large change of a position [m], for differences.
 LARGE_CHANGE_M = 0.03
-
-
-def damping_stress(
-    law: DampingLaw, material: Material, symbols: list[ca.SX]
-) -> tuple[ca.SX, ca.SX | None]:
-    """Return the stress P_v (9,) of a damping law, and the stated ∂P_v/∂F (9, 9).
-
-    Parameters
-    ----------
-    symbols : list of SX
-        F (9,), its rate (9,), the constants of the material and those of the law.
-
-    Returns
-    -------
-    tuple
-        The second entry is None if the law has a potential, whose derivatives are all generated.
-
-    Raises
-    ------
-    AssertionError
-        If the law has neither stress nor potential.
-    """
-    F, rate, material_values, law_values = symbols
-    psi = damped_psi(law, material, ca.reshape(F, 3, 3), material_values)
-    named = {c.name: law_values[k] for k, c in enumerate(law.constants)}
-    if law.stress is not None:
-        stress, slope = law.stress(psi, F, rate, **named)
-        return ca.SX(stress), ca.SX(slope)
-    assert law.potential is not None
-    return ca.gradient(law.potential(psi, F, rate, **named), F), None
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +140,30 @@ class PlainInternalForce:
         hessian[size : 2 * size, -1] -= self.body.dof_mass * w
         hessian[-1, size : 2 * size] -= self.body.dof_mass * w
         return force, jacobian, hessian
+
+
+def check_compiled_forces(
+    material: str | Energy | Material,
+    element: str = "tet4",
+    damping: str | DampingLaw = "kelvin-voigt",
+    constants: Mapping[str, float] | None = None,
+    *,
+    is_objective: bool = True,
+    is_dissipative: bool = True,
+) -> None:
+    """Check the compiled forces of a small body with stated constants, or those of a soft foam."""
+    made = as_material(material)
+    law = as_damping(damping)
+    values = usual_constants((*made.constants, *law.constants), constants)
+    check_internal_forces(
+        PropertyCheck(f"material {made.name!r} with damping {law.name!r}"),
+        made,
+        law,
+        values,
+        element,
+        is_objective=is_objective,
+        is_dissipative=is_dissipative,
+    )
 
 
 def check_internal_forces(
@@ -265,7 +269,8 @@ def _check_energy(check: PropertyCheck, body: Body, x: Array, theta: Array) -> N
     constants = {c.name: named[c.name] for c in body.parts[0].material.constants}
     direction = LARGE_CHANGE_M * check.rng.standard_normal(x.size)
     force = body.force(x, np.zeros_like(x), theta)[0]
-    check.require_product(
+    require_product(
+        check,
         lambda at: np.atleast_1d(body.energy(at, **constants)),
         np.atleast_1d(-force @ direction),
         point=x,
@@ -330,14 +335,16 @@ def _check_differences(
         return w @ _first_derivatives(body, u[:size], v=u[size : 2 * size], theta=u[2 * size :])
 
     where = f"of the compiled force of {body.element.name} elements is wrong"
-    check.require_product(
+    require_product(
+        check,
         force_at,
         derivatives[0] @ direction,
         point=point,
         direction=direction,
         statement=f"the first derivative {where}",
     )
-    check.require_product(
+    require_product(
+        check,
         weighted_derivative_at,
         derivatives[1] @ direction,
         point=point,

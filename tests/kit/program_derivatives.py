@@ -2,18 +2,77 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
 
-from ..common.array_types import Array
-from ..program.collocation import Collocation
-from ..program.lifted.collocation import with_lifted_variables
-from .property_check import PropertyCheck
-from .small_problems import shaken_variables
+import numpy as np
+from numpy.typing import ArrayLike
+
+from collocation_sysid.common.array_types import Array
+from collocation_sysid.program.collocation import Collocation
+from collocation_sysid.program.lifted.collocation import with_lifted_variables
+from collocation_sysid.testing.finite_differences import directional_derivative
+from collocation_sysid.testing.property_check import (
+    DIFFERENCES,
+    PropertyCheck,
+    closest,
+    derivative_size,
+)
+from kit.problems import shaken_variables
 
 # Weight of the loss in the Lagrangian; not 1, so that a missing weight is noticed.
 LOSS_WEIGHT = 1.3
 # Size of a large change of the scaled variables.
 CHANGE = 0.05
+
+
+def require_product(
+    check: PropertyCheck,
+    function: Callable[[Array], ArrayLike],
+    product: ArrayLike,
+    point: Array,
+    direction: Array,
+    *,
+    statement: str,
+    tolerance: float = DIFFERENCES,
+) -> None:
+    """Compare the product of a derivative with one direction with central differences.
+
+    Parameters
+    ----------
+    function : callable
+        Function of an array like `point`.
+    product : array
+        Derivative times `direction`.
+    statement : str
+        What it means if they differ.
+    tolerance : float
+        Largest difference, relative to the largest entry of the product.
+
+    Raises
+    ------
+    AssertionError
+        If they differ.
+
+    Notes
+    -----
+    The largest entry is not taken below `ROUNDING` times the largest value of the function.
+    `direction` is a large change of `point`; of the differences with the `STEPS`, the closest
+    to the product count.
+    """
+    found = np.asarray(product, dtype=float)
+    size = derivative_size(found, function(point))
+    expected = closest(
+        found,
+        lambda step: directional_derivative(function, point, direction=direction, step=step),
+        tolerance=tolerance * size,
+    )
+    check.require_equal(
+        found,
+        expected,
+        statement=f"{statement}, by central differences",
+        tolerance=tolerance,
+        scale=size,
+    )
 
 
 def check_program(check: PropertyCheck, collocation: Collocation) -> None:
@@ -58,14 +117,16 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
         direction[columns] = CHANGE * check.rng.standard_normal(len(direction[columns]))
         if not direction.any():
             continue
-        check.require_product(
+        require_product(
+            check,
             lambda at: np.atleast_1d(program.objective(at)),
             np.atleast_1d(gradient @ direction),
             point=z,
             direction=direction,
             statement=f"the gradient of the loss by {meaning} is wrong in a small program",
         )
-        check.require_product(
+        require_product(
+            check,
             program.constraint_values,
             jacobian @ direction,
             point=z,
@@ -73,7 +134,8 @@ def check_program(check: PropertyCheck, collocation: Collocation) -> None:
             statement=f"the Jacobian of the equations of motion by {meaning} is wrong "
             "in a small program",
         )
-        check.require_product(
+        require_product(
+            check,
             lagrangian_gradient,
             hessian @ direction,
             point=z,
