@@ -239,14 +239,10 @@ def _undetermined_sentence(result: Result) -> list[str]:
     """Estimates that a reason of the verdict names are left out."""
     stated = stated_as_undetermined(result)
     sources = []
-    for name, shares in result.budget.items():
-        if name in stated or name not in result.estimates:
-            continue
-        if not result.estimates[name].is_determined:
-            source, share = next(iter(shares.items()))
-            sources.append(
-                f"{symbol_of(name)} (largest contribution: {source_label(source)}, {share:.0%})"
-            )
+    for name, limit in result.limits.items():
+        if name not in stated and not limit.determined:
+            largest = f"{source_label(limit.source)}, {limit.share:.0%}"
+            sources.append(f"{symbol_of(name)} (largest contribution: {largest})")
     if not sources:
         return []
     return [

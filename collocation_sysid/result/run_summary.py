@@ -25,7 +25,6 @@ from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.variance_sources import source_label
 from ..statistics.combinations import precision_text
-from ..statistics.remedies import remedy_for
 from .alternative_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,
@@ -191,17 +190,16 @@ def _limit(result: Result) -> Iterator[str]:
         yield best.statement(most=1) + more
     stated = stated_as_undetermined(result)
     combined = {name for each in result.combinations for name in each.determined.names}
-    values = result.estimates
-    known = [name for name in result.budget if name in values and result.budget[name]]
-    if not known:
+    limits = result.limits
+    if not limits:
         return
-    vague = [name for name in known if name not in stated and not values[name].is_determined]
+    vague = [name for name in limits if name not in stated and not limits[name].determined]
     shown = [
         name for name in vague if name in result.parameters or without_region(name) in SHOWN_MODULI
     ]
-    stiffness = next((name for name in STIFFNESS_NAMES if name in known), known[0])
+    stiffness = next((name for name in STIFFNESS_NAMES if name in limits), next(iter(limits)))
     name = next(iter(shown), stiffness)
-    largest = next(iter(result.budget[name]))
+    limit = limits[name]
     sources = [
         f"{source_label(source)} {share:.0%}"
         for source, share in [*result.budget[name].items()][:SHOWN_SOURCES]
@@ -211,7 +209,7 @@ def _limit(result: Result) -> Iterator[str]:
     if alone := [name for name in shown if name not in combined]:
         symbols = listed(map(symbol_of, alone))
         subject = f"not determined: {symbols}; {subject}"
-    remedy = f"to reduce {source_label(largest)}, {remedy_for(largest)}"
+    remedy = f"to reduce {source_label(limit.source)}, {limit.remedy}"
     yield f"{subject}; {remedy}{effect_of_remedy(result, name)}"
 
 
@@ -223,8 +221,7 @@ def effect_of_remedy(result: Result, name: str) -> str:
     if estimate.is_determined or estimate.combined95 is None or estimate.combined95[0] <= 0:
         return ""
     lower, upper = estimate.combined95
-    share = next(iter(result.budget[name].values()))
-    factor = (upper / lower) ** (0.5 * np.sqrt(max(0.0, 1 - share)))
+    factor = (upper / lower) ** (0.5 * np.sqrt(max(0.0, 1 - result.limits[name].share)))
     return f": {symbol_of(name)} would then be determined {precision_text(factor)}"
 
 

@@ -60,6 +60,9 @@ def build_result(answer: SolvedProblem) -> Result:
     problem = answer.problem
     collocation = solution.collocation
     values = answer.estimates
+    scale = scale_reference(
+        problem.experiments, problem.parameters, deviation=problem.assumed_deviations["mass"]
+    )
     return Result(
         schema=SCHEMA,
         status=solution.status.value,
@@ -69,16 +72,13 @@ def build_result(answer: SolvedProblem) -> Result:
         trust=answer.trust,
         method=solution.method,
         title=problem.title,
-        parameters={
-            item.name: values[item.name]
-            for item in answer.solution.collocation.parameters.components
-        },
+        parameters={item.name: values[item.name] for item in collocation.parameters.components},
         derived={name: values[name] for name in answer.derived},
-        basis=tuple(_reference_sentences(answer)),
+        basis=tuple(_reference_sentences(answer, scale)),
         budget={name: line.shares for name, line in answer.budget.items()},
         alternatives=answer.alternatives,
         origin_answers=answer.origin_answers,
-        scale=_scale(problem),
+        scale=scale,
         probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
@@ -132,14 +132,7 @@ def _provenance(problem: Problem) -> Provenance:
     )
 
 
-def _scale(problem: Problem) -> ScaleReference | None:
-    """Return what sets the scale of the moduli if no force is measured, else None."""
-    return scale_reference(
-        problem.experiments, problem.parameters, deviation=problem.assumed_deviations["mass"]
-    )
-
-
-def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
+def _reference_sentences(answer: SolvedProblem, scale: ScaleReference | None) -> Iterator[str]:
     problem = answer.problem
     parts = [part for each in problem.experiments if not each.is_static for part in each.body.parts]
     laws = dict.fromkeys(part.damping.name for part in parts if GAMMA_R in part.damping.constants)
@@ -148,7 +141,7 @@ def _reference_sentences(answer: SolvedProblem) -> Iterator[str]:
     ]
     if law_names:
         yield f"{GAMMA_R.symbol} refers to the damping law {' and '.join(law_names)}"
-    if (scale := _scale(problem)) is not None:
+    if scale is not None:
         yield scale.sentence
     tests = [each.specimen for each in problem.experiments if each.specimen is not None]
     if any(test.area_over_length_m or "force" in test.columns for test in tests):
@@ -165,19 +158,17 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     if known is None:
         return None
     reported = [k for k, name in enumerate(known.names) if name in known.estimates]
-    combined = drawn = None
-    if answer.systematic_effects is not None:
-        combined = answer.covariance()[np.ix_(reported, reported)]
-        drawn = answer.draw_covariance
+    both = np.ix_(reported, reported)
+    is_combined = answer.systematic_effects is not None
     return copy_fields(
         UncertaintyResult,
         known,
         names=tuple(known.names[k] for k in reported),
-        correlation=known.correlation[np.ix_(reported, reported)],
-        covariance=known.covariance[np.ix_(reported, reported)],
+        correlation=known.correlation[both],
+        covariance=known.covariance[both],
         quantiles=known.quantiles[reported],
-        combined_covariance=combined,
-        draw_covariance=drawn,
+        combined_covariance=answer.covariance()[both] if is_combined else None,
+        draw_covariance=answer.draw_covariance if is_combined else None,
         noise_factors=known.level.factors,
         autocorrelation=known.dependence.lag1,
         verdicts=tuple(identifiability_sentences(known, answer.combinations)),
@@ -199,21 +190,15 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
 def _field_result(estimate: FieldEstimate) -> FieldResult:
     """Share and number of modes are None, without evidence, if a deviation is not finite."""
     modes = estimate.modes
-    volumes_m3 = estimate.modes.volumes_m3
-    ends = (float(estimate.value.min()), float(estimate.value.max()))
-    is_determined = estimate.is_informed
-    if not np.isfinite(estimate.deviation).all():
-        return FieldResult(
-            modes.describe_resolution(), ends, determined_share=None, identified=None, likelier={}
-        )
-    share = float(volumes_m3[is_determined].sum() / volumes_m3.sum())
-    likelier = {f"{each:g}": estimate.log_evidence_ratio(each) for each in modes.field.lengths_m}
+    known = bool(np.isfinite(estimate.deviation).all())
+    share = float(modes.volumes_m3[estimate.is_informed].sum() / modes.volumes_m3.sum())
+    lengths_m = modes.field.lengths_m if known else ()
     return FieldResult(
         modes.describe_resolution(),
-        ends,
-        determined_share=share,
-        identified=estimate.identified_mode_count,
-        likelier=likelier,
+        (float(estimate.value.min()), float(estimate.value.max())),
+        determined_share=share if known else None,
+        identified=estimate.identified_mode_count if known else None,
+        likelier={f"{each:g}": estimate.log_evidence_ratio(each) for each in lengths_m},
     )
 
 
@@ -225,12 +210,10 @@ def _recordings_agreement(answer: SolvedProblem) -> dict[str, RecordingsAgreemen
     parameters = answer.solution.collocation.parameters
     for k in parameters.scalar_coordinates:
         item = parameters.free[k]
-        away = q[k] + scatter.differences[:, k]
-        values = [item.from_coordinate(float(x)) if np.isfinite(x) else np.nan for x in away]
-        deviations = scatter.deviations[:, k].tolist()
+        values = map(item.from_coordinate, (q[k] + scatter.differences[:, k]).tolist())
         agreements[item.name] = RecordingsAgreement(
             dict(zip(scatter.recordings, values, strict=True)),
-            dict(zip(scatter.recordings, deviations, strict=True)),
+            dict(zip(scatter.recordings, scatter.deviations[:, k].tolist(), strict=True)),
             chi_squared=float(scatter.chi_squared[k]),
             degrees_of_freedom=int(scatter.degrees_of_freedom[k]),
             disagree=bool(scatter.find_disagreements()[k]),
@@ -300,10 +283,14 @@ def _nuisance(answer: SolvedProblem) -> dict[str, dict[str, NuisanceResult]]:
     deviations = answer.uncertainty.nuisance if answer.uncertainty is not None else {}
     named: dict[str, dict[str, NuisanceResult]] = {}
     for part in answer.solution.parts:
-        for entry, name, value in part.transcription.nuisance.iterate_values(part.phi):
-            error = deviations[name] * entry.sigma if name in deviations else None
-            here = named.setdefault(part.transcription.experiment.name, {})
-            here[entry.label] = NuisanceResult(value, entry.sigma, std_error=error)
+        here = {
+            entry.label: NuisanceResult(
+                value, entry.sigma, deviations[name] * entry.sigma if name in deviations else None
+            )
+            for entry, name, value in part.transcription.nuisance.iterate_values(part.phi)
+        }
+        if here:
+            named[part.transcription.experiment.name] = here
     return named
 
 

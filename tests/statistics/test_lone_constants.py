@@ -18,6 +18,7 @@ from collocation_sysid.result.run_summary import effect_of_remedy
 from collocation_sysid.runs import expected_precision
 from collocation_sysid.runs.expected_precision import added_measurements
 from collocation_sysid.runs.result_builder import build_result
+from collocation_sysid.runs.result_content import Limit
 from collocation_sysid.statistics.combinations import find_combinations, lone_constants
 
 TRUTH = {"young_pa": 800.0, "poisson": 0.33, "gamma_r_s": 0.009, "gamma_m_1_s": 1.0}
@@ -253,7 +254,7 @@ def test_a_predicted_remedy_determines_a_constant():
 def test_the_effect_of_a_remedy_is_stated_for_the_determined_constant():
     estimate = SimpleNamespace(is_determined=False, combined95=(1.0, 16.0))
     result: Any = SimpleNamespace(
-        estimates={"lambda_pa": estimate}, budget={"lambda_pa": {"scale": 0.75, "noise": 0.25}}
+        estimates={"lambda_pa": estimate}, limits={"lambda_pa": Limit(False, "scale", 0.75, "")}
     )
     assert (
         effect_of_remedy(result, "lambda_pa")
