@@ -8,11 +8,10 @@ them.
 
 from __future__ import annotations
 
-import sys
-import urllib.request
+import shutil
 from pathlib import Path
 
-from script_arguments import make_parser
+from script_arguments import fetched_files
 
 FOLDER = Path(__file__).parents[2] / "problems" / "phantom_compression"
 COMMIT = "52b1271f0f8a966c168e5ddc0886190f12c6551f"
@@ -20,30 +19,16 @@ SOURCE = (
     f"https://raw.githubusercontent.com/abubakardawood/tissue-phantom-material-database/{COMMIT}"
     "/data"
 )
-MATERIALS = ("EF10_0T", "EF30_0T", "EF50_0T")
-RUNS = tuple(f"A{k}" for k in range(1, 6))
+FILES = {
+    f"{material}_A{k}.csv": f"{SOURCE}/{material}/{material}_A{k}.csv"
+    for material in ("EF10_0T", "EF30_0T", "EF50_0T")
+    for k in range(1, 6)
+}
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument(
-        "--from",
-        dest="source",
-        type=Path,
-        help="folder that has the files; without it, they are downloaded",
-    )
-    source = parser.parse_args().source
-    for material in MATERIALS:
-        for run in RUNS:
-            file = f"{material}_{run}.csv"
-            if source is None:
-                content = urllib.request.urlopen(f"{SOURCE}/{material}/{file}").read()
-            elif (source / file).is_file():
-                content = (source / file).read_bytes()
-            else:
-                sys.exit(f"{source} has no {file}")
-            (FOLDER / file).write_bytes(content)
-            print(FOLDER / file)
+    for file in fetched_files(__doc__, FILES):
+        print(shutil.copyfile(file, FOLDER / file.name))
 
 
 if __name__ == "__main__":

@@ -13,15 +13,12 @@ step of the pressure as the problem assumes it.
 
 from __future__ import annotations
 
-import sys
-import tempfile
-import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from script_arguments import make_parser
+from script_arguments import fetched_files
 
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.recording.marker_files import read_markers
@@ -75,28 +72,14 @@ class ArmShape:
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument(
-        "--from",
-        dest="source",
-        type=Path,
-        help="folder that has the files; without it, they are downloaded",
-    )
-    source = parser.parse_args().source
+    names = {f"{pressure}mbar_V3.c3d": pressure for pressure in PRESSURES_MBAR}
+    for file in fetched_files(__doc__, {name: f"{SOURCE}/{name}" for name in names}):
+        pressure = names[file.name]
+        written = FOLDER / f"{pressure}mbar.csv"
+        written.write_text(table_of_tip(file))
+        print(written)
+        (FOLDER / f"{pressure}mbar_step.csv").write_text(table_of_step(1e2 * pressure))
     arm_mesh(ArmShape()).write(FOLDER / "arm.vtu")
-    with tempfile.TemporaryDirectory() as folder:
-        for pressure in PRESSURES_MBAR:
-            name = f"{pressure}mbar_V3.c3d"
-            file = Path(folder) / name if source is None else source / name
-            if source is None:
-                urllib.request.urlretrieve(f"{SOURCE}/{name}", file)
-            elif not file.is_file():
-                sys.exit(f"{source} has no {name}")
-            written = FOLDER / f"{pressure}mbar.csv"
-            written.write_text(table_of_tip(file))
-            print(written)
-            step = FOLDER / f"{pressure}mbar_step.csv"
-            step.write_text(table_of_step(1e2 * pressure))
 
 
 # Recordings -------------------------------------------------------------------------------------

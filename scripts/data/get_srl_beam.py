@@ -10,11 +10,9 @@ the extra: pip install 'collocation-sysid[c3d]'. The meshes are written here too
 from __future__ import annotations
 
 import shutil
-import sys
-import urllib.request
 from pathlib import Path
 
-from script_arguments import make_parser
+from script_arguments import fetched_files
 
 from collocation_sysid.fem.meshes.structured import box_mesh
 
@@ -32,24 +30,10 @@ MESHES = {"beam.vtu": (5, 2, 2), "beam_coarse.vtu": (3, 1, 1)}
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument(
-        "--from",
-        dest="source",
-        type=Path,
-        help="folder that has the files; without it, they are downloaded",
-    )
-    source = parser.parse_args().source
+    for file in fetched_files(__doc__, {name: f"{SOURCE}/{name}" for name in RECORDINGS}):
+        print(shutil.copyfile(file, FOLDER / file.name))
     for name, divisions in MESHES.items():
         box_mesh(SIZE_M, divisions, ORIGIN_M).write(FOLDER / name)
-    for name in RECORDINGS:
-        if source is None:
-            urllib.request.urlretrieve(f"{SOURCE}/{name}", FOLDER / name)
-        elif (source / name).is_file():
-            shutil.copyfile(source / name, FOLDER / name)
-        else:
-            sys.exit(f"{source} has no {name}")
-        print(FOLDER / name)
 
 
 if __name__ == "__main__":
