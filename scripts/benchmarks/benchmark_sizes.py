@@ -1,14 +1,13 @@
 """Time and memory of a simulation and a sweep of bodies with 500 to 20,000 nodes.
 
-The body is a swung cylinder, with the default damping law or with Rayleigh's. Each line is measured
-in a separate process, so that the peak memory is that of the line. On one thread, times are
+The body is a swung cylinder with the default damping law. Each line is measured in a separate
+process, so that the peak memory is that of the line. On one thread, times are
 processor times, which other work on the machine changes little; on more threads they are wall
 times. A sweep consists of a feasibility step and the sensitivities to four parameters; a few time
 steps are enough to measure the cost of one.
 
-    python scripts benchmark_sizes                              # all sizes, one and two threads
-    python scripts benchmark_sizes --size 5000 --steps 200      # peak memory of 200 steps
-    python scripts benchmark_sizes --size 2000 --factorisation band sparse supernodal
+    python scripts benchmark_sizes                 # all sizes, one and two threads
+    python scripts benchmark_sizes --size 5000
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import multiprocessing
 import resource
 import time
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,11 +23,9 @@ from script_arguments import make_parser
 from synthetic import swing
 
 from collocation_sysid import Body, Collocation, Experiment, Grasp, Markers, Parameter, Parameters
-from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import cylinder_mesh
 from collocation_sysid.program.forward.newton_solver import NewtonOptions
 from collocation_sysid.program.forward.scheme_simulation import continue_simulation
-from collocation_sysid.program.linear_algebra.factorisation import Choice
 from collocation_sysid.program.stopwatch import Stopwatch
 from collocation_sysid.program.sweep import Sweep
 from collocation_sysid.recording import Nuisance, place_markers
@@ -77,23 +73,11 @@ def main() -> None:
     """Run the benchmark with the options of the command line, and print its table."""
     parser = make_parser(__doc__)
     parser.add_argument("--size", nargs="+", choices=[*SIZES], default=[*SIZES])
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--factorisation", nargs="+", choices=get_args(Choice), default=["auto"])
-    parser.add_argument("--damping", default="kelvin-voigt")
-    parser.add_argument("--steps", type=int)
     arguments = parser.parse_args()
     for size in arguments.size:
-        for choice in arguments.factorisation:
-            for threads in arguments.threads:
-                case = size, arguments.steps, threads, choice, arguments.damping
-                with multiprocessing.get_context("spawn").Pool(1) as pool:
-                    print(pool.apply(measure_size, case), flush=True)
-
-
-def cylinder(mesh: str) -> TetMesh:
-    """Return the mesh of a cylinder with numbers of rings and layers, such as 2x8."""
-    rings, layers = map(int, mesh.split("x"))
-    return cylinder_mesh(0.04, 0.16, rings, layers)
+        for threads in (1, 2):
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                print(pool.apply(measure_size, (size, threads)), flush=True)
 
 
 def swung_cylinder(body: Body, steps: int) -> Experiment:
@@ -118,22 +102,17 @@ def swung_cylinder(body: Body, steps: int) -> Experiment:
     return Experiment(body, t_s, [grasp], markers, name="swing", nuisance=no_nuisance)
 
 
-def measure_size(size: str, steps: int | None, threads: int, choice: Choice, damping: str) -> str:
-    """Measure simulation and sweep of one body, and return a line of the table.
-
-    `size` is a key of `SIZES`; if `steps` is None, the number of steps there is used.
-    """
-    mesh, element, default_steps = SIZES[size]
-    steps = steps or default_steps
-    body = Body(
-        cylinder(mesh), density_kg_m3=20.0, damping=damping, element=element, threads=threads
-    )
+def measure_size(size: str, threads: int) -> str:
+    """Measure simulation and sweep of one body (a key of `SIZES`), and return a line of the table."""
+    mesh, element, steps = SIZES[size]
+    rings, layers = map(int, mesh.split("x"))
+    shape = cylinder_mesh(0.04, 0.16, rings, layers)
+    body = Body(shape, density_kg_m3=20.0, element=element, threads=threads)
     collocation = Collocation([swung_cylinder(body, steps + 1)], PARAMETERS)
     (transcription,) = collocation.transcriptions
     equations = transcription.equations_at(
         np.log([TRUTH[name] for name in PARAMETERS.names]), np.zeros(0)
     )
-    before_mb = peak_mb()
     clock = time.perf_counter if threads > 1 else time.process_time
     began = clock()
     stopwatch = Stopwatch(clock)
@@ -147,9 +126,9 @@ def measure_size(size: str, steps: int | None, threads: int, choice: Choice, dam
         raise failure
     simulation_cost = PartCost(clock() - began, stopwatch)
     stopwatch = Stopwatch(clock)
-    solver = Sweep(transcription, stopwatch=stopwatch, factorisation=choice)
+    solver = Sweep(transcription, stopwatch=stopwatch)
     # The symbolic factorisation is computed once for all sweeps; accessing this computes it.
-    chunk_bytes = solver.estimate_chunk_bytes()
+    solver.estimate_chunk_bytes()
     began = clock()
     solver.forward(x, equations)
     sweep_cost = PartCost(clock() - began, stopwatch)
@@ -157,8 +136,7 @@ def measure_size(size: str, steps: int | None, threads: int, choice: Choice, dam
         f"{len(body.nodes_m):6d} nodes {element:5s} {steps:4d} steps {threads} threads "
         f"{factorisation_name(solver):10s} simulation {simulation_cost.as_text(steps)}  "
         f"sweep {sweep_cost.as_text(steps)}  "
-        f"chunks of {solver.choose_chunk_rows()} steps, {chunk_bytes / 1e6:.0f} MB; "
-        f"peak memory {peak_mb():.0f} MB, before {before_mb:.0f} MB"
+        f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB"
     )
 
 
@@ -170,11 +148,6 @@ def factorisation_name(solver: Sweep) -> str:
     return (
         "band" if factoriser.is_banded else "supernodal" if factoriser.is_supernodal else "sparse"
     )
-
-
-def peak_mb() -> float:
-    """Return the largest memory of this process so far [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 if __name__ == "__main__":
