@@ -5,13 +5,11 @@ white noise of 0.4 mm; the true pose of the camera differs from image to image, 
 is wrong by 2.7 degrees and 8 mm. Each twin is solved without a guess and from the truth; the loss,
 the intervals and the verdict are printed.
 
-    python scripts study_depth [--twins 30] [--first 0]
+    python scripts study_depth [--twins 30]
 """
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -22,39 +20,6 @@ from script_arguments import make_parser
 import collocation_sysid as cs
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
-
-
-@dataclass(frozen=True)
-class SoftTwin:
-    """Results of one twin of the soft bar."""
-
-    young_pa: float  # estimate of E [Pa]
-    # Ends of the combined interval [Pa].
-    low_pa: float
-    high_pa: float
-    statistical_pa: tuple[float, float]  # (2,): ends of the statistical interval [Pa]
-    # Losses of the solves without a guess and from the true stiffness.
-    loss: float
-    loss_from_truth: float
-    verdict: str
-    processor_time_s: float
-
-    @property
-    def contains_truth(self) -> bool:
-        """Whether the combined interval contains the true stiffness."""
-        return self.low_pa < SOFT_TRUTH["young_pa"] < self.high_pa
-
-    @property
-    def statistical_contains_truth(self) -> bool:
-        """Whether the statistical interval contains the true stiffness."""
-        low_pa, high_pa = self.statistical_pa
-        return low_pa < SOFT_TRUTH["young_pa"] < high_pa
-
-    @property
-    def is_better_optimum(self) -> bool:
-        """Whether the start from the truth does not lead to a noticeably lower loss."""
-        return self.loss < self.loss_from_truth + SAME_LOSS
-
 
 SOFT_TRUTH = {"young_pa": 2.5e4, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 # Camera matrix and image shape (rows, columns) [px].
@@ -142,55 +107,34 @@ def soft_problem(seed: int, guess_pa: float | None = None) -> cs.Problem:
     return cs.Problem([soft_experiment(depth)], parameters)
 
 
-def soft_twin(seed: int) -> SoftTwin:
-    """Solve a twin of the soft bar without a guess and from the truth."""
-    began_s = time.process_time()
-    answer = cs.run(soft_problem(seed), seek_causes=False)
-    processor_time_s = time.process_time() - began_s
-    from_truth = cs.solve(soft_problem(seed, SOFT_TRUTH["young_pa"]))
-    estimate = answer.estimates["young_pa"]
-    low_pa, high_pa = estimate.combined95 or (0.0, np.inf)
-    return SoftTwin(
-        young_pa=estimate.value,
-        low_pa=low_pa,
-        high_pa=high_pa,
-        statistical_pa=estimate.statistical95 or (0.0, np.inf),
-        loss=robust_loss(answer.solution),
-        loss_from_truth=robust_loss(from_truth),
-        verdict=" ".join([answer.trust.verdict, *answer.trust.reasons]),
-        processor_time_s=processor_time_s,
-    )
-
-
-def study_soft_bar(seeds: range) -> None:
-    """Print the results of twins of the soft bar, and the coverage of their intervals."""
-    twins = []
-    for seed in seeds:
-        twin = soft_twin(seed)
-        twins.append(twin)
-        low, high = twin.statistical_pa
-        print(
-            f"seed {seed}: E {1e-3 * twin.young_pa:.1f} kPa, combined {1e-3 * twin.low_pa:.1f} to "
-            f"{1e-3 * twin.high_pa:.1f}, statistical {1e-3 * low:.1f} to {1e-3 * high:.1f}, loss "
-            f"{twin.loss:.1f} ({twin.loss_from_truth:.1f} from the truth), {twin.processor_time_s:.0f} s, "
-            f"{twin.verdict}",
-            flush=True,
-        )
-    values = np.array([twin.young_pa for twin in twins]) / SOFT_TRUTH["young_pa"]
-    print(
-        f"{sum(twin.contains_truth for twin in twins)} of {len(twins)} combined and "
-        f"{sum(twin.statistical_contains_truth for twin in twins)} statistical intervals contain "
-        f"the truth; {sum(twin.is_better_optimum for twin in twins)} ended in the better optimum; "
-        f"E over the truth {np.mean(values):.3f} with a standard deviation of {np.std(values):.3f}"
-    )
-
-
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--twins", type=int, default=30)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first twin")
-    options = parser.parse_args()
-    study_soft_bar(range(options.first, options.first + options.twins))
+    truth_pa = SOFT_TRUTH["young_pa"]
+    found = []
+    for seed in range(parser.parse_args().twins):
+        answer = cs.run(soft_problem(seed), seek_causes=False)
+        loss = robust_loss(answer.solution)
+        loss_from_truth = robust_loss(cs.solve(soft_problem(seed, truth_pa)))
+        estimate = answer.estimates["young_pa"]
+        intervals = [
+            each or (0.0, np.inf) for each in (estimate.combined95, estimate.statistical95)
+        ]
+        contained = [low < truth_pa < high for low, high in intervals]
+        found.append((estimate.value / truth_pa, *contained, loss < loss_from_truth + SAME_LOSS))
+        ends = [f"{low / truth_pa:.3f} to {high / truth_pa:.3f}" for low, high in intervals]
+        print(
+            f"seed {seed}: E over the truth {estimate.value / truth_pa:.3f}, combined {ends[0]}, "
+            f"statistical {ends[1]}, loss {loss:.1f} ({loss_from_truth:.1f} from the truth), "
+            f"{answer.trust.verdict}",
+            flush=True,
+        )
+    ratios, combined, statistical, better = np.array(found).T
+    print(
+        f"{combined.sum():.0f} of {len(found)} combined and {statistical.sum():.0f} statistical "
+        f"intervals contain the truth; {better.sum():.0f} ended in the better optimum; E over the "
+        f"truth {ratios.mean():.3f} with a standard deviation of {ratios.std():.3f}"
+    )
 
 
 if __name__ == "__main__":

@@ -18,12 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from script_arguments import make_parser
-from studies import markdown, number, save
+from studies import markdown, number
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
@@ -63,7 +62,6 @@ Motion = Callable[[Array], Array]
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--tasks", nargs="*", choices=list(TASKS), default=list(TASKS))
-    parser.add_argument("--out", type=Path, default=Path("results/study_planning"))
     arguments = parser.parse_args()
     plant = Plant()
     recorded = recording(plant)
@@ -71,25 +69,20 @@ def main() -> None:
     run = cs.run(cs.Problem([recorded], unknown(), uncertainty=exact))
     print(run.table(), run.trust.verdict, *run.trust.reasons, sep="\n    ", flush=True)
     rows = []
-    rigid = np.nan, np.nan, np.nan
     for name in arguments.tasks:
         wanted = TASKS[name]()
         plan = plan_motion(run, wanted.task, LIMITS)
         motions: dict[str, Motion] = {"rigid": wanted.rigid_hand}
-        motions["plan"] = plan_coordinates(plan)
+        motions["plan"] = lambda t_s, plan=plan: plan.motion.derivatives(t_s).value
         motions["rigid, shaped"] = Shaper.at(plan, run).shaped(wanted)
         for title, motion in motions.items():
             t_s, tip = executed(plant, motion, wanted.task.duration_s + AFTER_S)
             values = errors_of(t_s, tip, wanted)
-            rigid = values if title == "rigid" else rigid
-            shares = [number(mine / its) for mine, its in zip(values[:2], rigid[:2], strict=True)]
-            rows.append((name, title, *(number(value, 1e3) for value in values), *shares))
+            rows.append((name, title, *(number(value, 1e3) for value in values)))
             print(*rows[-1], f"hand off by {1e6 * plant.lag_m:.2g} µm", flush=True)
             if title == "plan":
                 print(band_report(tip, plan), flush=True)
-    heads = ("task", "hand", "RMS mm", "largest mm", "residual vibration mm")
-    heads += ("RMS, times rigid", "largest, times rigid")
-    save(arguments.out, "planning", markdown(heads, rows))
+    print(markdown(("task", "hand", "RMS mm", "largest mm", "residual vibration mm"), rows))
 
 
 # The plant ----------------------------------------------------------------------------------------
@@ -377,11 +370,6 @@ class Shaper:
 
 
 # Execution ----------------------------------------------------------------------------------------
-
-
-def plan_coordinates(plan: MotionPlan) -> Motion:
-    """Return the coordinates of the planned hand."""
-    return lambda t_s: plan.motion.derivatives(t_s).value
 
 
 def executed(plant: Plant, motion: Motion, time_s: float) -> tuple[Array, Array]:

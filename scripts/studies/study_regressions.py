@@ -1,9 +1,8 @@
 """Certified nonlinear regressions of NIST: correct digits of values and standard errors.
 
 The 27 regressions of the Statistical Reference Datasets (NIST, public domain) are solved from both
-official starts by this package (as identifications, see `regressions`), by SciPy's `curve_fit` and
-`least_squares`, by lmfit and by pyPESTO, each with its default tolerances; lmfit and pyPESTO only if
-they are installed. `curve_fit` and lmfit use finite differences, the others exact derivatives.
+official starts by this package (as identifications, see `regressions`) and by SciPy's `curve_fit`
+(finite differences) and `least_squares` (exact derivatives), each with its default tolerances.
 A digit is −log₁₀ |x − c|/|c| with the certified value c, at most 11, the smallest of all parameters.
 
 With --profiles, the profile likelihood of regressions with up to 60 observations: that of the
@@ -17,9 +16,7 @@ FOLDER has the files of NIST, such as `MGH09.dat`, from https://www.itl.nist.gov
 
 from __future__ import annotations
 
-import importlib.util
 import sys
-import time
 import warnings
 from collections.abc import Callable
 from fractions import Fraction
@@ -109,46 +106,6 @@ def by_least_squares(regression: Regression, start: Array) -> tuple[Array, Array
     return found.x, standard_errors(regression, found.x, found.jac.T @ found.jac)
 
 
-def by_lmfit(regression: Regression, start: Array) -> tuple[Array, Array]:
-    """Values and standard errors (P,) of `lmfit.minimize`."""
-    import lmfit
-
-    parameters = lmfit.Parameters()
-    for name, value in zip(regression.names, start, strict=True):
-        parameters.add(name, value=float(value))
-    found = lmfit.minimize(
-        lambda p: regression.residuals(np.array(list(p.valuesdict().values()))), parameters
-    )
-    known = [found.params[name] for name in regression.names]
-    errors = [np.nan if each.stderr is None else each.stderr for each in known]
-    return np.array([each.value for each in known]), np.array(errors)
-
-
-def by_pypesto(regression: Regression, start: Array) -> tuple[Array, Array]:
-    """Values and standard errors (P,) of pyPESTO with SciPy's trust region on least squares."""
-    import pypesto
-    import pypesto.optimize
-
-    jacobian = slopes(regression)
-    objective = pypesto.Objective(
-        fun=lambda b: 0.5 * float(np.sum(regression.residuals(b) ** 2)),
-        grad=lambda b: jacobian(b).T @ regression.residuals(b),
-        res=regression.residuals,
-        sres=jacobian,
-    )
-    wide = 1e4 * np.abs(start)
-    problem = pypesto.Problem(objective, lb=-wide, ub=wide, x_guesses=[start])
-    result = pypesto.optimize.minimize(
-        problem,
-        optimizer=pypesto.optimize.ScipyOptimizer(method="ls_trf"),
-        n_starts=1,
-        progress_bar=False,
-    )
-    values = np.asarray(result.optimize_result[0]["x"])
-    at = jacobian(values)
-    return values, standard_errors(regression, values, at.T @ at)
-
-
 def profile_error(regression: Regression) -> float:
     """Return the largest relative error of the ends of a profile-likelihood interval."""
     k = int(np.argmax(regression.errors / np.abs(regression.values)))
@@ -234,7 +191,6 @@ def main() -> None:
     """Run the study and print its tables."""
     parser = make_parser(__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--names", nargs="*", help="regressions; all by default")
     parser.add_argument("--profiles", action="store_true", help="profile likelihoods alone")
     arguments = parser.parse_args()
     fits: dict[str, Fit] = {
@@ -242,13 +198,7 @@ def main() -> None:
         "curve_fit": by_curve_fit,
         "least_squares": by_least_squares,
     }
-    if importlib.util.find_spec("lmfit"):
-        fits["lmfit"] = by_lmfit
-    if importlib.util.find_spec("pypesto"):
-        fits["pyPESTO"] = by_pypesto
-    paths = sorted(arguments.folder.glob("*.dat"))
-    regressions = [read_regression(each) for each in paths]
-    regressions = [r for r in regressions if not arguments.names or r.name in arguments.names]
+    regressions = [read_regression(each) for each in sorted(arguments.folder.glob("*.dat"))]
     regressions.sort(key=lambda r: LEVELS.index(r.difficulty))
     if arguments.profiles:
         few = [each for each in regressions if len(each.y) <= MOST_OBSERVATIONS]
@@ -257,11 +207,9 @@ def main() -> None:
         return
     rows = []
     counts = {name: [0, 0] for name in fits}
-    times_s = dict.fromkeys(fits, 0.0)
     for regression, k in product(regressions, range(2)):
         row = [f"{regression.name}, {regression.difficulty.lower()}", str(k + 1)]
         for name, fit in fits.items():
-            begun_s = time.process_time()
             try:
                 with warnings.catch_warnings(), np.errstate(all="ignore"):
                     warnings.simplefilter("ignore")
@@ -270,17 +218,14 @@ def main() -> None:
             except Exception as error:  # of any of the packages: the search has failed
                 print(regression.name, k + 1, name, repr(error), file=sys.stderr)
                 correct = 0.0, 0.0
-            times_s[name] += time.process_time() - begun_s
             is_found = correct[0] >= FOUND
             counts[name][0] += is_found
             counts[name][1] += is_found and correct[1] >= FOUND
             row.append(" / ".join(f"{each:.1f}" for each in correct) if is_found else "–")
-        print(row, file=sys.stderr, flush=True)
         rows.append(row)
     for k, text in enumerate((f"values to {FOUND:g} digits", "and standard errors")):
         shares = [f"{each[k]} of {2 * len(regressions)}" for each in counts.values()]
         rows.append([text, "", *shares])
-    rows.append(["processor time, s", "", *(f"{each:.1f}" for each in times_s.values())])
     print(markdown(["regression", "start", *fits], rows))
     heads = ["parameters", "condition of the scaled J", "this package", "inverse of JᵀJ"]
     print(markdown(heads, near_singular()))

@@ -10,11 +10,11 @@ estimates are 734.3, 182.8, 0.021 and 0.91, and in a simulation with these the e
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from script_arguments import make_parser
-from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, number, run_variants, save
+from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, number, run_variants
 
 from collocation_sysid.extras.studies.rows import Row
 
@@ -60,10 +60,10 @@ def main() -> None:
         time_s=arguments.time_s,
         workers=arguments.workers,
     )
-    save(arguments.out, "study_table1", table(rows))
+    print(table(rows))
 
 
-def table(rows: Mapping[str, Sequence[Row]]) -> str:
+def table(rows: Mapping[str, Row]) -> str:
     """Return a Markdown table of the estimates, misfits and constraint violations."""
     heads = (
         *(
@@ -78,7 +78,7 @@ def table(rows: Mapping[str, Sequence[Row]]) -> str:
     )
     truth = ("truth", *(f"{value:g}" for value in TRUTH.values()), *("0",) * 4, *"–––")
     lines = [truth, PAPER_ROW]
-    for name, (row, *_) in rows.items():
+    for name, row in rows.items():
         lines.append(
             (
                 name,

@@ -50,30 +50,34 @@ CC_BY = "CC BY 4.0"
 MIT = "MIT"
 OWN = "this project"
 
+
+def _twin(name: str, specimen: str, file: str = "problem") -> CatalogueSource:
+    problem = f"problems/{name}/{file}.toml"
+    return CatalogueSource(f"twin_{name}", problem, specimen, OWN, MIT, f"make_{name}")
+
+
+def _specimen(name: str, file: str, specimen: str, *, is_long: bool = False) -> CatalogueSource:
+    problem = f"problems/phantom_compression/{file}.toml"
+    return CatalogueSource(
+        name, problem, specimen, PHANTOMS, CC_BY, static_times_are_recorded=True, is_long=is_long
+    )
+
+
 SOURCES = (
-    CatalogueSource(
+    _specimen(
         "ecoflex_00_30_sticking",
-        "problems/phantom_compression/problem.toml",
+        "problem",
         "Ecoflex 00-30, cylinder compressed between sticking platens",
-        PHANTOMS,
-        CC_BY,
-        static_times_are_recorded=True,
     ),
-    CatalogueSource(
+    _specimen(
         "ecoflex_00_30_lubricated",
-        "problems/phantom_compression/sliding.toml",
+        "sliding",
         "Ecoflex 00-30, the same loads, platens assumed to be lubricated",
-        PHANTOMS,
-        CC_BY,
-        static_times_are_recorded=True,
     ),
-    CatalogueSource(
+    _specimen(
         "ecoflex_00_30_whole_stroke",
-        "problems/phantom_compression/whole_stroke.toml",
+        "whole_stroke",
         "Ecoflex 00-30, cylinder compressed to a third of its height, with contact",
-        PHANTOMS,
-        CC_BY,
-        static_times_are_recorded=True,
         is_long=True,
     ),
     CatalogueSource(
@@ -139,52 +143,10 @@ SOURCES = (
         f"Diani and co-workers; {RUBBER}",
         MIT,
     ),
-    CatalogueSource(
-        "twin_foam_cylinder",
-        "problems/foam_cylinder/recording.toml",
-        "foam cylinder swung by a robot, marker positions unknown",
-        OWN,
-        MIT,
-        "make_foam_cylinder",
-    ),
-    CatalogueSource(
-        "twin_noisy_cylinder",
-        "problems/noisy_cylinder/problem.toml",
-        "foam cylinder with lost, exchanged and misplaced markers",
-        OWN,
-        MIT,
-        "make_noisy_cylinder",
-    ),
-    CatalogueSource(
-        "twin_table1",
-        "problems/table1/problem.toml",
-        "cylinder of Table I of the paper, data without noise",
-        OWN,
-        MIT,
-        "make_table1",
-    ),
-    CatalogueSource(
-        "twin_wrist_sensor",
-        "problems/wrist_sensor/problem.toml",
-        "foam block of unknown density, hand with a force sensor",
-        OWN,
-        MIT,
-        "make_wrist_sensor",
-    ),
-    CatalogueSource(
-        "twin_laid_block",
-        "problems/laid_block/problem.toml",
-        "foam block that a gripper places on a plate",
-        OWN,
-        MIT,
-        "make_laid_block",
-    ),
-    CatalogueSource(
-        "twin_poked_block",
-        "problems/poked_block/problem.toml",
-        "gel block poked by a ball at twelve places, force only",
-        OWN,
-        MIT,
-        "make_poked_block",
-    ),
+    _twin("foam_cylinder", "foam cylinder swung by a robot, marker positions unknown", "recording"),
+    _twin("noisy_cylinder", "foam cylinder with lost, exchanged and misplaced markers"),
+    _twin("table1", "cylinder of Table I of the paper, data without noise"),
+    _twin("wrist_sensor", "foam block of unknown density, hand with a force sensor"),
+    _twin("laid_block", "foam block that a gripper places on a plate"),
+    _twin("poked_block", "gel block poked by a ball at twelve places, force only"),
 )

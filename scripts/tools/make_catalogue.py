@@ -8,7 +8,6 @@ fail or that exceed the time limit are listed as omitted.
     python scripts make_catalogue --reuse            # solves what has no run folder yet
     python scripts make_catalogue --reuse --long     # also those of more than ten minutes
     python scripts make_catalogue --only isoprene_rubber   # solves this one, and keeps the others
-    python scripts make_catalogue --page-only        # writes the page from the JSON file
 """
 
 from __future__ import annotations
@@ -42,7 +41,6 @@ from collocation_sysid.fem.laws.constants import is_damping, unit_of
 from collocation_sysid.fem.regions import BodyPart
 from collocation_sysid.result.replay import MotionRecord, read_run
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.statistics.budget.combined_intervals import ReportedEstimate
 
 JSON_FILE = ROOT / "docs" / "catalogue.json"
 PAGE_FILE = ROOT / "docs" / "catalogue.md"
@@ -57,14 +55,9 @@ TIME_LIMIT_S = 1500.0
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--reuse", action="store_true", help="use the run folders that exist")
-    parser.add_argument("--page-only", action="store_true", help="write the page from the JSON")
     parser.add_argument("--long", action="store_true", help="solve long problems too")
     parser.add_argument("--only", nargs="+", default=(), help="names; other entries are kept")
-    parser.add_argument("--time-limit-s", type=float, default=TIME_LIMIT_S)
     options = parser.parse_args()
-    if options.page_only:
-        write_page(read_catalogue())
-        return
     entries = []
     omitted = []
     kept = read_catalogue() if options.only else Catalogue(cs.__version__, (), ())
@@ -74,14 +67,12 @@ def main() -> None:
             outcome = earlier[source.name]
             (omitted if isinstance(outcome, Omission) else entries).append(outcome)
             continue
-        outcome = make_entry(
-            source, reuse=options.reuse, time_limit_s=options.time_limit_s, with_long=options.long
-        )
+        outcome = make_entry(source, reuse=options.reuse, with_long=options.long)
         print(source.name, outcome.reason if isinstance(outcome, Omission) else outcome.verdict)
         (omitted if isinstance(outcome, Omission) else entries).append(outcome)
     catalogue = Catalogue(cs.__version__, tuple(entries), tuple(omitted))
     write_text_file(JSON_FILE, as_json(catalogue) + "\n")
-    write_page(catalogue)
+    write_text_file(PAGE_FILE, catalogue_page(catalogue))
 
 
 def read_catalogue() -> Catalogue:
@@ -89,13 +80,12 @@ def read_catalogue() -> Catalogue:
     return read(Catalogue, json.loads(JSON_FILE.read_text(encoding="utf-8")))
 
 
-def write_page(catalogue: Catalogue) -> None:
-    """Write the page docs/catalogue.md with the constants of all materials."""
-    write_text_file(PAGE_FILE, catalogue_page(catalogue))
-
-
 def make_entry(
-    source: CatalogueSource, *, reuse: bool, time_limit_s: float, with_long: bool = False
+    source: CatalogueSource,
+    *,
+    reuse: bool,
+    time_limit_s: float = TIME_LIMIT_S,
+    with_long: bool = False,
 ) -> CatalogueEntry | Omission:
     """Return the entry of a problem, solved in its run folder, or why there is none."""
     folder = RUNS / source.name
@@ -195,24 +185,17 @@ def constants_of(
     """Return parameters and derived moduli; without the dampings of equilibria, which have none."""
     named = {n: e for n, e in result.estimates.items() if not (is_static and is_damping(n))}
     return tuple(
-        _constant(name, each, name in result.derived, truth.get(name))
-        for name, each in named.items()
-    )
-
-
-def _constant(
-    name: str, estimate: ReportedEstimate, is_derived: bool, true_value: float | None
-) -> IdentifiedConstant:
-    """Return one constant of an entry."""
-    return IdentifiedConstant(
-        name=name,
-        unit=unit_of(name) or "1",
-        value=estimate.value,
-        combined95=estimate.combined95,
-        is_stated=bool(estimate.fixed),
-        is_derived=is_derived,
-        reason=estimate.reason,
-        true_value=true_value,
+        IdentifiedConstant(
+            name=name,
+            unit=unit_of(name) or "1",
+            value=estimate.value,
+            combined95=estimate.combined95,
+            is_stated=bool(estimate.fixed),
+            is_derived=name in result.derived,
+            reason=estimate.reason,
+            true_value=truth.get(name),
+        )
+        for name, estimate in named.items()
     )
 
 

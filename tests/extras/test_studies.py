@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 import study_faults
-import study_methods
 import study_table1
 from assumed_twins import _body
-from studies import PARAMETER_SYMBOLS, TRUTH, Variant, markdown, run_variants, worst_error
+from studies import PARAMETER_SYMBOLS, TRUTH, markdown, run_variants
 
 from collocation_sysid.statistics.budget.shape_error import thickness_m
 
@@ -32,48 +28,12 @@ def row(**changes) -> dict:
     return {**found, **errors, **numbers, **rest, "status": "converged", **changes}
 
 
-# Starts -------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def small_problem(tmp_path_factory) -> Path:
-    return study_methods.write_problem(tmp_path_factory.mktemp("starts"), 2, 10, 0.02)
-
-
-def test_a_variant_is_solved_from_every_start(small_problem):
-    variants = [Variant("shooting", "shooting", {"gradient": "forward"})]
-    rows = run_variants(small_problem, variants, small_problem.parent, starts=2, spread=1.5)
-    (result,) = (study_methods.score(name, each) for name, each in rows.items())
-    assert (result.runs, result.successes, result.converged, result.misled) == (2, 2, 2, 0)
-    (line,) = cells(study_methods.table([result]))
-    assert line[:3] == ["shooting", "2 of 2", "100"]
-
-
-def test_a_slow_variant_gets_the_first_starts(small_problem, monkeypatch):
-    monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
-    variants = [Variant("all", "shooting"), Variant("few", "penalty", share=0.25)]
-    rows = run_variants(small_problem, variants, small_problem.parent / "none", starts=8)
-    assert [len(each) for each in rows.values()] == [8, 2]
-    guesses = [[each[k][f"guess_{n}"] for n in TRUTH] for each in rows.values() for k in (0, 1)]
-    assert guesses[:2] == guesses[2:]
-
-
-def test_a_run_without_an_answer_counts_as_a_failure():
-    lost = row(total_s=None, converged=False, **{f"error_{name}": None for name in TRUTH})
-    far = row(error_mu_pa=0.5)
-    result = study_methods.score("some", [row(), far, lost])
-    assert (result.successes, result.converged, result.misled) == (1, 2, 1)
-    assert worst_error(lost) == np.inf
-    low, high = result.interval
-    assert 0 < low < 1 / 3 < high < 1
-
-
 # Table I ------------------------------------------------------------------------------------------
 
 
 def test_table_1_sets_every_method_beside_truth_and_paper():
     stopped = row(rms_m=None, total_s=None, status="timeout")
-    lines = cells(study_table1.table({"one": [row()], "other": [stopped]}))
+    lines = cells(study_table1.table({"one": row(), "other": stopped}))
     truth, paper, one, other = lines
     assert {len(line) for line in lines} == {12}
     assert one[1:5] == truth[1:5] == ["200", "300", "0.009", "1"]
@@ -84,7 +44,7 @@ def test_table_1_sets_every_method_beside_truth_and_paper():
 def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
     monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
     rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS, tmp_path)
-    assert {len(each) for each in rows.values()} == {1}
+    assert list(rows) == [each.name for each in study_table1.VARIANTS]
 
 
 def test_tables_are_markdown():
@@ -98,7 +58,7 @@ def test_tables_are_markdown():
 
 
 def test_a_twin_with_noisy_poses_is_identified_and_listed():
-    found = study_faults.run("poses 0.1 mm, 0.06°, estimated", (0, 1))
+    found = study_faults.run("poses 0.5 mm, 0.3°, estimated", (0, 1))
     assert found.converged
     assert found.contains_truth.sum() >= 3
     line = study_faults.table_row("poses", [found])
@@ -142,11 +102,3 @@ def test_faults_have_the_size_in_their_name():
     moved, _ = study_faults.FAULTS["marker positions 1 mm"](measured, rng)
     offsets = moved.markers.positions_m - before
     assert np.linalg.norm(offsets, axis=2).mean() == pytest.approx(1.6e-3, rel=0.4)
-
-
-@pytest.mark.parametrize(("count", "shown"), [(190, "95"), (182, "91*"), (199, "99.5*")])
-def test_shares_beyond_chance_are_starred(count, shown):
-    outcome = study_faults.FaultOutcome(True, *(np.ones(6) for _ in range(4)))
-    missed = replace(outcome, contains_truth=np.zeros(6))
-    row = study_faults.table_row("none", [outcome] * count + [missed] * (200 - count))
-    assert row[1] == shown

@@ -19,7 +19,7 @@ COMMANDS = (
     "study_contact --parts poked --twins 2",
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
-    "study_methods --starts 1 --methods reduced-space --workers 1",
+    "study_starts --methods --starts 1 --factor 2",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
     "study_mistakes --groups video --only turned --seeds 1 --check-only",
     "study_starts --starts 1 --bodies cylinder",
@@ -53,6 +53,7 @@ def test_every_script_prints_a_help_text():
         if "__main__" in (text := file.read_text(encoding="utf-8"))
         and "parse_args(" not in text
         and "require_no_arguments" not in text
+        and "fetched_files" not in text
     ]
     assert not without_help
 
