@@ -1350,6 +1350,7 @@ def test_a_recording_of_the_plan_narrows_the_statistical_part_of_the_band():
     assert known.half_width_after_recording_m == pytest.approx(half_m, rel=1e-3)
 
 
+@pytest.mark.long
 def test_a_robust_plan_is_better_on_average_over_the_constants():
     plan = known_plan([0.15, 1e-5, 0.3, 1e-5])
     planned = plan.program

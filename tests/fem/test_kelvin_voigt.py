@@ -69,16 +69,6 @@ def test_stress_is_viscous_in_the_rate_of_deformation(rng):
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_forces_balance_and_exert_no_torque(element, rng):
-    body = small_body(element=element)
-    x, v = state(body, rng)
-    force = damping_force(body, x, v).reshape(-1, 3)
-    assert abs(force.sum(axis=0)).max() < 1e-12 * abs(force).sum()
-    torque = np.cross(x.reshape(-1, 3), force)
-    assert abs(torque.sum(axis=0)).max() < 1e-12 * abs(torque).sum()
-
-
-@pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("material", [*COMPILED, of_a_user])
 def test_kelvin_voigt_damping_of_an_undeformed_body_is_rayleighs(material, element, rng):
     """So that damping ratios of small oscillations are the same."""

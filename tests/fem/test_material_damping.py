@@ -111,9 +111,10 @@ def test_damping_of_st_venant_kirchhoff_is_the_rate_of_the_elastic_stress(rng):
     assert relative_error(damping_force(body, x, v)[0].reshape(4, 3)[1:].T, expected) < 1e-7
 
 
+@pytest.mark.parametrize("damping", ["material", "kelvin-voigt"])
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_forces_balance_and_exert_no_torque(element, rng):
-    body = damped_body(element=element)
+def test_forces_balance_and_exert_no_torque(element, damping, rng):
+    body = damped_body(element=element, damping=damping)
     x, v = moving_state(body, rng)
     force = damping_force(body, x, v).reshape(-1, 3)
     assert abs(force.sum(axis=0)).max() < 1e-12 * abs(force).sum()

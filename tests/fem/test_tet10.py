@@ -29,9 +29,11 @@ TET10 = element_named("tet10")
 
 
 @cache
-def small_body(material: str = "neo-hookean", evaluator: str = "auto") -> Body:
+def small_body(
+    material: str = "neo-hookean", evaluator: str = "auto", element: str = "tet10"
+) -> Body:
     """Six elements, no two alike."""
-    return Body(uneven_box(1), material, 30.0, "tet10", damping="rayleigh", evaluator=evaluator)
+    return Body(uneven_box(1), material, 30.0, element, damping="rayleigh", evaluator=evaluator)
 
 
 @pytest.fixture
@@ -136,9 +138,10 @@ def test_evaluators_agree(material, rng):
             assert difference <= 1e-12 * abs(values).max(initial=0), name
 
 
+@pytest.mark.parametrize("element", ["tet10", "tet10-p0"])
 @pytest.mark.parametrize("material", [name for name in COMPILED if name != "linear"])
-def test_rigid_motion_causes_no_force(material, rng):
-    body = small_body(material)
+def test_rigid_motion_causes_no_force(material, element, rng):
+    body = small_body(material, element=element)
     turn = Rotation.from_rotvec([0.5, -2.0, 1.0]).as_matrix()
     moved = body.nodes_m @ turn.T + [0.3, 0.2, -0.1]
     constants = elastic(body)

@@ -130,6 +130,7 @@ def test_the_value_is_corrected_for_the_step_and_lies_within_both_intervals():
         assert coarse.parameters[name] == each.value
 
 
+@pytest.mark.long
 def test_a_scheme_of_first_order_has_its_error_in_the_interval_too():
     euler = run(replace(twin(3e-4, 4), scheme="backward-euler"), seek_causes=False)
     noise = euler.optimum["gamma_r_s"]

@@ -64,6 +64,7 @@ def test_a_problem_uses_the_steps_of_impacts_by_default():
     assert cs.Problem([free], law).collocation().substeps == 1
 
 
+@pytest.mark.long
 def test_few_stated_steps_are_a_note_and_the_first_reason_of_a_failed_search():
     fall = passing(0.975 * DOWN_M_S)
     assert impact_step_concerns(fall, 5) == []

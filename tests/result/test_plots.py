@@ -640,6 +640,7 @@ def test_a_run_has_all_its_pictures(tmp_path):
     np.testing.assert_allclose([width, height], RESOLUTION_DPI * inches, atol=1)
 
 
+@pytest.mark.long
 def test_type_can_be_read_in_a_column():
     seen = replay()
     pictures = all_pictures([seen], told())

@@ -284,6 +284,7 @@ def test_frames_of_obstacles_are_copied():
     assert positions[0] == pytest.approx(given_m.ravel(), abs=1e-12)
 
 
+@pytest.mark.long
 def test_a_coarse_mesh_that_determines_no_modulus_is_no_start():
     """Fifteen nodes cannot be pressed by a ball as the given mesh is."""
     problem = Problem([pressed_box()], TRUTH | {"mu_pa": Unknown(250.0)})

@@ -113,6 +113,7 @@ def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
     assert f" {int(count[0].is_compared.sum())} points of" in fit
 
 
+@pytest.mark.long
 def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(many, monkeypatch):
     def fail(*_):
         raise NoStartError("300 depth points fail")
@@ -124,6 +125,7 @@ def test_a_thinned_start_that_fails_is_replaced_by_the_complete_search(many, mon
     assert compared(solution) == len(depth().clouds[0])
 
 
+@pytest.mark.long
 def test_thinned_points_that_do_not_determine_a_parameter_are_no_start(many, monkeypatch):
     smaller = thinned()
     rough = cs.solve(smaller.problem)
