@@ -35,7 +35,7 @@ NUMBERS: dict[str, Callable[[Result], float | None]] = {
     "total_s": lambda r: r.timing_s.total,
 }
 # Numbers of which the summary of a method has the median over its runs.
-MEDIANS = (*(name for name in NUMBERS if name not in ("loss", "rollout_max_m")), "tip_max_m")
+MEDIANS = tuple(name for name in NUMBERS if name not in ("loss", "rollout_max_m"))
 # 97.5 % quantile of the standard normal distribution.
 NORMAL_975 = 1.959963984540054
 
@@ -88,7 +88,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
     """Return one run as a flat row; values are None if they are not known or NaN.
 
     The columns are "key", "method", "start", "status", "converged", "success", those of the
-    parameters, the names in `NUMBERS` (quality and cost, such as "loss" and "rms_m"), "tip_max_m",
+    parameters, the names in `NUMBERS` (quality and cost, such as "loss" and "rms_m"),
     "wall_s", "attempts" and "message". The columns of the parameters are ``guess_NAME``,
     ``value_NAME``, and ``error_NAME`` (relative to the truth, only for parameters whose truth is
     known).
@@ -119,7 +119,6 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         "success": converged and is_accurate,
         **parameters,
         **numbers,
-        "tip_max_m": record.get("tip_max_m"),
         "wall_s": record.get("wall_s"),
         "attempts": record.get("attempts"),
         "message": record.get("message", ""),

@@ -14,16 +14,12 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...common.files import write_text_file
 from ...common.serialisation import as_json
 from ...common.signal_handling import heed_interrupts, leave
 from ...errors import InputError, SimulationError
-from ...pipeline import Run, run
+from ...pipeline import run
 from ...problem import Problem
-from ...recording.grasp import prescribed_nodes
-from ...runs.forward_simulation import ForwardSimulation
 from .model_choice import fit_record
 from .run_execution import ERROR, FINISHED
 
@@ -53,8 +49,8 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
     -------
     dict
         "outcome" (`FINISHED` or `ERROR`) and "message". Of a finished run also "model", see
-        `fit_record`, if `test_name` is not None (a comparison of models), else "result" and
-        "tip_max_m", see `_tip_error_m`. Of an unexpected error also "traceback".
+        `fit_record`, if `test_name` is not None (a comparison of models), else "result". Of an
+        unexpected error also "traceback".
     """
     try:
         problem = Problem.read(
@@ -69,30 +65,12 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
             "outcome": FINISHED,
             "message": finished.solution.message,
             "result": finished.result,
-            "tip_max_m": _tip_error_m(finished),
         }
     except (InputError, SimulationError) as error:
         return {"outcome": ERROR, "message": str(error)}
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
         return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
-
-
-def _tip_error_m(finished: Run) -> float | None:
-    """Return the largest error [m] of the marker farthest from the grasp in a simulation."""
-    experiment = finished.solution.collocation.transcriptions[0].experiment
-    markers = experiment.markers
-    rollout = finished.rollouts[experiment.name]
-    if not (markers.names and isinstance(rollout, ForwardSimulation)):
-        return None
-    nodes_m = experiment.body.nodes_m
-    grasped_nodes = prescribed_nodes(experiment.grasps)
-    centre = nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(axis=0)
-    tip = int(np.linalg.norm(markers.predict_positions(nodes_m) - centre, axis=1).argmax())
-    if not markers.is_complete[:, tip].any():
-        return None
-    errors_m = rollout.trajectory.markers_m[:, tip] - markers.positions_m[:, tip]
-    return float(np.nanmax(np.linalg.norm(errors_m, axis=1)))
 
 
 def _end_with_study() -> None:
