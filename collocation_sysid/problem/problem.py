@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, field, replace
 from pathlib import Path
-from typing import Literal, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -30,9 +30,9 @@ from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
-def _unconverted(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Parameters:
+def _unconverted(parameters: Parameters | Mapping[str, Unknown | Tied | float]) -> Any:
     """A mapping is converted when the bodies are known."""
-    return cast(Parameters, parameters)
+    return parameters
 
 
 def _as_parameters(
@@ -358,12 +358,12 @@ def _require_rest_shapes(bodies: Iterable[Body], parameters: Parameters) -> None
 
 def _require_equal_fields(bodies: Iterable[Body]) -> None:
     shapes_by_name: dict[str, Array] = {}
-    for part in (part for body in bodies for part in body.parts if part.field):
-        assert part.field is not None
-        shapes = part.field.shapes
-        if not np.array_equal(shapes_by_name.setdefault(part.field_name, shapes), shapes):
+    for name, shapes in (
+        (part.field_name, part.field.shapes) for body in bodies for part in body.parts if part.field
+    ):
+        if not np.array_equal(shapes_by_name.setdefault(name, shapes), shapes):
             raise InputError(
-                f"two bodies have a field of {part.field_name}, whose shapes differ as their "
+                f"two bodies have a field of {name}, whose shapes differ as their "
                 "meshes do; expected one body, or fields of regions with names of their own"
             )
 

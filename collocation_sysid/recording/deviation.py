@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -190,7 +190,7 @@ class Deviation:
     remedy: str = ""
     of: Component = "recording"
     axes: str = ""
-    effect: Callable[..., object] | None = None
+    effect: Callable[..., Any] | None = None
     corrected: Callable[..., tuple[object, Mapping[str, object]] | None] | None = None
     is_whole: bool = False
     of_specimens: bool = False

@@ -103,9 +103,9 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
     """
     count = len(confidence.names) - 1
     half = (confidence.quantiles * np.sqrt(np.diag(confidence.covariance))).tolist()
-    scales = [
-        _DeviationAxis.from_reach(1.15 * min(JOINT_RADIUS * each, MAX_HALF_WIDTH)) for each in half
-    ]
+    reaches = [1.15 * min(JOINT_RADIUS * each, MAX_HALF_WIDTH) for each in half]
+    ticks, texts, units = zip(*map(_ticks, reaches), strict=True)
+    titles = [symbol_as_mathtext(n) + u for n, u in zip(confidence.names, units, strict=True)]
     figure = framed_figure(
         COLUMN_MM, COLUMN_MM if count > 1 else 62, left_mm=14, right_mm=2, foot_mm=11, top_mm=2
     )
@@ -121,14 +121,14 @@ def confidence_ellipses(confidence: Confidence) -> Figure:
             axes, ellipse_outline(confidence, i, j=j), half_width=half[i], half_height=half[j]
         )
         style_axes(axes)
-        axes.set(xlim=scales[i].limits, ylim=scales[j].limits)
+        axes.set(xlim=(-reaches[i], reaches[i]), ylim=(-reaches[j], reaches[j]))
         last = row == count - 1
         first = column == 0
-        axes.set_xticks(scales[i].ticks, scales[i].labels if last else [""] * 3)
-        axes.set_yticks(scales[j].ticks, scales[j].labels if first else [""] * 3)
-        axes.set_xlabel(scales[i].axis_label(confidence.names[i]) if last else "", fontsize=TEXT_PT)
+        axes.set_xticks(ticks[i], texts[i] if last else [""] * 3)
+        axes.set_yticks(ticks[j], texts[j] if first else [""] * 3)
+        axes.set_xlabel(titles[i] if last else "", fontsize=TEXT_PT)
         if first:
-            axes.set_ylabel(scales[j].axis_label(confidence.names[j]), fontsize=TEXT_PT)
+            axes.set_ylabel(titles[j], fontsize=TEXT_PT)
             axes.yaxis.set_label_coords(-0.13 * count, 0.5)
     what = "combined" if confidence.is_combined else "statistical"
     note = f"{what} uncertainty"
@@ -145,36 +145,18 @@ def _draw_pair(axes: Axes, outline: Array, half_width: float, half_height: float
         axes.plot(*line, color=BLACK, lw=0.8, solid_capstyle="butt")
 
 
-@dataclass(frozen=True)
-class _DeviationAxis:
-    """Axis of a logarithm's deviation from its estimate."""
-
-    reach: float  # largest deviation shown, on either side
-    # Deviations with a tick, and their texts.
-    ticks: tuple[float, float, float]
-    labels: tuple[str, str, str]
-    unit: str  # text after the name of the parameter
-
-    @classmethod
-    def from_reach(cls, reach: float) -> _DeviationAxis:
-        """Return an axis in percent, or in factors if it is wide."""
-        if reach > FACTOR_THRESHOLD:
-            factor = round_length(np.exp(0.9 * reach))
-            size = float(np.log(factor))
-            return cls(
-                reach, (-size, 0.0, size), labels=(f"÷{factor:g}", "1", f"×{factor:g}"), unit=""
-            )
-        share = round_length(1 - np.exp(-0.9 * reach))
-        number = f"{100 * share:g}"
-        ticks = (float(np.log1p(-share)), 0.0, float(np.log1p(share)))
-        return cls(reach, ticks, labels=(f"−{number}", "0", f"+{number}"), unit=" [%]")
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        return -self.reach, self.reach
-
-    def axis_label(self, name: str) -> str:
-        return symbol_as_mathtext(name) + self.unit
+def _ticks(reach: float) -> tuple[list[float], list[str], str]:
+    """Return ticks up to a deviation of a logarithm, their texts in percent, or else in factors if
+    the axis is wide, and their unit.
+    """
+    if reach > FACTOR_THRESHOLD:
+        factor = round_length(np.exp(0.9 * reach))
+        size = float(np.log(factor))
+        return [-size, 0.0, size], [f"÷{factor:g}", "1", f"×{factor:g}"], ""
+    share = round_length(1 - np.exp(-0.9 * reach))
+    number = f"{100 * share:g}"
+    ticks = [float(np.log1p(-share)), 0.0, float(np.log1p(share))]
+    return ticks, [f"−{number}", "0", f"+{number}"], " [%]"
 
 
 def correlation_matrix(confidence: Confidence) -> Figure:

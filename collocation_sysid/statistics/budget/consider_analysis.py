@@ -239,9 +239,7 @@ def _effect_of(row: Deviation, at: ExperimentAtAnswer, axis: int) -> Effect | No
     is_specimen = at.iterate.transcription.experiment.specimen is not None
     if row.effect is None or (is_specimen and not row.of_specimens):
         return None
-    effect = row.effect(at, axis)
-    assert effect is None or isinstance(effect, Effect)
-    return effect
+    return row.effect(at, axis)
 
 
 def _changes_by_effects(

@@ -29,7 +29,6 @@ from ...fem.laws.constants import GAMMA_M, GAMMA_R, is_modulus, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import boundary_of
-from ...fem.rest_shape import RestShape
 from ...model.contact.summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
@@ -211,16 +210,8 @@ class ExperimentAtAnswer:
         """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]: those of
         the mesh, or those that follow from a mesh made under gravity.
         """
-        body = self.body
-        return (
-            body.nodes.points_m
-            if body.inverse_equilibrium is None
-            else self._solve_rest_shape().positions_m
-        )
-
-    def _solve_rest_shape(self) -> RestShape:
-        assert self.body.inverse_equilibrium is not None
-        return self.body.inverse_equilibrium.solve(self.theta)
+        scan = self.body.inverse_equilibrium
+        return self.body.nodes.points_m if scan is None else scan.solve(self.theta).positions_m
 
     def force_change_by_reference(self, moved_m: Array) -> Array:
         """Return the first-order change (N, 3n) [N] of the material's forces if the stress-free
