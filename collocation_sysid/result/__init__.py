@@ -9,7 +9,7 @@ of a check; `report` turns such sections into an HTML page or Markdown, `picture
 pictures, and `solve_progress` shows a solve while it runs.
 
 Pictures: the package `pictures` has static figures in the look of `figure_style`; `animation` makes
-films, `frame_fields` the fields of ParaView frames on the surface. `camera_overlays` prepares
+films, `frame_fields` reads the stress of ParaView frames on the surface. `camera_overlays` prepares
 the points of cameras for all of these, and `element_fields` evaluates stress and energy in
 each element.
 """

@@ -1,4 +1,4 @@
-"""Fields of the ParaView frames of a run, on the triangles of the boundary."""
+"""Stress in the ParaView frames of a run, on the triangles of the boundary."""
 
 from __future__ import annotations
 
@@ -13,42 +13,31 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..common.files import damage_refused, is_own
-from ..errors import InputError, require_among
+from ..errors import InputError
 from .replay import MotionRecord
 from .run_writers import FRAMES_FILE
 
 
-def field_on_faces(run: str | Path, replay: MotionRecord, field: str) -> Array:
-    """Return a field (T, F) on the boundary triangles, at each sample that of the nearest frame.
-
-    Point data are averaged over the corners of a triangle; of vectors the norm is taken.
+def stress_on_faces(run: str | Path, replay: MotionRecord) -> Array:
+    """Return the von Mises stress (T, F) [Pa] on the boundary triangles, at each sample that of the
+    nearest frame.
 
     Parameters
     ----------
     replay : MotionRecord
         Experiment of this run.
-    field : str
-        Point or cell data of the frames.
 
     Raises
     ------
     InputError
-        If the frames have no such field, are damaged, or there are none.
+        If the frames are damaged, or there are none.
     """
-    frames = _frames_of_fit(run, replay)
+    if replay.positions_m is None:
+        raise _missing_frames(run, replay.name)
+    frames = frame_files(Path(run), replay.name)
     cells = cells_below_faces(replay.tetrahedra, replay.surface)
     with _damaged_frames_refused(Path(run)):
-        shown = []
-        for _, file in frames:
-            frame = meshio.read(file)
-            points = frame.point_data
-            in_cells = frame.cell_data
-            require_among(field, [*in_cells, *points], where="field")
-            if field in in_cells:
-                values = in_cells[field][0][cells]
-            else:
-                values = points[field][replay.surface].mean(axis=1)
-            shown.append(np.linalg.norm(values, axis=1) if values.ndim == 2 else values)
+        shown = [meshio.read(file).cell_data["von_mises_pa"][0][cells] for _, file in frames]
         times = np.array([time for time, _ in frames])
         nearest = np.abs(replay.t_s[:, None] - times).argmin(axis=1)
         return np.array(shown)[nearest]
@@ -105,13 +94,6 @@ def _missing_frames(run: str | Path, experiment: str) -> InputError:
         "have frames",
         run,
     )
-
-
-def _frames_of_fit(run: str | Path, replay: MotionRecord) -> list[tuple[float, Path]]:
-    """Return times [s] and files of the frames of an experiment that was fitted, see `frame_files`."""
-    if replay.positions_m is None:
-        raise _missing_frames(run, replay.name)
-    return frame_files(Path(run), replay.name)
 
 
 def _damaged_frames_refused(run: Path) -> AbstractContextManager[None]:

@@ -133,7 +133,6 @@ def write_frames(
     element: Element,
     undeformed_m: ArrayLike,
     point_series: Mapping[str, ArrayLike] | None = None,
-    max_frames: int = MAX_PARAVIEW_FRAMES,
     fields: ElementFields | None = None,
     cell_data: Mapping[str, ArrayLike] | None = None,
 ) -> Path:
@@ -141,7 +140,7 @@ def write_frames(
     existing files of these names are replaced, and frames with higher numbers stay.
 
     Every frame has `displacement_m` and `velocity_m_s` (finite differences; zero if there is only
-    one sample) at the points, and the `fields` in the cells. Of more than `max_frames` samples
+    one sample) at the points, and the `fields` in the cells. Of more than `MAX_PARAVIEW_FRAMES` samples
     every second, third, … is written.
 
     Parameters
@@ -160,8 +159,6 @@ def write_frames(
         Nodes of the undeformed body [m].
     point_series : mapping of name to (T, n) or (T, n, k), optional
         Further data at the points.
-    max_frames : int
-        Largest number of frames.
     fields : ElementFields, optional
         Evaluator of von Mises stress [Pa], energy density [J/m³] and det F of each element; none
         of these by default.
@@ -183,7 +180,7 @@ def write_frames(
     frames = Path(folder) / "frames"
     frames.mkdir(exist_ok=True)
     written = []
-    for number, k in enumerate(range(0, len(times), -(-len(times) // max_frames))):
+    for number, k in enumerate(range(0, len(times), -(-len(times) // MAX_PARAVIEW_FRAMES))):
         file = frames / f"frame_{number:04d}.vtu"
         data = {
             "displacement_m": positions[k] - undeformed_m,
@@ -214,10 +211,7 @@ def write_frames(
 
 @contextmanager
 def replaced_folder(
-    path: str | Path,
-    overwrite: bool = True,
-    marker_file: str = RESULT_FILE,
-    content_word: str = "run",
+    path: str | Path, marker_file: str = RESULT_FILE, content_word: str = "run"
 ) -> Iterator[Path]:
     """Context with a temporary folder to write into, which is renamed to `path` at the end.
 
@@ -230,8 +224,6 @@ def replaced_folder(
     ----------
     path : str or Path
         Folder to write; missing parents are made.
-    overwrite : bool
-        Whether an earlier run may be replaced.
     marker_file : str
         Name of a file by which an earlier run is recognised.
     content_word : str
@@ -245,7 +237,7 @@ def replaced_folder(
         the end, the message names the place where the finished one is kept.
     """
     target = _resolved_parent(Path(path))
-    require_replaceable(target, overwrite, marker_file=marker_file, content_word=content_word)
+    require_replaceable(target, marker_file=marker_file, content_word=content_word)
     target.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(target)
     process_name = f"{platform.node()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -259,7 +251,7 @@ def replaced_folder(
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     try:
-        require_replaceable(target, overwrite, marker_file=marker_file, content_word=content_word)
+        require_replaceable(target, marker_file=marker_file, content_word=content_word)
         _replace_folder(
             temporary, target, backup=target.with_name(f".{target.name}.{process_name}.old")
         )
@@ -300,17 +292,15 @@ def _is_running(process: int) -> bool:
 
 
 def require_replaceable(
-    target: Path, overwrite: bool = True, marker_file: str = RESULT_FILE, content_word: str = "run"
+    target: Path, marker_file: str = RESULT_FILE, content_word: str = "run"
 ) -> None:
-    """Raise an `InputError` if a place for a run folder holds anything but an earlier run, or one
-    that may not be overwritten; a missing or empty folder passes.
+    """Raise an `InputError` if a place for a run folder holds anything but an earlier run; a
+    missing or empty folder passes.
 
     Parameters
     ----------
     target : Path
         Place of the folder.
-    overwrite : bool
-        Whether an earlier run passes, if this program wrote every file in it and none was changed.
     marker_file : str
         Name of a file by which an earlier run is recognised.
     content_word : str
@@ -320,7 +310,7 @@ def require_replaceable(
     ------
     InputError
         Naming the place: for a link, a file, a mount point, a folder with files but no
-        `marker_file`, an earlier run unless `overwrite`, and a run with a link or a file that this
+        `marker_file`, and a run with a link or a file that this
         program did not write or that was changed since, which is named too.
     """
     require_no_link(target)
@@ -340,12 +330,6 @@ def require_replaceable(
         raise InputError(
             f"the folder has files but no {marker_file}, so that it is not an earlier "
             f"{content_word} and is not replaced; choose another folder",
-            target,
-        )
-    if not overwrite:
-        raise InputError(
-            f"the folder contains an earlier {content_word}, and overwrite is false; choose "
-            "another folder, or pass overwrite=True",
             target,
         )
     require_only_written(target)

@@ -18,19 +18,12 @@ TESTED = {
 }
 
 
-def find_misspecifications(solution: Solution, budget: int | None = None) -> tuple[Hypothesis, ...]:
+def find_misspecifications(solution: Solution) -> tuple[Hypothesis, ...]:
     """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
     are noise.
 
     Hypotheses of the features are always tested; others only if a measurement of an experiment
     misses, see `motion_misspecifications`.
-
-    Parameters
-    ----------
-    budget : int, optional
-        Largest number of sweeps over the first samples for all refits together; by default five
-        times the work of the fit, at most 200, and those of the mirror images of a body that the
-        fit turned or shifted far, at most 40 for each.
 
     Returns
     -------
@@ -40,7 +33,7 @@ def find_misspecifications(solution: Solution, budget: int | None = None) -> tup
     hypotheses = [
         hypothesis for feature in FEATURES for hypothesis in feature.fit_hypotheses(solution)
     ]
-    hypotheses += motion_misspecifications(solution, hypotheses, budget=budget)
+    hypotheses += motion_misspecifications(solution, hypotheses)
     return rank(hypotheses)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 from kit.problem_files import TRUTH, run_command, settings, write_problem
@@ -26,7 +27,7 @@ from collocation_sysid.result.animation import (
     film_samples,
 )
 from collocation_sysid.result.figure_style import GREEN
-from collocation_sysid.result.frame_fields import field_on_faces, frame_files
+from collocation_sysid.result.frame_fields import cells_below_faces, frame_files, stress_on_faces
 from collocation_sysid.result.replay import read_run, run_headline
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
@@ -213,14 +214,14 @@ def test_an_experiment_for_validation_has_no_frames_of_another(run):
     _, replays = read_run(run)
     nod = next(each for each in replays if each.name == "nod")
     with pytest.raises(InputError, match="'nod' of this run has no"):
-        field_on_faces(run, nod, field="det_f")
+        stress_on_faces(run, nod)
 
 
-def test_a_field_of_the_frames_is_given_on_the_faces(run):
+def test_the_stress_of_the_frames_is_given_on_the_faces(run):
     swing = read_run(run)[1][0]
-    moved_m = (swing.positions_m - swing.undeformed_m)[:, swing.surface].mean(axis=2)
-    values = field_on_faces(run, swing, field="displacement_m")
-    np.testing.assert_allclose(values, np.linalg.norm(moved_m, axis=2), atol=1e-6)
-    assert field_on_faces(run, swing, field="von_mises_pa").shape == values.shape
-    with pytest.raises(InputError, match="found 'stress'; expected one of det_f"):
-        field_on_faces(run, swing, field="stress")
+    stress_pa = stress_on_faces(run, swing)
+    assert stress_pa.shape == (len(swing.t_s), len(swing.surface))
+    (time_s, file), *_ = frame_files(run, "swing")
+    cells = cells_below_faces(swing.tetrahedra, swing.surface)
+    expected_pa = meshio.read(file).cell_data["von_mises_pa"][0][cells]
+    np.testing.assert_array_equal(stress_pa[np.abs(swing.t_s - time_s).argmin()], expected_pa)

@@ -52,13 +52,13 @@ MISTAKES = {
 @pytest.mark.parametrize(("cause", "change"), MISTAKES.items(), ids=MISTAKES)
 def test_a_mistake_is_the_likeliest_cause(cause: str, change: Callable[[Wrench], Wrench]):
     collocation = changed(change)
-    found = find_misspecifications(ReducedSpace()(collocation), budget=0)
+    found = find_misspecifications(ReducedSpace()(collocation))
     assert found[0].code == cause
     assert cause_concerns(found)[0].grade == "doubtful"
 
 
 def test_a_wrench_that_fits_has_no_cause():
-    assert not find_misspecifications(ReducedSpace()(changed(lambda w: w)), budget=0)
+    assert not find_misspecifications(ReducedSpace()(changed(lambda w: w)))
 
 
 # Mass of the tool, more than that of the cube [kg], and its place beyond the grasp [m].

@@ -23,7 +23,7 @@ from ...common.display import as_markdown
 from ...errors import InputError
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...result.animation import experiment_named
-from ...result.frame_fields import field_on_faces
+from ...result.frame_fields import stress_on_faces
 from ...result.replay import MotionRecord, read_run
 from ...result.run_summary import run_summary
 from ...result.run_writers import replaced_folder
@@ -97,10 +97,8 @@ def write_rerun(run: str | Path, folder: str | Path, experiment: str | None = No
 
 def _stress_on_faces(run: str | Path, replay: MotionRecord) -> Array | None:
     """Return (T, F) [Pa] of the nearest frame; None if there are none."""
-    if replay.positions_m is None:  # only fitted experiments have frames
-        return None
     try:
-        return field_on_faces(run, replay, field="von_mises_pa")
+        return stress_on_faces(run, replay)
     except InputError:
         return None
 

@@ -89,12 +89,13 @@ def marker_tracks(
     measured_m: Array,
     fitted_m: Array | None,
     simulated_m: Array | None = None,
-    max_markers: int = MAX_SHOWN_MARKERS,
 ) -> Figure:
     """Return a figure of the coordinates of markers over time, each with model minus measurement
     below.
 
-    All error axes have the same scale, so that errors can be compared.
+    All error axes have the same scale, so that errors can be compared. Of more than
+    `MAX_SHOWN_MARKERS` markers, those with the largest residuals of the fit, or else of the
+    simulation, are shown; without both the first ones.
 
     Parameters
     ----------
@@ -104,12 +105,9 @@ def marker_tracks(
         Measured markers, NaN where missing.
     fitted_m, simulated_m : (T, M, 3) or None
         Fitted markers, and those of a simulation with the estimated parameters; None is left out.
-    max_markers : int
-        Largest number of markers, at least 1. Of more markers, those with the largest residuals of
-        the fit, or else of the simulation, are shown; without both the first ones.
     """
     drawn = drawn_models(fitted_m, simulated_m)
-    shown = _worst_markers(measured_m, [model for _, model, _ in drawn], count=max_markers)
+    shown = _worst_markers(measured_m, [model for _, model, _ in drawn])
     some = f"{len(shown)} of {len(names)} markers, those with the largest errors"
     title = some if len(shown) < len(names) else ""
     head = TRACK_LAYOUT.legend_mm + (5.0 if title else 0.0)
@@ -184,13 +182,13 @@ def _column_width_mm() -> float:
     return (PAGE_MM - layout.first_margin_mm - layout.last_margin_mm - 2 * layout.column_gap_mm) / 3
 
 
-def _worst_markers(measured_m: Array, models_m: Sequence[Array], count: int) -> list[int]:
-    """Return `count` markers with the largest RMS residuals of the first model, in their order."""
-    if measured_m.shape[1] <= count or not models_m:
-        return list(range(min(count, measured_m.shape[1])))
+def _worst_markers(measured_m: Array, models_m: Sequence[Array]) -> list[int]:
+    """Return the markers with the largest RMS residuals of the first model, in their order."""
+    if measured_m.shape[1] <= MAX_SHOWN_MARKERS or not models_m:
+        return list(range(min(MAX_SHOWN_MARKERS, measured_m.shape[1])))
     squares = np.nansum((models_m[0] - measured_m) ** 2, axis=(0, 2))
     present = np.maximum(1, np.isfinite(measured_m).any(axis=2).sum(axis=0))
-    return sorted(np.argsort(-squares / present)[:count].tolist())
+    return sorted(np.argsort(-squares / present)[:MAX_SHOWN_MARKERS].tolist())
 
 
 # Errors whose ratio is larger are drawn on a logarithmic axis.

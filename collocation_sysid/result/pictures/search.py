@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -34,11 +34,7 @@ from ..figure_style import (
 _STAGE_COLOUR = "#808080"
 
 
-def convergence(
-    history: Sequence[Iteration],
-    names: Sequence[str] | None = None,
-    truth: Mapping[str, float] | None = None,
-) -> Figure:
+def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None) -> Figure:
     """Return a figure of marker error, loss, violation of the equations of motion, and parameters
     against the iteration number; values that are not positive are left out.
 
@@ -48,14 +44,11 @@ def convergence(
         Iterations of a search; if empty, the axes are empty.
     names : sequence of str, optional
         Parameters to draw; those of the first iteration by default.
-    truth : mapping, optional
-        True values of these parameters by name, relative to which they are drawn; their final
-        values by default.
 
     Raises
     ------
     KeyError
-        If one of the parameters is missing in an iteration or in `truth`.
+        If one of the parameters is missing in an iteration.
     """
     figure = framed_figure(COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
     heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
@@ -76,7 +69,7 @@ def convergence(
         make_log_axis(axes)
     _mark_continuation_stages(panels[:3], history, stages=rungs)
     drawn = list(history[0].parameters) if names is None and history else list(names or ())
-    _draw_parameters(panels[3], history, names=drawn, truth=truth)
+    _draw_parameters(panels[3], history, names=drawn)
     panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
     for axes in panels:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -108,12 +101,7 @@ def _mark_continuation_stages(
     panels[0].set_title(f"continuation: {shares} % of the time steps in turn", fontsize=SMALL_PT)
 
 
-def _draw_parameters(
-    axes: Axes,
-    history: Sequence[Iteration],
-    names: Sequence[str],
-    truth: Mapping[str, float] | None,
-) -> None:
+def _draw_parameters(axes: Axes, history: Sequence[Iteration], names: Sequence[str]) -> None:
     """A reference of zero counts as 1, and ratios that are not positive are left out."""
     axes.axhline(1.0, color=BLACK, lw=0.6)
     numbers = [iteration.number for iteration in history]
@@ -121,13 +109,12 @@ def _draw_parameters(
         values = np.array([iteration.parameters[name] for iteration in history], dtype=float)
         symbol = symbol_as_mathtext(name)
         unit = unit_of(name)
-        reference = values[-1] if truth is None else truth[name]
         label = f"{symbol} = {values[-1]:.4g} {unit}"
         style = {"ms": 2.5, "lw": LINE_PT, "color": COLOUR_CYCLE[k % len(COLOUR_CYCLE)]}
         axes.plot(
-            numbers, _positive_or_nan(values / (reference or 1.0)), "o-", label=label, **style
+            numbers, _positive_or_nan(values / (values[-1] or 1.0)), "o-", label=label, **style
         )
-    style_axes(axes, "", xlabel="", ylabel=f"θ / {'final θ' if truth is None else 'truth'}")
+    style_axes(axes, "", xlabel="", ylabel="θ / final θ")
     make_log_axis(axes)
     if history and names:
         add_legend_above(axes, columns=2)

@@ -92,9 +92,7 @@ BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
 SHORTEST = 4
 
 
-def motion_misspecifications(
-    solution: Solution, known: Sequence[Hypothesis], budget: int | None = None
-) -> list[Hypothesis]:
+def motion_misspecifications(solution: Solution, known: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return hypotheses about the motion and the sensors of the experiment with the largest misfit,
     by natural modes and refits; empty if its measurements miss by at most `NOISE` σ.
 
@@ -103,10 +101,6 @@ def motion_misspecifications(
     known : sequence of Hypothesis
         Other hypotheses; nothing is fitted again if one of these, or of the natural modes, is
         nearly certain (`CERTAIN`).
-    budget : int, optional
-        Largest number of sweeps over the first samples for all refits together; by default five
-        times the work of the fit, at most 200, and those of the mirror images of a body that the
-        fit turned or shifted far, at most 40 for each.
     """
     fitted = [transcription.experiment for transcription in solution.collocation.transcriptions]
     hypotheses = [each for experiment in fitted for each in same_tracks(experiment)]
@@ -133,9 +127,7 @@ def motion_misspecifications(
     ]
     certainty = max((each.strength for each in (*known, *hypotheses)), default=0.0)
     if certainty < CERTAIN:
-        hypotheses += _refit_hypotheses(
-            solution, worst, discrepancy=discrepancies[number], budget=budget
-        )
+        hypotheses += _refit_hypotheses(solution, worst, discrepancy=discrepancies[number])
     return hypotheses
 
 
@@ -180,7 +172,7 @@ def _pose_deviation(part: ExperimentIterate) -> float:
 
 
 def _refit_hypotheses(
-    solution: Solution, experiment: Experiment, discrepancy: float, budget: int | None
+    solution: Solution, experiment: Experiment, discrepancy: float
 ) -> list[Hypothesis]:
     """Return the hypothesis whose correction lets the first samples of an experiment fit as well as
     noise allows; several as one hypothesis if the fits do not tell them apart, or if none of
@@ -188,7 +180,7 @@ def _refit_hypotheses(
     fitted.
     """
     first = first_samples(experiment, MOST_SAMPLES)
-    alone = _Refitter(solution, first, sweeps=budget)
+    alone = _Refitter(solution, first)
     alone.near_answer.add(first)
     stated = alone.fit(first)
     if stated is None:
@@ -216,7 +208,7 @@ def _refit_hypotheses(
     images = mirrored_meshes(first) if discrepancy > MIRRORED else ()
     mirrored = [*corrected_hypotheses(images, first)]
     is_far = max(map(_pose_deviation, solution.parts)) > FAR
-    if is_far and budget is None:  # these come first, and leave the others their sweeps
+    if is_far:  # these come first, and leave the others their sweeps
         alone.sweeps += alone.each * (len(mirrored) + len(turned))
         alone.longer.update(each.corrected for each in turned)
     bodies = [*screened_bodies(solution, first, is_far=is_far)]
@@ -378,18 +370,15 @@ class _Refitter:
         Fit of the problem.
     declared : Experiment
         Experiment as stated; if the problem consists of it alone, its fit is known already.
-    sweeps : int or None
-        Sweeps that are allowed for all fits together; None for `EFFORT` times the work of the fit,
-        at most `BUDGET`.
     """
 
-    def __init__(self, solution: Solution, declared: Experiment, sweeps: int | None) -> None:
+    def __init__(self, solution: Solution, declared: Experiment) -> None:
         self.collocation = solution.collocation
         fitted = [transcription.experiment for transcription in self.collocation.transcriptions]
         rows = sum(len(experiment.t_s) for experiment in fitted)
         self.each = min(MOST_SWEEPS, max(FEWEST_SWEEPS, solution.iterations))
         work = EFFORT * self.each * rows // len(declared.t_s)
-        self.sweeps = min(BUDGET, work) if sweeps is None else sweeps
+        self.sweeps = min(BUDGET, work)  # that are left for all fits together
         self.near_answer: set[Experiment] = set()
         # Experiments whose fits may take twice the sweeps: that of another direction of gravity than
         # the one to which a fit turned the body begins far from its answer.
