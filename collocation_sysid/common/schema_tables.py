@@ -156,8 +156,6 @@ def declared_in(section: Section, where: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    section : Section
-        Table of a problem file.
     where : str
         Location of the table, for messages.
 

@@ -267,7 +267,6 @@ class Body(Discretisation):
 
     @cached_property
     def inverse_equilibrium(self) -> InverseEquilibrium | None:
-        """Solver of the stress-free shape; None if the mesh is stress-free."""
         return None if self.scan_conditions is None else InverseEquilibrium(self)
 
     def rest_shape_failure(self, theta: Theta) -> str | None:

@@ -138,8 +138,6 @@ class Discretisation(ConstantsModel):
         ----------
         number : int
             Index of the part.
-        memory : bool
-            Whether to include the memory of the material.
         """
         part = self.parts[number]
         scaled = part.field.scaled_indices if part.field else ()

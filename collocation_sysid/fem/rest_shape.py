@@ -288,8 +288,6 @@ class InverseEquilibrium:
     places : (k,)
         Indices in θ of the inputs on which the stress-free shape depends: elastic constants, then
         free densities.
-    layout : RestPointLayout
-        Layout of the data of the points.
 
     Raises
     ------

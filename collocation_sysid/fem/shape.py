@@ -42,8 +42,6 @@ class PolylineLength:
         Node indices of each point, P > 1.
     weights : (P, npe)
         Weights of these nodes.
-    node_count : int
-        Number of nodes of the body.
     """
 
     def __init__(self, nodes: Index, weights: Array, node_count: int) -> None:
@@ -147,8 +145,6 @@ class EnclosedVolume:
     faces : (F, 3) or (F, 6)
         Node indices: corners counter-clockwise as seen from outside the volume; for quadratic faces
         then the nodes on the edges ab, bc, ca.
-    node_count : int
-        Number of nodes of the body.
     apex_m : (3,), optional
         Apex of the cones; the origin by default. It matters only if the surface is open.
     """

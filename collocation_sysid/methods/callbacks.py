@@ -37,8 +37,6 @@ class TimedFunction(ca.Callback):
 
     Parameters
     ----------
-    name : str
-        Name of the function in CasADi.
     inputs : list of Sparsity
         Sparsity of each input.
     outputs : list of Sparsity
@@ -68,23 +66,18 @@ class TimedFunction(ca.Callback):
         self.construct(name)
 
     def get_n_in(self) -> int:
-        """Return the number of inputs (CasADi's interface)."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """Return the number of outputs (CasADi's interface)."""
         return len(self._outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the sparsity of input i, an index (CasADi's interface)."""
         return self._inputs[i]
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Return the sparsity of output i, an index (CasADi's interface)."""
         return self._outputs[i]
 
     def has_eval_buffer(self) -> bool:
-        """Return true: outputs are written to CasADi's memory (CasADi's interface)."""
         return True
 
     def eval_buffer(self, arguments, results) -> int:
@@ -127,9 +120,6 @@ class LagrangianGradient(TimedFunction):
         return nfwd == 1
 
     def get_forward(self, nfwd, name, inames, onames, opts):
-        """Return the function of the directional derivative, `hessian_product`, with CasADi's name
-        for it (CasADi's interface); the other arguments are not used.
-        """
         inputs = [*self._inputs, *self._outputs, *self._inputs]
         self._forward = TimedFunction(
             name, inputs, outputs=self._outputs, evaluate=self.hessian_product, errors=self._errors
@@ -153,8 +143,6 @@ class NlpFunctions:
 
     Parameters
     ----------
-    collocation : Collocation
-        Program.
     hessian : callable
         Function (z, w, y, values) that writes the upper triangle of H to `values`.
     errors : list
@@ -187,8 +175,6 @@ class NlpFunctions:
 
         Parameters
         ----------
-        name : str
-            Name of the function in CasADi.
         outputs : str
             Names of its outputs, see the class.
         """
@@ -339,15 +325,12 @@ class IterationMonitor(ca.Callback):
         self.construct("monitor")
 
     def get_n_in(self) -> int:
-        """Return the number of inputs (CasADi's interface)."""
         return ca.nlpsol_n_out()
 
     def get_n_out(self) -> int:
-        """Return the number of outputs (CasADi's interface)."""
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Return the sparsity of input i, an index (CasADi's interface)."""
         program = self.program
         sizes = {
             "x": program.variable_count,

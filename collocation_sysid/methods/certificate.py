@@ -71,8 +71,6 @@ def certify(collocation: Collocation, z: Array, multipliers: Array) -> Certifica
 
     Parameters
     ----------
-    collocation : Collocation
-        Problem.
     z : (variables,) array
         Variables.
     multipliers : (constraints,) array

@@ -302,7 +302,6 @@ class CondensedCollocation(Collocation):
 
     @cached_property
     def transcriptions(self) -> tuple[Transcription, ...]:
-        """Transcriptions of the fitted experiments."""
         return self.complete.transcriptions
 
     @cached_property
@@ -334,12 +333,10 @@ class CondensedCollocation(Collocation):
 
     @property
     def variable_count(self) -> int:
-        """Number of variables z that remain."""
         return len(self._remaining[0])
 
     @property
     def constraint_count(self) -> int:
-        """Number of constraints g that remain."""
         return len(self._remaining[1])
 
     @property
@@ -355,15 +352,9 @@ class CondensedCollocation(Collocation):
 
     @property
     def has_eliminated_histories(self) -> bool:
-        """Whether ∂g/∂z has more entries than `jacobian` contains, because of internal
-        variables.
-        """
         return self.complete.has_eliminated_histories
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
-        """Return variables z (variables,) from parameters p and positions, without the
-        eliminated dofs.
-        """
         return self.complete.pack(p, positions)[self._remaining[0]]
 
     def unpack(self, z: Array) -> tuple[Array, list[Array]]:
@@ -373,7 +364,6 @@ class CondensedCollocation(Collocation):
         return self.complete.unpack(self.complete_variables(z))
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return lower and upper bounds (variables,) of z; they are equal for known variables."""
         lower, upper = self.complete.bounds()
         return lower[self._remaining[0]], upper[self._remaining[0]]
 
@@ -423,7 +413,6 @@ class CondensedCollocation(Collocation):
     # Values -------------------------------------------------------------------------------------
 
     def objective(self, z: Array) -> float:
-        """Return the loss L in the scaling of the NLP at z."""
         return self.complete.objective(self.complete_variables(z))
 
     def gradient(self, z: Array) -> Array:
@@ -450,9 +439,6 @@ class CondensedCollocation(Collocation):
         return gradient[self._remaining[0]]
 
     def constraint_values(self, z: Array) -> Array:
-        """Return the scaled values (constraints,) of the constraints g that remain, at z
-        (variables,).
-        """
         return self.complete.constraint_values(self.complete_variables(z))[self._remaining[1]]
 
     # Matrices -----------------------------------------------------------------------------------
@@ -484,13 +470,9 @@ class CondensedCollocation(Collocation):
 
     @property
     def jacobian_structure(self) -> tuple[Index, Index]:
-        """Column pointers and row indices of ∂g/∂z, by compressed columns."""
         return self._jacobian.assembly.structure
 
     def constraints_and_jacobian(self, z: Array, out: Array | None = None) -> tuple[Array, Array]:
-        """Return the constraints g (constraints,) and the values of ∂g/∂z, including the dependence
-        through the eliminated positions, from one evaluation of the elements.
-        """
         pattern = self._jacobian
         rows, complete_values = self.complete.constraints_and_jacobian(self.complete_variables(z))
         groups = [
@@ -548,14 +530,10 @@ class CondensedCollocation(Collocation):
 
     @property
     def hessian_structure(self) -> tuple[Index, Index]:
-        """Column pointers and row indices of the upper triangle of ∇²_z (w L + yᵀ g)."""
         return self._hessian.assembly.structure
 
     @cached_property
     def hessian_diagonals(self) -> tuple[Index, Index]:
-        """Indices, in the values of the Hessian's upper triangle, of the diagonal entries of q
-        (nq,), and of those of the positions that remain.
-        """
         of_q, of_x = self.complete.hessian_diagonals
         positions = self._hessian.positions_of(np.concatenate([of_q, of_x]))
         return positions[: len(of_q)], positions[len(of_q) :]
@@ -563,7 +541,6 @@ class CondensedCollocation(Collocation):
     def hessian_values(
         self, z: Array, loss_weight: float, multipliers: Array | None, out: Array | None = None
     ) -> Array:
-        """Return the values of ∇²_z (loss_weight · objective + multipliers · g), upper triangle."""
         pattern = self._hessian
         numbers, _ = self._condensed_indices
         if multipliers is not None:

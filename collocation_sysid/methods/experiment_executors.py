@@ -81,11 +81,6 @@ class LocalExecutor:
     map_experiments : callable
         `fem.kernels.map_experiments` with these threads: results are the values themselves, and
         an exception of the function is raised.
-
-    Parameters
-    ----------
-    threads : int
-        Number of threads.
     """
 
     def __init__(self, threads: int) -> None:

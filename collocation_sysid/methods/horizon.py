@@ -85,8 +85,6 @@ class Horizon:
         Number of grid rows of each experiment.
     prior : float, optional
         Standard deviation of a prior of q around the guess; None for no such prior.
-    stopwatch : Stopwatch, optional
-        Stopwatch that measures the sweeps.
     factorisation : {"auto", "band", "sparse", "supernodal"}
         Factorisation of a time step's matrix.
     workers : ExperimentExecutor, optional

@@ -130,8 +130,6 @@ def exact_curvature(
         Problem with second derivatives, which is not checked, see `require_second_derivatives`.
     iterate : Iterate
         Iterate of all rows; its trajectories must be in this process.
-    stopwatch : Stopwatch, optional
-        Stopwatch that measures the sweep.
 
     Raises
     ------

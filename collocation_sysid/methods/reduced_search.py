@@ -214,8 +214,6 @@ class ReducedSearch:
 
     Parameters
     ----------
-    options : SearchOptions
-        Options.
     recorder : Recorder
         Record of the solve; its collocation is replaced when measurements are associated again.
     start : (variables,) array, optional

@@ -160,8 +160,6 @@ class Timing:
 
         Parameters
         ----------
-        watch : Stopwatch
-            Stopwatch of the solve.
         start_s : float
             `time.perf_counter()` at the start of the solve [s], for the total.
         """
@@ -516,12 +514,8 @@ def constraint_multipliers(
 
     Parameters
     ----------
-    collocation : Collocation
-        Problem.
     z : (variables,) array
         Variables.
-    stopwatch : Stopwatch, optional
-        Stopwatch that measures the sweeps.
 
     Raises
     ------

@@ -69,15 +69,11 @@ class Recorder:
         Entries so far.
     notes : list of str
         Remarks for the user.
-    stopwatch : Stopwatch
-        Stopwatch of evaluations and linear algebra.
     start_s : float
         `time.perf_counter()` at construction [s].
 
     Parameters
     ----------
-    method : str
-        Name of the method.
     collocation : Collocation
         Problem; methods replace it when measurements are associated again.
     watch : callable, optional
@@ -175,16 +171,12 @@ class Recorder:
 
         Parameters
         ----------
-        status : Status
-            Reason why the solve ended.
         message : str
             Sentence for the user.
         z : (variables,) array
             Final variables.
         multipliers : (constraints,) array or None
             Multipliers of the method; None if it has none, and then also in the solution.
-        iterations : int
-            Iterations of the method.
         evaluations : int
             Evaluations of whole trajectories.
         """

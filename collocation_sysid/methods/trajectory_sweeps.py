@@ -140,8 +140,6 @@ def sweep(
     ----------
     solver : Sweep
         Solver of the experiment's linearised equations of motion; its stopwatch is read and reset.
-    transcription : Transcription
-        Transcription of the experiment.
     p : (k,) array
         Parameters (q, φ) of the experiment.
     trajectory : LinearisedTrajectory, SimulationResult or (rows, 3n) array
@@ -192,8 +190,6 @@ def sweep_after_step(
     ----------
     solver : Sweep
         Solver of the experiment's linearised equations of motion; its stopwatch is read and reset.
-    transcription : Transcription
-        Transcription of the experiment.
     p : (k,) array
         Parameters (q, φ) after the step.
     previous : LinearisedTrajectory
@@ -293,8 +289,6 @@ def simulate_rows(
     ----------
     solver : Sweep
         Solver; its number of rows is that of the result.
-    transcription : Transcription
-        Transcription of the experiment.
     p : (k,) array
         Parameters (q, φ) of the experiment.
     known_rows : LinearisedTrajectory, SimulationResult, (m, 3n) array or None

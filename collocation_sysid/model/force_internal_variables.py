@@ -300,7 +300,6 @@ class ForceForwardColumns(_DerivativeIterator):
 
     Parameters
     ----------
-    history : ForceHistory
     by_p : callable
         Derivatives (U, columns) of the inputs at the evaluation with a given index.
     done : int
@@ -358,10 +357,6 @@ class ForceForwardColumns(_DerivativeIterator):
 
 class ForceAdjoint(_DerivativeIterator):
     """Weights μ of the internal variables, propagated backward in time.
-
-    Parameters
-    ----------
-    history : ForceHistory
 
     Attributes
     ----------

@@ -192,7 +192,6 @@ class Potential(ForceTerm):
         return self.scalar.couplings
 
     def with_inputs(self, u: Array) -> Self:
-        """Return this force with another amplitude (T, 1)."""
         return replace(self, amplitude=u)
 
     def force(self, states: States) -> Array:
@@ -202,9 +201,6 @@ class Potential(ForceTerm):
     def add_derivatives(
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
-        """Add the forces and their first derivatives by positions and by the amplitude to a
-        linearisation, in place, at the entries and the input column `places`.
-        """
         gradient = self.scalar.gradient(states.xi)
         np.subtract(linearisation.force, self.amplitude * gradient, out=linearisation.force)
         linearisation.by_position[:, places.entries] -= self.amplitude * self.scalar.hessian(
@@ -215,9 +211,6 @@ class Potential(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the second derivatives of Σ weights · F, and its first ones by the inputs, to a
-        curvature, in place, at `places`; the weights are (T, 3n).
-        """
         xi = states.xi
         column = places.inputs.start
         third_derivatives = self.scalar.hessian_derivative(xi, weights)

@@ -850,11 +850,6 @@ class ThetaMap:
 
     If the parameters do not determine the constants of the body, its methods raise an `InputError`,
     not its constructor.
-
-    Attributes
-    ----------
-    parameters : Parameters
-    body : Body
     """
 
     parameters: Parameters

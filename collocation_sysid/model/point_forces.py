@@ -75,7 +75,6 @@ class Pointwise(ForceTerm):
 
     @property
     def is_nonlinear_in_velocity(self) -> bool:  # type: ignore[override]
-        """Whether the law depends on ẏ."""
         return True
 
     def active_points(self, states: States) -> tuple[Index | None, Array]:
@@ -162,9 +161,6 @@ class Pointwise(ForceTerm):
         )
 
     def force(self, states: States) -> Array:
-        """Return the forces F (T, 3n) [N] on the nodes at states: the law's forces at the points,
-        multiplied by `factor`.
-        """
         at = self._inputs_at(states)
         value = self.law.evaluate(at.u, at.data)[at.y]
         return self.factor * self.points.assemble(value, at.chosen)
@@ -203,20 +199,7 @@ class Pointwise(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the derivatives of Σ weights · F + Σ `variable_weights` · h to a curvature, in place.
-
-        Second derivatives are by positions, velocities and the constants of the law, first ones by
-        the constants. Those by h_{k−1} are left to `mixed_second_derivatives`.
-
-        Parameters
-        ----------
-        curvature : SecondDerivatives
-            Derivatives at T states, changed in place.
-        places : AssemblyIndices
-            Entries of the points' matrices, and columns of the constants among all inputs.
-        weights : (T, 3n)
-            Weights of the forces; those of h are this force's `variable_weights`.
-        """
+        """Add also Σ `variable_weights` · h; those by h_{k−1} are in `mixed_second_derivatives`."""
         evaluated = self._inputs_at(states)
         points = self.points
         entries = places.entries
@@ -404,17 +387,14 @@ class CustomForce(Pointwise):
 
     @property
     def has_skew_damping(self) -> bool:  # type: ignore[override]
-        """Whether derivatives of the law by velocities may be non-symmetric."""
         return self.placed.force.has_skew_damping
 
     @property
     def has_skew_stiffness(self) -> bool:
-        """Whether derivatives of the law by positions may have a skew part."""
         return self.placed.force.has_skew_stiffness
 
     @property
     def internal_variable_count(self) -> int:  # type: ignore[override]
-        """Number of internal variables of the law."""
         return self.placed.force.internal_variable_count
 
     @property
@@ -429,25 +409,19 @@ class CustomForce(Pointwise):
 
     @property
     def law(self) -> GeneratedFunction:
-        """Law of the force with derivatives."""
         return law_function(self.placed.force, self.points.dofs)
 
     def with_inputs(self, u: Array) -> Self:
-        """Return self: the force has no inputs beside the constants of the body."""
         return self
 
     def constants(self, states: States) -> Array:
-        """Return the constants (c, 1) of the law."""
         return states.theta[self.placed.columns][:, None]
 
     def constant_columns(self, places: AssemblyIndices) -> Index:
-        """Return the indices in θ of the constants."""
         return self.placed.columns
 
     def data(self, chosen: Index | None) -> Array:
-        """Return the data (d, T, I) of the law at all instances, in the order in which a
-        `ForceContext` reads them; `chosen` is not used, because all instances act.
-        """
+        """All instances act; the order is that in which a `ForceContext` reads the data."""
         return self._data
 
     @cached_property

@@ -46,7 +46,6 @@ class StiffnessChange(ForceTerm):
         return self.body.pattern
 
     def with_inputs(self, u: Array) -> Self:
-        """Return this force with another share (T, 1)."""
         return replace(self, share=u)
 
     def _undamped(self, theta: Array) -> Array:
@@ -64,7 +63,6 @@ class StiffnessChange(ForceTerm):
         return at
 
     def force(self, states: States) -> Array:
-        """Return the forces (T, 3n) [N]."""
         return self.share * self.body.force(
             states.xi, states.nu, theta=self._undamped(states.theta)
         )
@@ -72,7 +70,6 @@ class StiffnessChange(ForceTerm):
     def add_derivatives(
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
-        """Add the forces and their first derivatives to a linearisation, in place."""
         at = self._linearise(states)
         constants = at.by_theta.shape[2]
         np.add(linearisation.force, self.share * at.force, out=linearisation.force)
@@ -86,9 +83,6 @@ class StiffnessChange(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the second derivatives of Σ weights · F, and its first ones by the inputs, to a
-        curvature, in place; the weights are (T, 3n).
-        """
         column = places.inputs.start
         entries = places.entries
         own = self.body.second_derivatives(

@@ -473,7 +473,6 @@ class MemoryForwardColumns:
 
     Parameters
     ----------
-    history : MemoryHistory
     theta_q : (k, columns)
         Derivatives of θ.
     done : int
@@ -572,10 +571,6 @@ class MemoryForwardColumns:
 
 class MemoryAdjoint:
     """Weights μ of the internal variables, propagated backward in time.
-
-    Parameters
-    ----------
-    history : MemoryHistory
 
     Attributes
     ----------

@@ -198,10 +198,7 @@ class Weight(ForceTerm):
         return self.body.mass_derivatives | dict(shares)
 
     def force(self, states: States) -> Array:
-        """Return weight and applied forces (T, 3n) [N].
-
-        The damping of tied masses is part of `Body.force`.
-        """
+        """Return weight and applied forces; the damping of tied masses is part of `Body.force`."""
         return self.external_n
 
     @cached_property
@@ -212,19 +209,9 @@ class Weight(ForceTerm):
     def add_derivatives(
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
-        """Add the forces and their first derivatives by the inputs and by free densities to a
-        linearisation, in place.
-
-        Velocities and θ of `states` enter the derivatives by the shares of loads, through the
-        damping γ_m of their masses; the damping force itself is part of `Body.force`.
-
-        Parameters
-        ----------
-        linearisation : Linearisation
-            Shared arrays; modified.
-        places : AssemblyIndices
-            Columns of the inputs; its entries are not used.
-        """
+        """Add derivatives by the inputs and by free densities; `places` needs no entries."""
+        # Velocities and θ enter by the shares of loads, through the damping γ_m of their masses; the
+        # damping force itself is part of `Body.force`.
         np.add(linearisation.force, self.external_n, out=linearisation.force)
         for density, slope in self.body.mass_derivatives.items():
             linearisation.by_theta[:, :, density] += slope * self.gravity
@@ -243,20 +230,8 @@ class Weight(ForceTerm):
     def add_second_derivatives(
         self, curvature: SecondDerivatives, places: AssemblyIndices, states: States, weights: Array
     ) -> None:
-        """Add the derivatives of Σ weights · F by inputs, free densities and velocities to a
-        curvature, in place.
-
-        Those by velocities and γ_m follow from the damping of joining masses.
-
-        Parameters
-        ----------
-        curvature : SecondDerivatives
-            Shared arrays; modified.
-        places : AssemblyIndices
-            Columns of the inputs; its entries are not used.
-        weights : (T, 3n)
-            Weights of the forces.
-        """
+        """Add derivatives by inputs, free densities and velocities; `places` needs no entries."""
+        # Those by velocities and γ_m follow from the damping of joining masses.
         for density, slope in self.body.mass_derivatives.items():
             curvature.theta[:, density] += weights @ (slope * self.gravity)
         first_column = places.inputs.start

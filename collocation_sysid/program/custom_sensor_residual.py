@@ -80,12 +80,8 @@ class CustomSensorResidual(MeasurementResidual):
             Index of the sensor in the experiment, from 0.
         at_s : (n,) array
             Times of the observable [s]; samples outside are not compared.
-        nuisance : NuisanceMap
-            Nuisance parameters of the experiment.
         huber : float or None
             Threshold of Huber's loss; None means a quadratic loss.
-        static : bool
-            Whether the experiment is static.
         **more
             Further attributes of a subclass.
         """
@@ -115,11 +111,9 @@ class CustomSensorResidual(MeasurementResidual):
 
     @property
     def measurement(self) -> CustomSensor:
-        """The user's sensor with its samples."""
         return self.sensor
 
     def at_samples(self, t_s: Array, grid: ReactionGrid) -> Self:
-        """Return the model for a motion known at other times, as `MeasurementResidual.at_samples`."""
         other = super().at_samples(t_s, grid)
         observable = other.observable
         at_s = observable.t_s if isinstance(observable, ReactionResultant) else t_s
@@ -147,32 +141,16 @@ class CustomSensorResidual(MeasurementResidual):
         return RowStencil(places, data.T[..., None])
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of the first samples that depend only on the first `known` times of
-        the observable; φ is not used.
-        """
         samples = int(np.count_nonzero(self._times[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     @property
     def first_needed_s(self) -> float:
-        """Time [s] of the last row of the motion on which the prediction of the first compared
-        sample depends.
-        """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
         return float(self.observable_s[self._times[first, -1]])
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the user's expression (m,), padded with zeros to a multiple of three numbers.
-
-        Parameters
-        ----------
-        values : (3, e · times) SX
-            Observable at the neighbouring times.
-        phi : SX
-            Nuisance parameters of the sensor, in prior standard deviations.
-        data : SX
-            Distances of the neighbouring times from the sample, and the sample's time [s].
-        """
+        """Return the user's expression (m,), padded with zeros to a multiple of three numbers."""
         *places, t_s = ca.vertsplit(data)
         late = ca.SX.sym("late")
         each = self.point_indices.shape[1]
@@ -191,10 +169,7 @@ class CustomSensorResidual(MeasurementResidual):
 
     @cached_property
     def observable_sigmas(self) -> Array:
-        """Standard deviations (3 e,) of the observable's components as one sample determines them,
-        from the derivatives at zero values, averaged over the compared numbers; infinite where the
-        readings do not depend on a component.
-        """
+        """From the derivatives at zero values; infinite where the readings do not depend on it."""
         nothing = np.zeros((self.observable.count, self.observable.vector_count, GROUP))
         by_u = self._evaluate(nothing, np.zeros(self.nuisance.size)).by_inputs
         by_observables = np.nan_to_num(by_u[..., : by_u.shape[3] - self.own_parameters.shape[1]])
@@ -206,14 +181,10 @@ class CustomSensorResidual(MeasurementResidual):
             return 1 / np.sqrt(squares)
 
     def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return predictions (S, G, 3) for a motion over all times of the observable, at φ (k,);
-        NaN for samples outside these times.
-        """
         predicted = super().predict_motion(motion, phi)
         return np.where(is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
 
     def numbers(self, predicted: Array) -> Array:
-        """Return predictions (S, G, 3) as the numbers (S, m) of the sensor, without padding."""
         return super().numbers(predicted)[:, : self.sensor.measured_values.shape[1]]
 
 
@@ -223,7 +194,6 @@ class CorrespondingSensorResidual(CustomSensorResidual, CorrespondenceResidual):
 
     @property
     def first_row(self) -> int:
-        """Index of the last time of the observable from which the first sample is computed."""
         return int(self._times[0, -1])
 
     def _shapes(self, x: Array) -> Array:
@@ -282,7 +252,6 @@ class CustomSensorModel(MeasurementModel):
     def residuals(
         self, association: Association, correspondences: Correspondences | None
     ) -> Sequence[CustomSensorResidual]:
-        """Return the residual of the sensor."""
         return (self._residual,)
 
 

@@ -33,8 +33,6 @@ class ExperimentIterate:
 
     Attributes
     ----------
-    transcription : Transcription
-        Transcription of the experiment.
     q : (nq,) array
         Shared parameters.
     phi : (k,) array

@@ -32,7 +32,6 @@ class NodesOfSamples(Correspondences):
 
     @property
     def measured(self) -> FollowingSensor:
-        """The sensor with its samples."""
         return self.sensor
 
     def with_start_values(self, phi: Array) -> Array:
@@ -57,7 +56,6 @@ class FollowingSensorResidual(CorrespondingSensorResidual):
 
     @property
     def point_indices(self) -> NDArray[np.integer]:
-        """Nodes (S, P) of each sample."""
         return self.correspondences.nodes
 
     @property
@@ -77,7 +75,6 @@ class FollowingSensorResidual(CorrespondingSensorResidual):
             return 1 / np.sqrt(squares / max(1, self.is_compared.sum()))
 
     def reassociated(self, x: Array, phi: Array) -> NodesOfSamples:
-        """Return the nodes of the shapes that the first rows x reach."""
         return self.correspondences.in_shapes(self._shapes(x))
 
     def aligned_correspondences(
@@ -94,7 +91,6 @@ class FollowingSensorResidual(CorrespondingSensorResidual):
         )
 
     def correspondences_of(self, measured: Any, x: Array, phi: Array) -> NodesOfSamples:
-        """Return the nodes of the samples of the same sensor in another experiment."""
         return replace(self.correspondences, sensor=measured).in_shapes(self._shapes(x))
 
     def simulated(self, motion: SampledMotion, phi: Array) -> Array:
@@ -125,7 +121,6 @@ class FollowingSensorModel(CorrespondenceModel):
         return all_nodes(self.grid.experiment.body, len(self.grid.t_s))
 
     def first_correspondences(self) -> NodesOfSamples:
-        """Return the correspondences with the undeformed body in its grasps."""
         experiment = self.grid.experiment
         at_s = np.clip(self.measurement.sample_times_s, *experiment.t_s[[0, -1]])
         nodes = self.measurement.nodes_of_samples(experiment.body, experiment.rigid_positions(at_s))
@@ -134,7 +129,6 @@ class FollowingSensorModel(CorrespondenceModel):
     def residuals(
         self, association: Association, correspondences: Correspondences | None
     ) -> tuple[FollowingSensorResidual]:
-        """Return the residual of the sensor."""
         assert isinstance(correspondences, NodesOfSamples)
         residual = FollowingSensorResidual.from_sensor(
             self.measurement,

@@ -163,8 +163,6 @@ class MotionJacobian:
             Values in the order of `structure`, overwritten.
         forces : Linearisation
             Derivatives of the forces at the evaluations.
-        dynamics : Dynamics
-            Equations of motion at the parameters.
         has_variable_mass : bool
             Whether the mass depends on the parameters; if not, the stated mass is used.
         """
@@ -234,14 +232,8 @@ class ReleasedGrasps:
 
         Parameters
         ----------
-        dynamics : Dynamics
-            Equations of motion.
-        band : BlockBand
-            Structure of the Jacobian.
         row_starts : (N,) array
             First row of each grid time, −1 where there are no rows.
-        pattern : SymmetricPattern
-            Sparsity pattern of the blocks.
         row_dofs : (k,) array
             Dof of each row of a grid time.
         scale : float

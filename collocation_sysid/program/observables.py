@@ -84,8 +84,6 @@ class PointPositions:
     ----------
     rows : (T,) array
         Indices of the grid times at which they are observed, ascending.
-    association : MarkerAssociation
-        Elements of the points.
     coordinate_parameters : (e, k) array
         Indices in φ of the estimated coordinates of X; −1 for points that are exact.
     delay_steps : int
@@ -246,8 +244,6 @@ class PointPositions:
 
         Parameters
         ----------
-        motion : ObservedMotion
-            The motion, over all grid times.
         phi : (k,) array
             Nuisance parameters.
         by_values : (R, e, 3) array

@@ -54,8 +54,6 @@ def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[Nuis
 
     Parameters
     ----------
-    experiments : sequence of Experiment
-        The experiments in their order.
     first : int
         Index in p of the first nuisance parameter.
 

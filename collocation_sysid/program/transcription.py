@@ -294,8 +294,6 @@ class Transcription(MotionTranscription):
             Positions [m].
         phi : (k,) array
             Nuisance parameters in units of their priors.
-        equations : EquationsAtParameters
-            Equations of motion at the parameters.
         weights : RowWeights
             Weights of the constraints, see `lagrangian_weights`.
         loss_weight : float

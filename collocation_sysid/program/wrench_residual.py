@@ -62,8 +62,6 @@ class WrenchResidual(MeasurementResidual):
         ----------
         observable : ReactionResultant
             Resultant of the reactions on the grid as an observable.
-        wrench : Wrench
-            Measured samples.
         label : str
             Suffix of the names of force and torque, such as " 2", if there are several sensors.
         huber : float or None
@@ -91,7 +89,6 @@ class WrenchResidual(MeasurementResidual):
 
     @property
     def measurement(self) -> Wrench:
-        """Measured samples."""
         return self.wrench
 
     @property
@@ -102,9 +99,6 @@ class WrenchResidual(MeasurementResidual):
         return super().first_needed_s + self.observable.clock_limit_s
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
-        """Return the mask (S,) of the samples for which the first `known` times suffice,
-        for any shift of the clock.
-        """
         return _is_covered(self.observable, self.t_s, known=known)
 
     def _neighbour_count(self, known: int) -> int:
@@ -134,18 +128,7 @@ class WrenchResidual(MeasurementResidual):
         )
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction (6,) [N, N m], interpolated in time, with the tare added to the
-        components that are measured.
-
-        Parameters
-        ----------
-        values : (3, 2 · times) SX
-            Wrenches at neighbouring grid times [N, N m].
-        phi : SX
-            Shift of the clock, if estimated, and tare, in prior standard deviations.
-        data : (times,) SX
-            Distances of these times from the sample [s].
-        """
+        """Return the prediction (6,) [N, N m], interpolated in time, with the tare added."""
         times = data.numel()
         tared = np.flatnonzero(self.wrench.measured_components)
         own = phi * self.nuisance.scales[self.own_parameters[0]][:, None]
@@ -160,9 +143,6 @@ class WrenchResidual(MeasurementResidual):
         return predicted
 
     def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
-        """Return predictions (S, 2, 3) [N, N m] from the reaction forces of a motion at φ (k,);
-        NaN for samples outside their times.
-        """
         values = self.observable.evaluate(motion, phi)
         if not len(values):
             return np.full((len(self.t_s), 2, 3), np.nan)
@@ -218,7 +198,6 @@ class WrenchModel(MeasurementModel):
     def residuals(
         self, association: Association, correspondences: Correspondences | None
     ) -> tuple[WrenchResidual]:
-        """Return the residual of the sensor."""
         return (self._residual,)
 
 

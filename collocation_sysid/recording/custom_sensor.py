@@ -170,7 +170,6 @@ class CustomSensor(Measurement):
 
     @property
     def sample_times_s(self) -> Array:
-        """(S,) sample times of the sensor [s]."""
         return np.asarray(self.t_s)
 
     @property
@@ -182,17 +181,14 @@ class CustomSensor(Measurement):
 
     @property
     def title(self) -> str:
-        """Name of the sensor."""
         return self.name
 
     @property
     def samples_text(self) -> str:
-        """Name of the sensor in quotation marks."""
         return f"'{self.name}'"
 
     @property
     def value_sigmas(self) -> Array:
-        """(m,) standard deviations of the numbers, which are equal; medians if samples differ."""
         return np.full(self.measured_values.shape[1], self.sigma)
 
     @property
@@ -201,7 +197,6 @@ class CustomSensor(Measurement):
         return np.isfinite(self.measured_values)
 
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
-        """Return a copy with other samples (S, m) at the times `t_s` (S,) [s]."""
         changes = {} if self.sigma_ratios is None else {"sigma_ratios": self._ratios_for(t_s)}
         return replace(self, t_s=t_s, values=values, **changes)
 

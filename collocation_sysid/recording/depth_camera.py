@@ -196,7 +196,6 @@ class Depth(Measurement):
 
         Parameters
         ----------
-        name : str
         images_m : array_like
             Zero, negative or NaN where there is no depth.
         camera : Camera
@@ -257,27 +256,22 @@ class Depth(Measurement):
 
     @property
     def title(self) -> str:
-        """Depth and name of the camera."""
         return f"the depth of {self.name}"
 
     @property
     def samples_text(self) -> str:
-        """Images and name of the camera."""
         return f"the images of '{self.name}'"
 
     @property
     def presence(self) -> dict[str, NDArray[np.bool_]]:
-        """Mask (S,) of the samples that have points."""
         return {"points": np.array(self.point_counts) > 0}
 
     @property
     def instrument_text(self) -> str:
-        """Number of points and name of the camera."""
         return f"{sum(self.point_counts):,} points of '{self.name}'"
 
     @property
     def sample_times_s(self) -> Array:
-        """(S,) sample times of the camera [s]."""
         return cast(Array, self.t_s)
 
     @property
@@ -288,13 +282,9 @@ class Depth(Measurement):
         return [cloud[:, :3] for cloud in self.clouds]
 
     def series(self) -> Iterator[tuple[str, Array]]:
-        """Yield the points of all images."""
         yield self.title, np.concatenate([*self.points_m, np.zeros((0, 3))])
 
     def until_time(self, end_s: float) -> Depth | None:
-        """Return a copy with the samples up to the time `end_s`, this one included; None if these
-        have no point.
-        """
         count = int(np.searchsorted(self.sample_times_s, end_s, side="right"))
         if not any(map(len, self.clouds[:count])):
             return None
@@ -305,12 +295,10 @@ class Depth(Measurement):
 
     @property
     def first_useful_s(self) -> float:
-        """Time of its first sample with points [s]."""
         return float(self.sample_times_s[self.first_sample_with_points])
 
     @property
     def point_counts(self) -> list[int]:
-        """Numbers of points of each sample."""
         return [*map(len, self.clouds)]
 
     def thinned(self, most: int) -> Depth:

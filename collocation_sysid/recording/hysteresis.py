@@ -47,11 +47,6 @@ def unloading_difference(experiment: Experiment) -> float | None:
     Compared are the branches of the last cycle of the test, at the strains of the unloading branch
     that the loading branch has too.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        Any experiment.
-
     Returns
     -------
     float or None

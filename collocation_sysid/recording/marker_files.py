@@ -85,8 +85,6 @@ def read_markers(
 
     Parameters
     ----------
-    path : str or Path
-        The file.
     names : sequence of str, optional
         Markers to take, in this order; by default all, in the file's order.
     labels : mapping of str to str, optional

@@ -207,7 +207,6 @@ class Markers(Measurement):
 
         Parameters
         ----------
-        body : Body
         undeformed_places : callable, optional
             Maps points (M, 3) at times (M,) to their places on the undeformed body if a grasp
             carried it rigidly. Estimates of unknown places start there; without it, at the first
@@ -253,7 +252,6 @@ class Markers(Measurement):
         return replace(self, t_s=t_s, positions_m=positions_m, offsets_s=None, sigma_ratios=ratios)
 
     def without_later_values(self, end_s: float) -> Markers:
-        """Return the markers with NaN after `end_s` [s]."""
         is_later = (self.t_s > end_s)[:, None, None]
         return replace(self, positions_m=np.where(is_later, np.nan, self.positions_m))
 
@@ -266,7 +264,6 @@ class Markers(Measurement):
 
     @property
     def sample_times_s(self) -> Array:
-        """(T,) sample times [s]."""
         return self.t_s
 
     @property
@@ -276,32 +273,24 @@ class Markers(Measurement):
 
     @property
     def value_sigmas(self) -> Array:
-        """(3M,) standard deviations of the coordinates [m]."""
         return np.repeat(self.sigma_m, 3)
 
     @property
     def identity(self) -> frozenset[str]:
-        """Names of the markers."""
         return frozenset(self.names)
 
     def series(self) -> Iterator[tuple[str, Array]]:
-        """Yield the name and the track of each marker."""
         for k, name in enumerate(self.names):
             yield f"marker {name}", np.ascontiguousarray(self.positions_m[:, k])
 
     def values_of(self, other: Markers) -> Array:
-        """Return the measured coordinates (T, 3M) [m] of markers with the same names in another
-        order.
-        """
         order = [other.names.index(name) for name in self.names]
         return other.positions_m[:, order].reshape(len(other.t_s), -1)
 
     def vectors(self, values: Array) -> Array:
-        """Return coordinates (T, 3M) as vectors (T, M, 3)."""
         return values.reshape(len(values), -1, 3)
 
     def rms_text(self, difference: Array) -> str:
-        """Return the RMS distance for differences (T, 3M) [m]; "" if none is finite."""
         known = self.distances_m(difference)
         return f"{1e3 * root_mean(known**2):.3g} mm RMS" if known.size else ""
 
@@ -315,7 +304,6 @@ class Markers(Measurement):
 
     @property
     def number_names(self) -> list[str]:
-        """Names (3M,) of the coordinates."""
         return [f"{name} {axis}" for name in self.names for axis in "xyz"]
 
     @property

@@ -155,7 +155,6 @@ class Wrench(Measurement):
         return self.with_samples(t_s, values)
 
     def within(self, t_s: Array, fewest: int) -> Wrench | None:
-        """Return the sensor with its samples within the times, see `Measurement.within`."""
         here = (self.t_s >= t_s[0]) & (self.t_s <= t_s[-1])
         if here.sum() < fewest or not self.is_measured[here].any():
             return None
@@ -163,7 +162,6 @@ class Wrench(Measurement):
 
     @property
     def sample_times_s(self) -> Array:
-        """(S,) sample times [s]."""
         return self.t_s
 
     @property
@@ -181,12 +179,10 @@ class Wrench(Measurement):
 
     @property
     def number_names(self) -> tuple[str, ...]:
-        """Names (6,) of the components."""
         return COMPONENTS
 
     @property
     def presence(self) -> dict[str, NDArray[np.bool_]]:
-        """Mask (S,) of the samples in which each measured component is present, by its name."""
         masks = super().presence
         return {name: masks[name] for name in self.component_names}
 
@@ -195,7 +191,6 @@ class Wrench(Measurement):
         return self.symmetry * values[:, None, :3]
 
     def rms_text(self, difference: Array) -> str:
-        """Return the RMS of the forces of the whole specimen; "" if none is finite."""
         return super().rms_text(self.vectors(difference))
 
     @property

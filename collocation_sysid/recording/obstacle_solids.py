@@ -109,12 +109,10 @@ class Plane(Solid):
 
     @property
     def offset_direction(self) -> Array:
-        """Normal (3,) of the plane."""
         return self.normal
 
     @property
     def tilt_centre_m(self) -> Array:
-        """(3,) stated point of the plane [m]."""
         return self.point_m
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
@@ -147,11 +145,9 @@ class Sphere(Solid):
     centre_m: Array = key(Vector, converter=float_converter((3,), "centre_m"), default=(0.0,) * 3)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return three closed circles (33, 3), one across each axis; both arguments are ignored."""
         return [_circle(self.centre_m, axis, radius_m=self.radius_m) for axis in np.eye(3)]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Return the signed distance of a point (3,) from the sphere [m]; negative inside."""
         return _length(point - ca.DM(self.centre_m)) - self.radius_m
 
 
@@ -172,7 +168,6 @@ class _AxialSolid(Solid):
     ends_m: Array = key(tuple[Vector, Vector], converter=_checked_ends)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return a closed circle at each end and four lines between them."""
         axis = np.diff(self.ends_m, axis=0)[0]
         first, last = (_circle(end, axis, radius_m=self.radius_m) for end in self.ends_m)
         quarters = range(0, len(first) - 1, (len(first) - 1) // 4)
@@ -204,9 +199,6 @@ class Cylinder(_AxialSolid):
     rounding_m: float = key(NotNegative, default=0.0)
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Return the signed distance of a point (3,) from the cylinder [m]; negative inside, where
-        it is that to the nearest of the side and the ends.
-        """
         along_m, radial_m = self._beyond_ends_and_radius(point)
         beyond = ca.vertcat(radial_m - self.radius_m, along_m)
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m
@@ -224,7 +216,6 @@ class Capsule(_AxialSolid):
     """
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Return the signed distance of a point (3,) from the capsule [m]; negative inside."""
         along_m, radial_m = self._beyond_ends_and_radius(point)
         return _length(ca.vertcat(ca.fmax(along_m, 0), radial_m)) - self.radius_m
 
@@ -255,17 +246,14 @@ class Cuboid(Solid):
 
     @property
     def tilt_centre_m(self) -> Array:
-        """(3,) centre of the box [m]."""
         return self.corners_m.mean(axis=0)
 
     def outline_polylines(self, about_m: Array, size_m: float) -> list[Array]:
-        """Return the twelve edges, (2, 3) each; both arguments are ignored."""
         corners = np.array(list(product(*self.corners_m.T)))
         differences = (corners[:, None] != corners).sum(axis=2)
         return [corners[[i, j]] for i, j in np.argwhere(differences == 1) if i < j]
 
     def signed_distance(self, point: ca.SX) -> ca.SX:
-        """Return the signed distance of a point (3,) from the box [m]; negative inside."""
         low, high = self.corners_m
         beyond = ca.fabs(point - ca.DM((low + high) / 2)) - ca.DM((high - low) / 2)
         return _corner_distance(beyond + self.rounding_m) - self.rounding_m

@@ -170,7 +170,6 @@ class LocatedBody:
     ----------
     nodes_m : (n, 3) array
         Node positions.
-    body : Body
 
     Attributes
     ----------

@@ -160,18 +160,12 @@ class Pressure(Actuator[EnclosedVolume]):
     def calibrated_amplitude(
         self, data: ca.SX, factor: Any, offset: Any, log_lag_ratio: Any
     ) -> ca.SX:
-        """Return minus the pressure [Pa] for a calibration, as an expression of `input_data` (1,)
-        at one time; without a lag `log_lag_ratio` is ignored.
-        """
         if not self.lag_s:
             return self.energy_amplitude(data, factor, offset=offset)
         pressure_pa = self._lagging_pressure(data, self.lag_s * ca.exp(log_lag_ratio))
         return self.energy_amplitude(pressure_pa, factor, offset=offset)
 
     def energy_amplitude_at(self, t_s: Array) -> Array:
-        """Return minus the pressure in the body [Pa] at the times `t_s` (T,), as (T,), with the
-        pressure's own factor, offset and lag.
-        """
         if not self.lag_s:
             return super().energy_amplitude_at(t_s)
         pressure_pa = self._lagging_pressure(ca.DM(t_s), ca.DM(self.lag_s)).full().ravel()

@@ -394,8 +394,6 @@ class Specimen:
         ----------
         material : str, Material or callable
             As of `Body`; not used if `body` is given.
-        name : str
-            Name of the experiment.
         prony : sequence of str or Prony
             Branches of the material's memory, as of `Body`; not used if `body` is given.
         fibres : Fibres, optional
@@ -528,7 +526,6 @@ class NominalStress(_MeasuredStress):
         self.direction = direction
 
     def stress_pa(self, at: GraspQuantities) -> ca.SX:
-        """Return the nominal stress [Pa]."""
         return STRESS_PER_FORCE * at.force_n[self.direction]
 
 
@@ -545,7 +542,6 @@ class StressDifference(_MeasuredStress):
         self.difference = difference
 
     def stress_pa(self, at: GraspQuantities) -> ca.SX:
-        """Return the difference [Pa]."""
         difference = self.difference[0]
         if len(self.t_s) > 1:
             difference = ca.pw_lin(at.t_s, ca.DM(self.t_s), ca.DM(self.difference))

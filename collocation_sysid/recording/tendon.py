@@ -109,17 +109,6 @@ class Tendon(Actuator[PolylineLength]):
         return PolylineLength(nodes, weights, node_count=len(body.nodes_m))
 
     def energy_amplitude(self, declared_value: Any, factor: Any, offset: Any) -> Any:
-        """Return the tension at the body, max(0, factor · stated − lost) [N]; 0 if the stated
-        tension is 0.
-
-        Parameters
-        ----------
-        declared_value : array or SX
-            Stated tension [N].
-        factor : float or SX
-            Factor of the stated tension.
-        offset : float or SX
-            Tension lost by friction [N].
-        """
+        """Return the tension at the body, max(0, factor · stated − lost) [N]; 0 if 0 is stated."""
         pull = factor * declared_value - offset
         return (declared_value > 0) * (pull > 0) * pull

@@ -268,21 +268,17 @@ class ReinforcedMaterial(Material):
 
     @property
     def matrix(self) -> Material:
-        """Material without the fibres."""
         return self.energy.matrix
 
     @cached_property
     def lame(self) -> ca.Function:
-        """Function from all constants to the small-strain (λ, μ) of the matrix."""
         values = ca.SX.sym("values", len(self.constants))
         return ca.Function("lame", [values], [self.matrix.lame(self._of_matrix(values))])
 
     def chain_rule(self, F: ca.SX, values: ca.SX) -> ChainRule:
-        """Return the chain rule of the matrix, see `Material.chain_rule`."""
         return self.matrix.chain_rule(F, self._of_matrix(values))
 
     def psi_in(self, rule: ChainRule, F: ca.SX, values: ca.SX) -> ca.SX:
-        """Return the energy density with the symbols of a rule, see `Material.psi_in`."""
         own = values[len(self.matrix.constants) :]
         matrix = self.matrix.psi_in(rule, F, self._of_matrix(values))
         return matrix + self.energy.fibres.psi(F, own)

@@ -114,8 +114,6 @@ def checked_arrays(
 
     Parameters
     ----------
-    count : int
-        Required first length.
     kind : str
         "point" or "cell", for the message.
     of : str

@@ -155,16 +155,7 @@ class Face(_PositionSelection):
         require_among(self.name, get_args(FaceName), where="face")
 
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
-        """Return the selected nodes as sorted int64 indices into `nodes.points_m`, mid nodes
-        included.
-
-        Sides do not include the nodes of the top and the bottom.
-
-        Raises
-        ------
-        InputError
-            If no node is selected.
-        """
+        """Sides do not include the nodes of the top and the bottom."""
         points_m = nodes.points_m
         mask = self._contains(points_m)
         if self.name.startswith("side"):

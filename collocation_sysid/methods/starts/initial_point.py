@@ -63,8 +63,6 @@ def compute_initial_point(
 
     Parameters
     ----------
-    recorder : Recorder
-        Recorder of the solve that needs the point.
     start : (variables,) array, optional
         Initial variables of reduced space; the guess by default.
     max_time_s : float
@@ -167,8 +165,6 @@ def adjoint_multipliers(
     ----------
     program : Collocation
         Program that is passed to IPOPT: `collocation` itself, with lifted variables, or condensed.
-    collocation : Collocation
-        Problem.
     z : (variables,) array
         Variables of `collocation`.
 

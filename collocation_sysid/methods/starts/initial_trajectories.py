@@ -92,8 +92,6 @@ def simulate_trajectories(
 
     Parameters
     ----------
-    collocation : Collocation
-        Problem.
     p : (np,) array
         Shared and nuisance parameters (q, φ).
     known_rows : sequence of (k, 3n) array, optional
@@ -103,8 +101,6 @@ def simulate_trajectories(
         Number of grid rows of each trajectory; all by default.
     options : NewtonOptions, optional
         Tolerances of Newton's method.
-    stopwatch : Stopwatch, optional
-        Stopwatch that measures the simulations.
     guess : sequence of (N, 3n) array, optional
         Trajectories at other parameters [m], from which Newton's method starts to search for
         equilibria.
@@ -149,8 +145,6 @@ def complete_variables(
 
     Parameters
     ----------
-    collocation : Collocation
-        Problem.
     p : (np,) array
         Shared and nuisance parameters (q, φ).
     known_rows : sequence of (k, 3n) array, optional

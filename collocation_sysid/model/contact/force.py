@@ -31,8 +31,6 @@ class Contact(ComplementarityForce):
     Attributes
     ----------
     law_of_contact : ContactLaw
-    factor : float
-        Factor of the force.
     previous_state : PreviousState, optional
         Given b of a program that has b as variables; b follows from the gap by default.
     variable_weights : (1, T, points), optional
@@ -83,7 +81,6 @@ class Contact(ComplementarityForce):
         return not self.is_complementarity
 
     def local_force(self, theta: Array, pattern: SymmetricPattern) -> LocalForce:
-        """Return the contact in one time step, see `ForceTerm.local_force`."""
         return StepContact(self.law_of_contact, theta, pattern=pattern, step_s=self.step_s)
 
     @property
@@ -144,7 +141,6 @@ class Contact(ComplementarityForce):
         return self.law_of_contact.is_averaged
 
     def with_inputs(self, u: Array) -> Self:
-        """Return self: contact has no inputs beside the constants of the body."""
         return self
 
     def active_points(self, states: States) -> tuple[Index | None, Array]:
@@ -173,7 +169,6 @@ class Contact(ComplementarityForce):
         )
 
     def separate_bodies(self, places: Array, shape: Array) -> Array:
-        """Return positions with the frame of the obstacle moved out of the body, see `ForceTerm`."""
         frame = self.law_of_contact.obstacle.nodes
         penetration_m, normal = self.deepest_point(shape.ravel())
         moved = places.copy()
@@ -199,7 +194,6 @@ class Contact(ComplementarityForce):
         return states.theta[self.law_of_contact.constant_columns][:, None]
 
     def constant_columns(self, places: AssemblyIndices) -> Index:
-        """Return the indices in θ of these constants."""
         return self.law_of_contact.constant_columns
 
     def data(self, chosen: Index | None) -> Array:

@@ -424,8 +424,6 @@ def contact_law(
 
     Parameters
     ----------
-    static : bool
-        Whether the experiment is static.
     averaged : bool
         Whether the pressure is the mean over a time step.
     """

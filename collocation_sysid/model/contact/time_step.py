@@ -44,10 +44,6 @@ class ContactCandidates:
 
         Parameters
         ----------
-        law : ContactLaw
-            Contact law of the obstacle.
-        pattern : SymmetricPattern
-            Pattern of the matrices.
         chosen : bytes
             Indices of the points among all contact points, an array of int64 as bytes.
         """
@@ -118,12 +114,8 @@ class StepContact(LocalForce):
 
     Parameters
     ----------
-    law : ContactLaw
-        Contact law of the obstacle.
     theta : (k,) array
         Constants of the body.
-    pattern : SymmetricPattern
-        Pattern of the matrices.
     step_s : float
         Length of the time step over which the pressure is averaged [s]; 0 if it is not.
     """
@@ -143,9 +135,6 @@ class StepContact(LocalForce):
         self._margin_m = 0.25 * law.surface.edge_m
 
     def force(self, xi: Array, nu: Array) -> Array:
-        """Return the contact forces (3n,) [N] at ξ [m] and ν [m/s], each (1, 3n); zero without
-        contact.
-        """
         if self._last_evaluation is not None:
             last_xi, last_nu, points = self._last_evaluation
             if np.array_equal(last_xi, xi) and np.array_equal(last_nu, nu):
@@ -159,7 +148,6 @@ class StepContact(LocalForce):
     def active_points(
         self, xi: Array, nu: Array, rates: tuple[float, float]
     ) -> ActivePoints | None:
-        """Return the points that touch, see `LocalForce.active_points`."""
         candidates = self._candidates(xi[0], nu[0])
         if candidates is None:
             return None

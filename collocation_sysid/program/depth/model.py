@@ -30,7 +30,6 @@ class DepthModel(CorrespondenceModel):
         )
 
     def first_correspondences(self) -> SurfaceCorrespondences:
-        """Return the correspondences with the undeformed body after an alignment of the camera."""
         experiment = self.grid.experiment
         nodes = VisibleSurface.from_body(experiment.body, self.measurement).nodes
         shapes_m = experiment.rigid_positions(self.measurement.sample_times_s)

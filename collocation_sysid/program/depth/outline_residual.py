@@ -60,7 +60,6 @@ class OutlineResidual(DepthResidual):
 
     @property
     def correspondences_in_use(self) -> Outline:
-        """Points of the outline, and planes through the edges in the images."""
         return self.correspondences.outline
 
     @property

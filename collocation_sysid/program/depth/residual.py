@@ -104,8 +104,6 @@ class DepthResidual(CorrespondenceResidual):
             Correspondences of the points with the surface.
         at_s : (n,) array
             Times at which positions are known [s].
-        nuisance : NuisanceMap
-            Nuisance parameters of the experiment.
         huber : float or None
             Threshold of Huber's loss; None means 3 standard deviations, because outliers are
             normal.
@@ -128,7 +126,6 @@ class DepthResidual(CorrespondenceResidual):
 
     @property
     def measurement(self) -> Depth:
-        """Points of the camera."""
         return self.correspondences.camera.depth
 
     @property
@@ -190,33 +187,22 @@ class DepthResidual(CorrespondenceResidual):
         )
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of the first images that depend only on the first `known` times of the
-        observable; φ is not used.
-        """
         samples = int(np.count_nonzero(self._neighbour_times[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     @property
     def first_row(self) -> int:
-        """Index of the last time of the observable from which the first image is computed."""
         return int(self._neighbour_times[0, -1])
 
     def reassociated(self, x: Array, phi: Array) -> SurfaceCorrespondences:
-        """Return the correspondences of the shapes at the images that the first rows x (rows, 3n)
-        [m] reach, see `SurfaceCorrespondences.updated`.
-        """
         return self.correspondences.updated(self.surface_shapes(x, phi), phi)
 
     def correspondences_of(self, measured: Depth, x: Array, phi: Array) -> SurfaceCorrespondences:
-        """Return the correspondences of other points of the same camera and images with the motion
-        x (N, 3n) [m], see `SurfaceCorrespondences.with_depth`.
-        """
         return self.correspondences.with_depth(measured, self.surface_shapes(x, phi), phi=phi)
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
     ) -> SurfaceCorrespondences:
-        """Align the camera with the first rows of a motion and return the correspondences."""
         correspondences = self.correspondences
         shapes = self.surface_shapes(x, phi)
         if not len(shapes):
@@ -232,25 +218,11 @@ class DepthResidual(CorrespondenceResidual):
 
     @property
     def first_needed_s(self) -> float:
-        """Time [s] of the last row of the motion on which the prediction of the first compared
-        image depends.
-        """
         first = int(self.is_compared.any(axis=(1, 2)).argmax())
         return float(self.observable_s[self._neighbour_times[first, -1]])
 
     def expression(self, values_in: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the distance (1,) of a point behind the surface along the normal [m], positive
-        inside the body.
-
-        Parameters
-        ----------
-        values_in : (3, nodes · times) SX
-            Positions of the nodes of the point's face at the neighbouring times [m].
-        phi : SX
-            Nuisance parameters of the camera, in prior standard deviations.
-        data : SX
-            Data of the point, see `_stencil`.
-        """
+        """Return the distance (1,) of a point behind the surface [m], positive inside the body."""
         view = self.correspondences.camera
         nodes = self.correspondences_in_use.nodes.shape[2]
         sizes = np.cumsum([0, self._neighbour_times.shape[1], nodes, 3, 3, 1, 3, 3]).tolist()
@@ -264,10 +236,7 @@ class DepthResidual(CorrespondenceResidual):
         return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - normal_motion
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
-        """Return the distances from visible parts of the surface to the points of the first image
-        (P,), in standard deviations, at positions x (rows, 3n) [m] and φ (k,); x must reach the
-        first image.
-        """
+        """Return distances (P,) of the surface to the first image, in standard deviations."""
         shapes = self.surface_shapes(x, phi)
         return (
             self.correspondences.distance_to_cloud_m(shapes[0], phi)
@@ -357,7 +326,6 @@ class DepthResidual(CorrespondenceResidual):
     # Of motions -------------------------------------------------------------------------------
 
     def fitted(self, motion: ObservedMotion, phi: Array) -> SurfaceComparison:
-        """Return the comparison with the surface of a fit at its correspondences."""
         return SurfaceComparison(
             self.correspondences,
             self.surface_shapes(motion.x, phi),

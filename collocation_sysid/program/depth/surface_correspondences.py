@@ -96,11 +96,9 @@ class SurfaceCorrespondences(Correspondences):
 
     @property
     def measured(self) -> Depth:
-        """Measured points of the camera."""
         return self.camera.depth
 
     def with_start_values(self, phi: Array) -> Array:
-        """Return a copy of φ (k,) with the camera's nuisance parameters `start_values`."""
         own = self.camera.parameter_indices
         updated = phi.copy()
         updated[own] = self.camera.parameters_from(self.start_values)[own]

@@ -95,8 +95,6 @@ def simulate_newmark(
         Constants of the body.
     steps_per_sample : int
         Time steps between samples.
-    options : NewtonOptions or None
-        Options of Newton's method; None means defaults.
     progress : callable or None
         Called with the share of the samples done.
     sensed : (g,) array

@@ -714,10 +714,6 @@ class NewtonSolvers:
 
     Parameters
     ----------
-    experiment : Experiment
-        The experiment.
-    options : NewtonOptions, optional
-        Options of Newton's method.
     stopwatch : Stopwatch, optional
         Accumulates the time spent.
     """

@@ -41,7 +41,6 @@ class Retraction:
 
     Parameters
     ----------
-    body : Body
     prescribed : (n, 3) bool
         Coordinates that are prescribed, and are displaced exactly by the increment.
     """

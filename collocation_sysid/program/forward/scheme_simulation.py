@@ -49,8 +49,6 @@ def simulate_scheme(
         The experiment, which states the start.
     dynamics : Dynamics
         Discrete equations of motion at the parameters.
-    options : NewtonOptions, optional
-        Options of Newton's method.
     progress : callable, optional
         Called with the share of the rows done.
 
@@ -92,8 +90,6 @@ def continue_simulation(
         Discrete equations of motion at the parameters.
     known : (k, 3n) array, optional
         First rows [m], at least one; by default the start of the experiment is computed.
-    options : NewtonOptions, optional
-        Options of Newton's method.
     progress : callable, optional
         Called with the share of the rows done.
     stopwatch : Stopwatch, optional
@@ -229,8 +225,6 @@ class RowEquations(StepEquations):
 
     Parameters
     ----------
-    dynamics : Dynamics
-        Equations of motion.
     x : (N, 3n) array
         Positions [m]; rows before t are used.
     forces : (N, 3n) array
@@ -302,7 +296,6 @@ class RowEquations(StepEquations):
         return rest + self.local.force(*states) if self.local.has_forces else rest
 
     def states(self, x: Array) -> tuple[Array, Array]:
-        """Return ξ_t [m] and ν_t [m/s], each (1, 3n), from x_t (3n,)."""
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
 
     def _residual_from(self, force: Array, x: Array) -> Array:
@@ -311,13 +304,9 @@ class RowEquations(StepEquations):
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual_without_local(self, x: Array) -> Array:
-        """Return the constraints c_t (3n,) [N] without local forces at positions x_t (3n,) [m]."""
         return self._residual_from(self.rest.total(*self.states(x))[0], x)
 
     def linearise_without_local(self, x: Array) -> NewtonLinearisation:
-        """Return c_t (3n,) [N] without local forces at x_t = `x` (3n,) [m], and its derivative by
-        x_t.
-        """
         row = self.row
         at = self.rest.linearise(*self.states(x))
         matrix = row.block(at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern)

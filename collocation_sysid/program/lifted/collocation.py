@@ -47,23 +47,17 @@ class LiftedCollocation(Collocation):
 
     @property
     def variable_count(self) -> int:
-        """Number of variables z, including lifted ones."""
         return super().variable_count + lifted_count(self)
 
     @property
     def constraint_count(self) -> int:
-        """Number of constraints g, including the equations of lifted variables."""
         return super().constraint_count + lifted_count(self)
 
     @property
     def has_eliminated_histories(self) -> bool:
-        """Whether history variables are eliminated; they are not."""
         return False
 
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
-        """Return the variables z, see `Collocation.pack`; lifted ones follow from positions and
-        parameters.
-        """
         parts = self.iterates_at(p, positions)
         lifted = [each.consistent_values(parts[each.transcription_index]) for each in self.lifted]
         return np.concatenate([super().pack(p, positions), *lifted])
@@ -167,8 +161,6 @@ def lifted_count(collocation: Collocation, kind: str | None = None) -> int:
 
     Parameters
     ----------
-    collocation : Collocation
-        Program.
     kind : {"memory", "force", "pressure", "reaction"}, optional
         Kind of lifted variables; None means all.
     """

@@ -102,8 +102,6 @@ class ExpressionPattern:
 
         Parameters
         ----------
-        recursion : Recursion
-            The recursion R.
         data : (d, …) array
             Data of the recursion; broadcast to the shape of the instances.
         states : PatternIndices, (n, N, I)

@@ -50,7 +50,6 @@ class LiftedForceHistory(LiftedVariables):
 
     @property
     def history_index(self) -> int:
-        """Index of the history in `ExperimentIterate.histories`."""
         return self.motion_history
 
     @property
@@ -65,9 +64,6 @@ class LiftedForceHistory(LiftedVariables):
         return (term.internal_variable_count, self.transcription.grid_times - 1, self._points.count)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables (count,) that satisfy the equations at the iterate's
-        positions and parameters; the iterate must not have lifted ones.
-        """
         return (
             self._history_of(iterate).previous_state.before[:, 1:].ravel()
             / self.transcription.length_m
@@ -91,21 +87,7 @@ class LiftedForceHistory(LiftedVariables):
         return z[self.columns] - predicted / self.transcription.length_m
 
     def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
-        """Return the history and its weights in the Lagrangian.
-
-        Parameters
-        ----------
-        iterate : ExperimentIterate
-            The experiment at the variables.
-        multipliers : array
-            Multipliers of all constraints g.
-
-        Returns
-        -------
-        (ForceHistory, (n, N, I) array)
-            The history, and μ such that multipliers · equations contains Σ μ_k h_k; zero at the
-            last evaluation.
-        """
+        """Return the history and μ (n, N, I): multipliers · equations contains Σ μ_k h_k."""
         mu = -multipliers[self.rows].reshape(self.shape) / self.transcription.length_m
         return self._history_of(iterate), np.concatenate([mu, np.zeros_like(mu[:, :1])], axis=1)
 
@@ -207,9 +189,6 @@ class LiftedForceHistory(LiftedVariables):
         yield EntryBlock([self._dynamic_columns[:, None, None, None]], [columns])
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate and z, and the values of
-        `jacobian_entries`.
-        """
         history = self._history_of(iterate)
         length_m = self.transcription.length_m
         d = self._points.dofs

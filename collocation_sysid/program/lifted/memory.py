@@ -100,9 +100,6 @@ class LiftedMemory(LiftedVariables):
     # Values -------------------------------------------------------------------------------------
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables (count,) that satisfy the recursion at the iterate's
-        positions and parameters; the iterate must not have lifted ones.
-        """
         return (_body_history(iterate).previous_variables[1:] / self.unit_pa).ravel()
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
@@ -122,21 +119,7 @@ class LiftedMemory(LiftedVariables):
         return (_body_history(iterate).compute_recursion_residuals() / self.unit_pa).ravel()
 
     def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
-        """Return the history and its weights in the Lagrangian.
-
-        Parameters
-        ----------
-        iterate : ExperimentIterate
-            The experiment at the variables.
-        multipliers : array
-            Multipliers of all constraints g.
-
-        Returns
-        -------
-        (MemoryHistory, (N, width) array)
-            The history, and μ such that multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k);
-            zero at the last evaluation.
-        """
+        """Return the history and μ: multipliers · r = −Σ μ_k (m_k − d_k m_{k−1} − a_k S_k)."""
         return _body_history(iterate), self._history_weights(multipliers)
 
     def _history_weights(self, multipliers: Array) -> Array:
@@ -262,16 +245,12 @@ class LiftedMemory(LiftedVariables):
 
     @property
     def entry_counts(self) -> tuple[int, int]:
-        """Numbers of additional entries of Jacobian and Hessian, computed without index arrays."""
         groups = self._jacobian_blocks(), self._hessian_blocks()
         return sum(each.entry_count for each in groups[0]), sum(
             each.entry_count for each in groups[1]
         )
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the scaled equations r (count,), and the values of `jacobian_entries`, at the
-        history variables that the iterate contains; z is not used.
-        """
         history = _body_history(iterate)
         memory = iterate.transcription.body.memory
         after = self.shape[0] - 1, self.shape[1]
@@ -349,9 +328,6 @@ class LiftedMemory(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in
-        `LiftedVariables.hessian_values`.
-        """
         transcription = self.transcription
         history = _body_history(iterate)
         theta_q = iterate.equations.theta_p[:, : iterate.equations.nq]

@@ -57,9 +57,6 @@ class LiftedPressure(LiftedForceHistory):
         return 1, self.transcription.constraint_times, self._points.count
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled variables (count,) that satisfy the equations at the iterate's
-        positions.
-        """
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
         return self._find_force().scaled_pressures(xi).ravel() / self.unit_m
 
@@ -103,9 +100,6 @@ class LiftedPressure(LiftedForceHistory):
             )
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate, and the values of `jacobian_entries`;
-        z is not used.
-        """
         history = self._history_of(iterate)
         d = self._points.dofs
         slopes = history.derivatives(slice(None))

@@ -56,7 +56,6 @@ class LiftedReactions(LiftedVariables):
         return forces_n
 
     def residual_weights(self, multipliers: Array) -> Array:
-        """Return the derivative (N, 3n) of multipliers · g by the residual c in newtons [1/N]."""
         weights = np.zeros((self.transcription.grid_times, self.transcription.dof_count))
         by_row = multipliers[self.rows].reshape(self.shape) / self.transcription.force_n
         weights[self.transcription.dynamics.first_row :, self.transcription.sensed_dofs] = by_row
@@ -79,9 +78,6 @@ class LiftedReactions(LiftedVariables):
         )
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled reaction forces (count,) that follow from the positions and parameters
-        of the iterate.
-        """
         return self._scaled(iterate.reactions.reaction)
 
     def _scaled(self, newtons: Array) -> Array:
@@ -111,9 +107,6 @@ class LiftedReactions(LiftedVariables):
         return np.concatenate(rows), np.concatenate([*columns, np.tile(of_p, self.count)])
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
-        """Return the scaled equations (count,) at an iterate and z, and the values of
-        `jacobian_entries`.
-        """
         setting = iterate.equations
         motion = self._motion_jacobian
         dynamics = setting.dynamics

@@ -92,9 +92,6 @@ class LiftedResultant(LiftedVariables):
         return slice(self.columns.stop - self._resultant_size, self.columns.stop)
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        """Return the scaled W and, with a low-pass, Y (count,) that follow from the iterate's
-        motion.
-        """
         own = [self.observable.evaluate_unfiltered(iterate.reactions, iterate.phi)]
         if evolution := self.observable.filter_resultant(own[0], iterate.phi):
             own += [*evolution.states]
@@ -211,9 +208,6 @@ class LiftedResultant(LiftedVariables):
         multipliers: Array,
         weights: RowWeights,
     ) -> Array:
-        """Return the values of `hessian_entries`; arguments as in
-        `LiftedVariables.hessian_values`.
-        """
         of_equations = super().hessian_values(
             iterate, z, loss_weight=loss_weight, multipliers=multipliers, weights=weights
         )

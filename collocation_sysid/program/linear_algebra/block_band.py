@@ -70,8 +70,6 @@ class BlockBand:
         Columns per block.
     row_starts : (N,) array
         First row of each row block, −1 where the block does not exist.
-    blocks : sequence of BandBlock
-        The blocks.
     top_rows : int
         Number of rows above all blocks, in which every column has an entry (0 … `top_rows` − 1).
     adds : bool

@@ -546,10 +546,6 @@ class Factoriser:
         ----------
         matrix : callable
             Returns lower triangles of both parts of matrix k, see `factorise`.
-        count : int
-            Number of matrices.
-        threads : int
-            Number of threads.
         buffers : sequence of FactorMemory or None
             Memory for each factor; empty to allocate. It may be longer than `count`.
         is_single : bool

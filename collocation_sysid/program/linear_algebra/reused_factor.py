@@ -66,8 +66,6 @@ class NodeRotation:
     ----------
     free : (k,) array
         Free dofs, ascending; dof 3 i + j is the coordinate j of node i.
-    node_count : int
-        Number of nodes.
     """
 
     def __init__(self, free: Index, node_count: int) -> None:
@@ -271,8 +269,6 @@ class ReusedFactor:
         ----------
         right : (k,) or (k, m) array
             Right-hand sides; not modified.
-        transposed : bool
-            Whether to solve with the transposed matrix.
         guess : array, optional
             Guess of the solution, in the shape of `right`.
 

@@ -58,14 +58,8 @@ class MarkerResidual(MeasurementResidual):
 
         Parameters
         ----------
-        markers : Markers
-            Measured tracks.
         rows : (T,) array
             Grid times of the observable, one for each sample.
-        nuisance : NuisanceMap
-            Nuisance parameters of the experiment.
-        association : MarkerAssociation
-            Elements of the markers.
         clock_samples : int
             Whole samples of the clock's shift.
         huber : float or None
@@ -95,7 +89,6 @@ class MarkerResidual(MeasurementResidual):
 
     @property
     def measurement(self) -> Markers:
-        """Measured tracks."""
         return self.markers
 
     @property
@@ -141,24 +134,10 @@ class MarkerResidual(MeasurementResidual):
         return RowStencil(places, np.repeat(place[..., None], count, axis=2))
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
-        """Return the stencil of the first samples that depend only on the first `known` times of
-        the observable; φ is not used.
-        """
         samples = int(np.count_nonzero(self._neighbour_indices[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
-        """Return the prediction y (3,) of one marker.
-
-        Parameters
-        ----------
-        values : (3, neighbours) SX
-            Places of the marker at neighbouring grid times [m].
-        phi : SX
-            Nuisance parameters of the marker, in prior standard deviations.
-        data : (2,) SX
-            Position of the frame among the neighbours, in samples, and its time [s].
-        """
         place, t_s = ca.vertsplit(data)
         own = self.own_parameters[0] if len(self.own_parameters) else np.zeros(0, dtype=np.int64)
         value = values[:, 0]
@@ -197,7 +176,6 @@ class MarkerModel(MeasurementModel):
     def residuals(
         self, association: Association, correspondences: Correspondences | None
     ) -> tuple[MarkerResidual]:
-        """Return the residual of all tracks."""
         residual = MarkerResidual.from_markers(
             self.measurement,
             self.grid.sample_rows,

@@ -142,8 +142,6 @@ def linearised_reactions(
 
     Parameters
     ----------
-    equations : EquationsAtParameters
-        Equations of motion at the parameters.
     x : (rows, 3n) array
         Positions [m].
     grasp_forces : GraspForces
@@ -191,8 +189,6 @@ def reaction_vjp(
 
     Parameters
     ----------
-    equations : EquationsAtParameters
-        Equations of motion at the parameters.
     x : (N, 3n) array
         Positions [m].
     weights : (N, g) array
@@ -244,8 +240,6 @@ def reaction_forces(dynamics: Dynamics, mass_kg: Array, force: Array, accelerati
 
     Parameters
     ----------
-    dynamics : Dynamics
-        Equations of motion.
     mass_kg : (N, g) array
         Masses of the dofs [kg].
     force : (N, g) array
@@ -263,8 +257,6 @@ def reaction_changes(
 
     Parameters
     ----------
-    dynamics : Dynamics
-        Equations of motion.
     mass_kg : (N, g) array
         Masses of the dofs [kg].
     force_changes : (N, g, columns) array

@@ -92,16 +92,12 @@ class ReactionResultant:
     ----------
     sensor_index : int
         Index of the sensor in the experiment; −1 if it has no nuisance parameters of its own.
-    grasp : Grasp
-        The grasp.
     frame : str
         Frame of the sensor, in whose axes components are expressed.
     point_m : (3,) array
         Point of the torque [m]: fixed in the world, or in the frame "grasp" on the undeformed body.
     reaction_grid : ReactionGrid
         Times at which reaction forces are known.
-    nuisance : NuisanceMap
-        Nuisance parameters of the experiment.
     dof_count : int
         Number of dofs of the body, 3n.
     sensed_dofs : (g,) array
@@ -197,8 +193,6 @@ class ReactionResultant:
             Origin of the sensor [m].
         grid : ReactionGrid
             Times at which reaction forces are known.
-        nuisance : NuisanceMap
-            Nuisance parameters of the experiment.
         number : int
             Index of the sensor; −1 if it has no nuisance parameters of its own.
         """
@@ -434,8 +428,6 @@ class ReactionResultant:
 
         Parameters
         ----------
-        motion : ObservedMotion
-            Motion over all grid times.
         phi : (k,) array
             Nuisance parameters.
         by_values : (n, 2, 3) array

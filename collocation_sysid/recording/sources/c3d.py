@@ -45,9 +45,6 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
 
     Parameters
     ----------
-    path : str or Path
-    content : bytes
-        Content of that file.
     choose : LabelChooser
         Picks the markers.
 

@@ -139,8 +139,6 @@ class Header:
 
         Parameters
         ----------
-        count : int
-            Actual number.
         what : str
             What is counted, for the message.
         line : int, optional

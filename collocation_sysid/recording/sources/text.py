@@ -255,8 +255,6 @@ def numeric_cells(grid: Table, columns: Sequence[int], blank_allowed: bool) -> A
 
     Parameters
     ----------
-    columns : sequence of int
-        Indices of the columns.
     blank_allowed : bool
         Whether cells may be blank; "nan" counts as blank.
 
@@ -312,8 +310,6 @@ def times_in_column(grid: Table, column: int, factor: float = 1.0) -> Array:
 
     Parameters
     ----------
-    column : int
-        Index of the column.
     factor : float
         Factor from the column's unit to seconds.
 
