@@ -6,7 +6,7 @@ Fields of immutable classes are read-only copies.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -113,7 +113,7 @@ def as_array(values: ArrayLike) -> Array:
     ``__post_init__`` checks.
     """
     try:
-        return cast(Array, np.asanyarray(values))
+        return np.asanyarray(values)
     except ValueError as error:
         raise InputError(f"an array has rows of different lengths ({error})") from error
 
@@ -123,28 +123,28 @@ def as_array_or_none(values: ArrayLike | None) -> Array | None:
     return None if values is None else as_array(values)
 
 
-def unconverted(values: ArrayLike) -> Array:
+def unconverted(values: ArrayLike) -> Any:
     """Return the values unchanged; converter of array fields that ``__post_init__`` converts with
     more information.
     """
-    return cast(Array, values)
+    return values
 
 
-def unconverted_or_none(values: ArrayLike | None) -> Array | None:
+def unconverted_or_none(values: ArrayLike | None) -> Any:
     """Return the values unchanged, like `unconverted`; None where the field may be None."""
-    return cast("Array | None", values)
+    return values
 
 
-def unconverted_sigma(sigma: ArrayLike) -> float:
+def unconverted_sigma(sigma: ArrayLike) -> Any:
     """Return the value unchanged; converter of a σ that ``__post_init__`` splits into median and
     ratios of samples.
     """
-    return cast(float, sigma)
+    return sigma
 
 
-def unconverted_sigma_or_none(sigma: ArrayLike | None) -> float | None:
+def unconverted_sigma_or_none(sigma: ArrayLike | None) -> Any:
     """Return the value unchanged, like `unconverted_sigma`; None where the field may be None."""
-    return cast("float | None", sigma)
+    return sigma
 
 
 def read_only_coordinates(values: ArrayLike, shape: tuple[int | None, ...]) -> Array:

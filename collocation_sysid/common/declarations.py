@@ -49,11 +49,11 @@ def identity(value: T) -> T:
     return value
 
 
-def identity_or_none(value: T | None) -> T:
+def identity_or_none(value: Any) -> Any:
     """Return the value unchanged; converter of fields that may be None until they are set with more
     information.
     """
-    return cast(T, value)
+    return value
 
 
 def key(

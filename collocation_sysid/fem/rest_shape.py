@@ -296,7 +296,6 @@ class InverseEquilibrium:
     """
 
     def __init__(self, body: Any) -> None:
-        assert body.scan_conditions is not None
         self.body = body
         self.points_m: Array = body.nodes.points_m
         self.gravity_m_s2 = np.asarray(body.scan_conditions.gravity_m_s2, dtype=float)

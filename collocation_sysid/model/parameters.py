@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -953,8 +953,8 @@ def resolve_theta(
     """
     if isinstance(values, Parameters):
         return body.theta_from_values(values.guesses)
-    if hasattr(values, "to_dict"):  # a row of a table of pandas
-        values = cast(Any, values).to_dict()
+    if to_dict := getattr(values, "to_dict", None):  # a row of a table of pandas
+        values = to_dict()
     if isinstance(values, Mapping):
         Parameters.from_mapping(values, definitions=body.constants).require_constants_of([body])
         return body.theta_from_values(values)

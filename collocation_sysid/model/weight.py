@@ -210,8 +210,8 @@ class Weight(ForceTerm):
         self, linearisation: Linearisation, places: AssemblyIndices, states: States
     ) -> None:
         """Add derivatives by the inputs and by free densities; `places` needs no entries."""
-        # Velocities and θ enter by the shares of loads, through the damping γ_m of their masses; the
-        # damping force itself is part of `Body.force`.
+        # Velocities and θ enter by the shares of loads, through the damping γ_m of their masses;
+        # the damping force itself is part of `Body.force`.
         np.add(linearisation.force, self.external_n, out=linearisation.force)
         for density, slope in self.body.mass_derivatives.items():
             linearisation.by_theta[:, :, density] += slope * self.gravity

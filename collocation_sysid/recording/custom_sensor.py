@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
@@ -82,7 +82,7 @@ class GraspQuantities:
 def stack_values(values: SensorValues) -> ca.SX:
     """Return the values of a custom sensor as a column; a matrix column after column."""
     stacked = ca.vertcat(*values) if isinstance(values, Sequence) else values
-    return ca.vec(ca.SX(cast(ca.SX, stacked)))
+    return ca.vec(ca.SX(stacked))
 
 
 class CustomSensor(Measurement):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal, cast
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,16 +55,16 @@ def _require_selection(faces: Selection | None) -> Selection | None:
     return faces
 
 
-def _unconverted_clouds(clouds: Sequence[ArrayLike]) -> tuple[Array, ...]:
+def _unconverted_clouds(clouds: Sequence[ArrayLike]) -> Any:
     """Return the clouds, which `Depth` checks and thins."""
     if isinstance(clouds, str) or not isinstance(clouds, Iterable):
         raise InputError(f"found {clouds!r}; expected a list of clouds (P, 3) of a depth camera")
-    return cast(tuple[Array, ...], clouds)
+    return clouds
 
 
-def _unconverted_images(images_m: Sequence[ArrayLike | None]) -> tuple[Array | None, ...]:
+def _unconverted_images(images_m: Sequence[ArrayLike | None]) -> Any:
     """Return the images unchanged, which `Depth` checks and converts."""
-    return cast(tuple[Array | None, ...], images_m)
+    return images_m
 
 
 @declaration
@@ -272,7 +272,7 @@ class Depth(Measurement):
 
     @property
     def sample_times_s(self) -> Array:
-        return cast(Array, self.t_s)
+        return self.t_s
 
     @property
     def points_m(self) -> list[Array]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal, Self, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,14 +31,13 @@ SMALLEST_SINGULAR_VALUE = 1e-6
 Axes = Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]
 
 
-def unconverted_poses(poses: PoseSequence | ArrayLike) -> PoseSequence:
+def unconverted_poses(poses: PoseSequence | ArrayLike) -> Any:
     """Return poses unchanged, and matrices (T, 4, 4) as an array: they are converted when their
     times are known.
     """
     if isinstance(poses, PoseSequence):
         return poses
-    matrices = float_array(poses, "poses of a grasp", (None, 4, 4), finite=False)
-    return cast(PoseSequence, matrices)
+    return float_array(poses, "poses of a grasp", (None, 4, 4), finite=False)
 
 
 @declaration

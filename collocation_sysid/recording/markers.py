@@ -154,9 +154,8 @@ class Markers(Measurement):
         sigma_m, ratios = np.ones(m), np.ones((t, m))
         for k, name in enumerate(self.names):
             seen = is_seen[:, k : k + 1]
-            sigma_m[k], each = split_sigma(given[:, k], seen, f"sigma_m of marker '{name}'")
-            assert each is not None
-            ratios[:, k] = each[:, 0]
+            what = f"sigma_m of marker '{name}'"
+            sigma_m[k], ratios[:, k : k + 1] = split_sigma(given[:, k], seen, what)
         vars(self)["sigma_ratios"] = np.repeat(ratios, 3, axis=1)
         return sigma_m
 

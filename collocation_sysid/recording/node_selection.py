@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -88,9 +88,9 @@ def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:
         By the converter: if there are no nodes, or as `read_only_nodes` does.
     """
 
-    def chosen(selection: ArrayLike | Selection) -> Index:
+    def chosen(selection: ArrayLike | Selection) -> Any:
         if isinstance(selection, Selection):
-            return cast(Index, selection)
+            return selection
         nodes = np.unique(read_only_nodes(selection, (None,), name=f"nodes of {what}"))
         if nodes.size == 0:
             raise InputError(f"{what} has an empty list of nodes; expected at least one node index")

@@ -8,7 +8,6 @@ linear tetrahedra, which represents the homogeneous deformation exactly, see
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -137,7 +136,7 @@ class Specimen:
     strain: Array = key(converter=float_converter((None,), "strain"))
     stress_pa: Array = key(converter=float_converter((None,), "stress_pa", finite=False))
     sigma_pa: float | Array = key(Positive, accepted=PositivePerSample)
-    t_s: Array | None = key(converter=float_converter((None,), "t_s"), default=None)
+    t_s: Array = key(converter=float_converter((None,), "t_s"), default=None)
     second_strain: Array | None = key(
         converter=float_converter((None,), "second_strain"), default=None
     )
@@ -415,7 +414,6 @@ class Specimen:
             angle = self.cut_angle_deg
             cell = cell_body(self.test, material, prony, fibres=fibres, cut_angle_deg=angle)
             cell = conditioned(cell, self.oscillates, self.shift, self.temperature_difference_k)
-        assert self.t_s is not None
         require_evaluable_law(
             cell, self.find_deformation(), strain=self.strain, second_strain=self.second_strain
         )
@@ -436,7 +434,6 @@ class Specimen:
 
     def _grasps(self, has_fibres: bool) -> list[Grasp]:
         """Return a grasp for each node of the cell; with fibres, uniaxial tension shears."""
-        assert self.t_s is not None
         deformation = self.find_deformation()
         if has_fibres and self.test == "uniaxial":
             deformation = replace(deformation, free_shear=("zx",))
@@ -456,7 +453,6 @@ class Specimen:
 
     def _sensors(self) -> list[Gauge]:
         """Return the sensors of both stresses and the lateral stretch, as far as measured."""
-        assert self.t_s is not None
         sensors = []
         for name, component, values in (
             (STRESS_NAME, self.find_deformation().first_stress, self.stress_pa),
@@ -474,7 +470,7 @@ class Specimen:
                     LateralStretch(axis),
                     t_s=self.t_s,
                     values=self.lateral_stretch,
-                    sigma=cast(float, self.lateral_sigma),
+                    sigma=self.lateral_sigma,
                     points_m=[point_m],
                     unit="1",
                 )
@@ -484,7 +480,6 @@ class Specimen:
     def _stress_sensor(self, name: str, component: str, values: Array) -> Gauge:
         deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
         direction, normal = (AXES.index(axis) for axis in component)
-        assert self.t_s is not None
         quantity = NominalStress(direction)
         if self.test == "biaxial-difference":
             assert self.second_strain is not None
@@ -494,7 +489,7 @@ class Specimen:
             quantity,
             t_s=self.t_s,
             values=values,
-            sigma=cast(float, self.sigma_pa),
+            sigma=self.sigma_pa,
             grasp=2 + normal,
             frame="world",
             unknowns={unknown: sigma for unknown, sigma in deviations.items() if sigma},
