@@ -164,7 +164,8 @@ def _conclusions(result: Result) -> Iterator[str]:
     """Name windows and recordings first, then the assumption that reduces χ² most."""
     significant = [probe for probe in result.probes if probe.sentences]
     assumptions = _found_assumptions(result)
-    relaxed = [p for p in assumptions if is_possible(p)]
+    is_good = result.trust.verdict == "good"
+    relaxed = [p for p in assumptions if is_possible(p) and not is_good]
     for kind in ("window", "recording"):
         disagreeing = [p for p in significant if p.kind == kind]
         if disagreeing:

@@ -40,6 +40,7 @@ from .residuals.noise_level import NoiseLevel
 from .thresholds import (
     ABSURD,
     AS_GOOD_AS_CERTAIN,
+    CHANCE,
     CLEARLY_PERSISTENT,
     DAMPING_SHARE,
     E_FOLDINGS,
@@ -171,9 +172,9 @@ def fit_concerns(uncertainty: Uncertainty, budgeted: ErrorBasis | None = None) -
     "residuals/shared". Residuals more than `MISFIT` times σ are "doubtful" above `GROSS_MISFIT` if
     they are also correlated, or if nothing is known about their correlation in time. Residuals less
     than 1/`MISFIT` of σ are "check" unless they are exactly zero or correlated. All need
-    significance at `RARE`, except the correlation of large residuals, which may also be above
-    `CLEARLY_PERSISTENT`. One concern for each outlier, for noisy markers, and for parameters on
-    which recordings disagree is added.
+    significance at `RARE`, except large residuals (`CHANCE`) and their correlation, which may also
+    be above `CLEARLY_PERSISTENT`. One concern for each outlier beyond `GROSS_MISFIT`, for noisy
+    markers, and for parameters on which recordings disagree is added.
 
     Parameters
     ----------
@@ -195,7 +196,7 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     factor = float(np.sqrt(level.pooled))
     persistent, shared = _correlations(dependence)
     is_used = uncertainty.errors == "autocorrelated"
-    larger = factor > MISFIT and level.larger_p < RARE
+    larger = factor > MISFIT and level.larger_p < CHANCE
     # Of single samples nothing tells that it is noise; of a few, only a clear correlation tells
     # that it is not.
     no_noise = (
@@ -210,7 +211,7 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     smaller = not larger and 0 < factor < 1 / least and level.smaller_p < RARE
     sigma_key = level.sigma_key
     return [
-        *(outlier.to_concern() for outlier in uncertainty.outliers),
+        *(each.to_concern() for each in uncertainty.outliers if each.deviations > GROSS_MISFIT),
         *concern_if(
             is_used and persistent,
             factor > GROSS_MISFIT,

@@ -153,7 +153,8 @@ WIDENING_OF_FIELDS = Threshold(
 )
 CHANCE = Threshold(
     0.01,
-    "Probability that a faultless run has any significant probe, beside those of every solve.",
+    "Probability that a faultless run has any significant probe, beside those of every solve, or "
+    "residuals that are larger than noise.",
     study="verdict_reliability",
 )
 GRANTED = Threshold(

@@ -125,3 +125,8 @@ def test_a_first_sample_that_is_no_rest_is_reported():
     assert "at t = 0.5 s" in named
     assert "is assumed to be relaxed at the first sample" in named
     assert any("consecutive samples are correlated" in reason for reason in trust.reasons)
+
+
+def test_a_sample_below_three_sigma_is_no_reason_although_it_dominates():
+    trust, _ = judged(0.01 * with_outlier(RNG(0).normal(size=(60, 3, 3))))
+    assert not any("deviates by" in reason for reason in trust.reasons)

@@ -13,11 +13,13 @@ import collocation_sysid as cs
 from collocation_sysid.features.specimens.concerns import as_specimen_concerns
 from collocation_sysid.result.probe_sections import _conclusions, is_another_effect
 from collocation_sysid.runs.check.body import bending_concerns
-from collocation_sysid.statistics.assessment import _noisy_marker_concerns
+from collocation_sysid.statistics.assessment import Assessment, _noisy_marker_concerns
 from collocation_sysid.statistics.concerns import Concern
 from collocation_sysid.statistics.estimates import derived_estimates
 from collocation_sysid.statistics.linearised import DerivedModuli
 from collocation_sysid.statistics.residuals.diagnostics import Outlier
+
+CHECK = Assessment((Concern("noise/larger"),))
 
 
 def estimated(name, value, slopes, reasons=()):
@@ -66,7 +68,9 @@ def test_a_probe_without_shown_estimates_states_no_changes():
         size_error=0.01,
         moves={},
     )
-    result: Any = SimpleNamespace(probes=[probe], estimates={}, parameters={}, budget={})
+    result: Any = SimpleNamespace(
+        probes=[probe], estimates={}, parameters={}, budget={}, trust=CHECK
+    )
     first = next(_conclusions(result))
     assert first.endswith("χ² decreases by 30; measure it, or estimate it")
 
@@ -79,7 +83,9 @@ def test_memory_of_a_negative_share_is_called_another_effect():
         )  # fmt: skip
 
     probes = [probe("memory_share τ=0.01s", -0.25, 79.8), probe("clock_rate", 0.1, 30.0)]
-    result: Any = SimpleNamespace(probes=probes, estimates={}, parameters={}, budget={})
+    result: Any = SimpleNamespace(
+        probes=probes, estimates={}, parameters={}, budget={}, trust=CHECK
+    )
     (impossible,) = _conclusions(result)
     assert impossible.startswith("χ² would decrease by 79.8 with memory of a negative share")
     assert impossible.endswith("this is another effect, not memory; by less with clock rate (30)")
@@ -90,6 +96,8 @@ def test_memory_of_a_negative_share_is_called_another_effect():
     result.probes = [probe("memory_share τ=0.01s", -0.25, 20.0), probes[1]]
     (measured,) = _conclusions(result)
     assert measured.startswith("the data determine clock rate")
+    result.trust = Assessment()
+    assert not [*_conclusions(result)]  # nothing contradicts the description
     assert not is_another_effect(result)
 
 
@@ -104,7 +112,9 @@ def test_a_decrease_without_a_finding_is_explained(chi_squared, explained):
         size_error=0.05,
         routine=True,
     )
-    result: Any = SimpleNamespace(probes=[probe], estimates={}, parameters={}, budget={})
+    result: Any = SimpleNamespace(
+        probes=[probe], estimates={}, parameters={}, budget={}, trust=CHECK
+    )
     (told,) = _conclusions(result)
     assert told.startswith("tested without a finding: anisotropy z")
     assert ("χ² decreases by 44 with anisotropy z, which is not significant" in told) == explained

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from kit.fits import PARAMETERS, autoregressive, problem
 from kit.problem_files import run_command, settings, write_problem
+from scipy.stats import chi2
 from twins import BODIES, NOISE_M, SOFT, twin
 from wrong_twins import FAULTS
 
@@ -121,6 +122,25 @@ def test_a_wrong_sigma_is_to_be_checked(factors, words):
         found = verdict_of_fit(errors)
         assert found.verdict == "check"
         assert any(words in reason for reason in found.reasons)
+
+
+@pytest.mark.parametrize(("samples", "offsets"), [((1, 1), True), ((2,), False)])
+@pytest.mark.parametrize(("share", "verdict"), [(0.9, "good"), (1.1, "check")])
+def test_chi_squared_beyond_its_99_percent_limit_is_to_be_checked(samples, offsets, share, verdict):
+    """Also of hardly more measurements than parameters."""
+    few = problem(samples, markers=1, offsets=offsets)
+    rng = RNG(1)
+    errors = [rng.normal(size=(count, 1, 3)) for count in samples]
+
+    def found(size):
+        fit, _ = few.fit([size * each for each in errors], np.zeros(len(few.names)))
+        return uncertainty_from_fit(fit, PARAMETERS, np.zeros(4))
+
+    freedom = max(1.0, found(1.0).degrees_of_freedom)
+    limit = chi2.isf(0.01, freedom) / freedom
+    size = np.sqrt(share * limit / found(1.0).reduced_chi_squared)
+    judged = Assessment.from_concerns(fit_concerns(found(size)))
+    assert judged.verdict == verdict
 
 
 def test_persistent_residuals_are_to_be_checked_and_gross_ones_doubtful():

@@ -133,7 +133,8 @@ def estimate_noise_level(fit: LinearisedFit, information: Information) -> NoiseL
     Notes
     -----
     Sums of squares that Huber's loss has shortened are corrected by `shortened_power`. If residuals
-    are rounding, or the measurements are not more than the parameters, p-values are 1.
+    are rounding, p-values are 1, and without a degree of freedom those of small and unequal ones.
+    That of large ones is for one degree at least.
     """
     names = []
     squares = []
@@ -273,7 +274,7 @@ def _solve_noise_level(
         freedoms=freedoms,
         pooled=float(pooled),
         freedom=freedom,
-        larger_p=float(chi2_sf(statistic, freedom)) if tested else 1.0,
+        larger_p=1.0 if exact else float(chi2_sf(statistic, max(1.0, freedom))),
         smaller_p=float(chi2_cdf(statistic, freedom)) if tested else 1.0,
         unequal_p=_bartlett(squares * freedoms / np.maximum(means, 1e-300), freedoms)
         if tested
