@@ -501,26 +501,24 @@ def _probes(solved_fit: SolvedFit, say: Log, deep: bool) -> tuple[Probe, ...]:
     return deep_probes(solved_fit)
 
 
-def profile_likelihoods(answer: Run, fit: LinearisedFit, say: Log) -> tuple[Profile, ...]:
-    """Return the profile likelihoods that the problem requests, in that order; the run must have
-    uncertainties.
+def profile_likelihoods(answer: Run, fit: LinearisedFit, say: Log) -> dict[str, Profile]:
+    """Return the profile likelihoods that the problem requests, by parameter in that order; the run
+    must have uncertainties.
 
     Raises
     ------
     InputError
         For a name without a profile; the error names the problem file.
     """
-    profiles = []
+    profiles = {}
     assert answer.uncertainty is not None
     for name in answer.problem.uncertainty.profile:
         say(f"profile likelihood of {name}")
         try:
-            profiles.append(
-                profile_of_solution(answer.solution, fit, uncertainty=answer.uncertainty, name=name)
-            )
+            profiles[name] = profile_of_solution(answer.solution, fit, answer.uncertainty, name)
         except InputError as error:
             raise error.located(answer.problem.path) from error
-    return tuple(profiles)
+    return profiles
 
 
 def _fine_enough(

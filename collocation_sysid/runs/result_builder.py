@@ -39,7 +39,6 @@ from .result_content import (
     DynamicsResult,
     FieldResult,
     NuisanceResult,
-    ProfileResult,
     ProgramSize,
     Provenance,
     RecordingsAgreement,
@@ -175,15 +174,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         combinations=answer.combinations,
         directions=answer.principal_directions,
         recordings=_recordings_agreement(answer),
-        profiles={
-            profile.parameter: copy_fields(
-                ProfileResult,
-                profile,
-                rises=profile.losses - profile.losses.min(),
-                sentence=profile.message,
-            )
-            for profile in answer.profiles
-        },
+        profiles=answer.profiles,
     )
 
 

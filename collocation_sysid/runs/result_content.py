@@ -22,6 +22,7 @@ from ..statistics.budget.alternatives import Alternative, OriginAnswer
 from ..statistics.budget.combined_intervals import ReportedEstimate
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
 from ..statistics.combinations import Combination, Direction
+from ..statistics.probes.profile_likelihood import Profile
 from ..statistics.probes.relaxed_assumptions import Probe
 from ..statistics.remedies import remedy_for
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
@@ -111,18 +112,6 @@ class RecordingsAgreement:
     disagree: bool  # whether the differences are significant
 
 
-@dataclass(frozen=True)
-class ProfileResult:
-    """A profile likelihood."""
-
-    # (lower, upper): interval by the threshold; None for an end that was not reached.
-    interval: tuple[float | None, float | None]
-    values: Array  # (k,): values of the parameter
-    rises: Array  # (k,): loss minus its least value
-    threshold: float  # rise of the loss at the ends of the interval
-    sentence: str  # result in words
-
-
 @dataclass(frozen=True, eq=False)
 class UncertaintyResult:
     """Statistics behind the error bars.
@@ -163,7 +152,7 @@ class UncertaintyResult:
         first; intervals are combined.
     recordings : mapping of str to RecordingsAgreement, or None
         Agreement of the recordings, by parameter; None if it was not evaluated.
-    profiles : mapping of str to ProfileResult
+    profiles : mapping of str to Profile
         Requested profile likelihoods, by parameter.
     """
 
@@ -178,7 +167,7 @@ class UncertaintyResult:
     quantiles: Array
     verdicts: tuple[str, ...]
     recordings: Mapping[str, RecordingsAgreement] | None
-    profiles: Mapping[str, ProfileResult]
+    profiles: Mapping[str, Profile]
     combined_covariance: Array | None = optional()  # noqa: RUF009, it returns a field
     draw_covariance: Array | None = optional()  # noqa: RUF009, it returns a field
     combinations: tuple[Combination, ...] = ()

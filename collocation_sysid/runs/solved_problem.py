@@ -76,7 +76,8 @@ class SolvedProblem:
     # converge or cannot be linearised.
     fit: LinearisedFit | None = None
     diagnoses: tuple[MarkerDiagnosis, ...] = ()  # findings in the residuals
-    profiles: tuple[Profile, ...] = ()  # profile likelihoods that were requested
+    # mapping of parameter to Profile: profile likelihoods that were requested.
+    profiles: Mapping[str, Profile] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # problems after the solve
     # Likely errors in the description of the problem, likeliest first.
     causes: tuple[Hypothesis, ...] = ()
@@ -676,7 +677,7 @@ class SolvedProblem:
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty, self.combinations),
         )
-        return (*dict.fromkeys(notes), *(profile.message for profile in self.profiles))
+        return (*dict.fromkeys(notes), *(profile.sentence for profile in self.profiles.values()))
 
 
 def _optional_package(name: str, purpose: str) -> Any:

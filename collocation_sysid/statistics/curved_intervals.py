@@ -84,16 +84,17 @@ def _along_profile(
     item, quantile = parameters.free[k], float(uncertainty.quantiles[k])
     widening = (quantile / normal_isf(0.025)) ** 2
     try:
-        rises, refits = profile_and_refits(
+        profile, refits = profile_and_refits(
             collocation, z, fit, uncertainty, k, first_step=quantile, widening=widening
         )
     except InputError:  # the estimate is beyond a bound by rounding
         return uncertainty
-    if rises.losses.min() < refits.loss - LOWER * rises.threshold:
+    at = np.searchsorted(profile.values, item.from_coordinate(float(z[k])))
+    if profile.rises[at] > LOWER * profile.threshold:
         return uncertainty
-    ends, bounds = rises.interval, (item.lower, item.upper)
+    ends, bounds = profile.interval, (item.lower, item.upper)
     closed = [bound if end is None else end for end, bound in zip(ends, bounds, strict=True)]
-    profile = [refits.values_near(end) | {item.name: end} for end in closed]
+    refitted = [refits.values_near(end) | {item.name: end} for end in closed]
     sizes = relative_derivatives(parameters, q)
     of_q = uncertainty.covariance / np.outer(sizes, sizes)
     values = parameter_values(collocation, q)
@@ -111,7 +112,7 @@ def _along_profile(
         by_q = slopes[name][used]
         covariance = by_q @ of_q[used, k]
         rest = by_q @ of_q[np.ix_(used, used)] @ by_q - covariance**2 / of_q[k, k]
-        moved = [each[name] for each in profile]
+        moved = [each[name] for each in refitted]
         return _with_ends(name, estimate, moved, quantile * np.sqrt(max(0.0, float(rest))))
 
     own = uncertainty.estimates[item.name]

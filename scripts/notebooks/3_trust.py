@@ -204,14 +204,14 @@ poor_run = cs.run(poor_problem, "reduced-space", seek_causes=False)
 poor_uncertainty = poor_run.uncertainty
 assert poor_uncertainty is not None
 print_estimates(poor_run)
-profile = poor_run.profiles[0]
-print(profile.message)
+profile = poor_run.profiles["poisson"]
+print(profile.sentence)
 
 # %%
 best = poor_run.solution.parameters["poisson"]
 deviation = np.sqrt(poor_uncertainty.covariance[1, 1])
 nu = np.linspace(profile.values.min(), profile.values.max(), 100)
-increase = profile.losses - profile.losses.min()
+increase = profile.rises
 
 figure, axes = plt.subplots(figsize=(5.6, 2.8))
 axes.plot(nu, (np.log(nu / best) / deviation) ** 2, "--", color=ORANGE, label="quadratic in ln ν")

@@ -146,7 +146,7 @@ def test_a_profile_agrees_with_the_error_bar_where_the_loss_is_round(finished):
     np.testing.assert_allclose(
         profile.interval, uncertainty.estimates["mu_pa"].statistical95, rtol=0.01
     )
-    best = profile.values[np.argmin(profile.losses)]
+    best = profile.values[np.argmin(profile.rises)]
     assert best == pytest.approx(solution.parameters["mu_pa"])
 
 

@@ -35,7 +35,7 @@ def test_a_parabola_gives_the_interval_of_the_standard_error(expected):
     reach = 0.1 * np.sqrt(THRESHOLD)
     np.testing.assert_allclose(np.log(np.array(found.interval) / BEST), [-reach, reach], rtol=0.02)
     assert len(solver.asked) < 26
-    assert "between" in found.message
+    assert "between" in found.sentence
 
 
 def test_a_good_guess_of_the_deviation_costs_few_solves():
@@ -44,12 +44,13 @@ def test_a_good_guess_of_the_deviation_costs_few_solves():
     assert len(solver.asked) <= 6
 
 
-def test_values_and_losses_are_those_asked_for_and_the_best():
+def test_values_and_rises_are_those_asked_for_and_the_best():
     solver = Solver(parabola(0.1))
     found = compute_profile(solver, "mu_pa", (BEST, 50.0), BOUNDS)
     assert (np.diff(found.values) > 0).all()
     assert set(found.values) == {*solver.asked, BEST}
-    np.testing.assert_allclose(found.losses, [solver.loss(np.log(v / BEST)) for v in found.values])
+    losses = np.array([solver.loss(np.log(v / BEST)) for v in found.values])
+    np.testing.assert_allclose(found.rises, losses - losses.min())
 
 
 def test_a_skewed_loss_gives_a_skewed_interval():
@@ -61,14 +62,14 @@ def test_a_skewed_loss_gives_a_skewed_interval():
     assert lower is None  # e^(5u) falls to 0: the loss rises by one only
     assert upper is not None
     assert np.log(upper / BEST) == pytest.approx(np.log1p(np.sqrt(THRESHOLD)) / 5, rel=0.03)
-    assert "at most" in found.message
-    assert "the data give no lower limit" in found.message
+    assert "at most" in found.sentence
+    assert "the data give no lower limit" in found.sentence
 
 
 def test_a_flat_loss_is_called_not_identifiable():
     found = compute_profile(Solver(lambda u: 5.0), "mu_pa", (BEST, 5.0), BOUNDS)
     assert found.interval == (None, None)
-    assert "not identifiable" in found.message
+    assert "not identifiable" in found.sentence
     assert (found.values.min(), found.values.max()) == pytest.approx(BOUNDS)
 
 
@@ -85,7 +86,7 @@ def test_the_search_stays_within_the_bounds():
     found = compute_profile(solver, "mu_pa", (BEST, 50.0), (BEST / 1.05, 1e6), deviation=0.1)
     assert min(solver.asked) >= BEST / 1.05 * (1 - 1e-12)
     assert found.interval[0] is None
-    assert "at most" in found.message
+    assert "at most" in found.sentence
 
 
 def test_an_answer_at_its_bound_has_an_interval_on_the_other_side():
@@ -102,14 +103,14 @@ def test_values_without_a_solution_end_the_interval():
 
     found = compute_profile(Solver(loss), "mu_pa", (BEST, 50.0), BOUNDS, deviation=0.1)
     assert np.log((found.interval[1] or 0) / BEST) == pytest.approx(0.15, rel=0.03)
-    assert np.isinf(found.losses[-1])
+    assert np.isinf(found.rises[-1])
 
 
 def test_a_better_answer_on_the_way_is_pointed_out():
     found = compute_profile(
         Solver(lambda u: ((u - 0.1) / 0.1) ** 2), "mu_pa", (BEST, 1.0), BOUNDS, deviation=0.05
     )
-    assert "lower than at the estimate" in found.message
+    assert "lower than at the estimate" in found.sentence
 
 
 def test_a_best_value_out_of_bounds_is_refused():

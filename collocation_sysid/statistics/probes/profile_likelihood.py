@@ -42,15 +42,15 @@ HIGHEST = 16.0
 class Profile:
     """Loss as a function of one parameter, with everything else fitted."""
 
-    parameter: str
-    # (n,): ascending values and the losses there; infinite where there is no solution.
-    values: Array
-    losses: Array
-    threshold: float  # increase of the loss at which the interval ends
     # (lower or None, upper or None): 95 % interval; None where it is open, because the loss does
     # not rise so far up to the last value.
     interval: tuple[float | None, float | None]
-    message: str  # message for the user
+    # (n,): ascending values, and the losses there minus the least one; infinite where there is no
+    # solution.
+    values: Array
+    rises: Array
+    threshold: float  # increase of the loss at which the interval ends
+    sentence: str  # message for the user
 
 
 def compute_profile(
@@ -142,12 +142,11 @@ def compute_profile(
             "this value as the guess"
         )
     return Profile(
-        parameter,
-        values,
-        losses=losses,
-        threshold=threshold,
         interval=(lower, upper),
-        message=message,
+        values=values,
+        rises=losses - losses.min(),
+        threshold=threshold,
+        sentence=message,
     )
 
 
