@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from kit.checks import assert_derivative, observed_order, relative_error
 from kit.forces import forces_alone
+from kit.internal_force_check import full_matrix
 from kit.memories import TWO, remembering
 from kit.problems import IDEAL, point_markers, times
 from scipy.spatial.transform import Rotation
@@ -19,7 +20,6 @@ from collocation_sysid.fem.laws.materials import Prony
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
 from collocation_sysid.model.viscoelasticity import FadingCoefficients, MemoryHistory, MemoryState
-from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence
 

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from kit.checks import assert_derivative, directional_derivative, relative_error
+from kit.internal_force_check import full_matrix
 from kit.materials import CONSTANTS, theta_for
 
 from collocation_sysid.errors import InputError
@@ -16,7 +17,6 @@ from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Ball, Box, Indices, Named
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.regions import Region
-from collocation_sysid.program.linear_algebra.block_band import full_matrix
 
 EVALUATORS = ["simd", "casadi"]
 LENGTH_M = 0.03  # a large change of a position

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import scipy.sparse as sp
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.common.array_types import Array, Index
@@ -25,7 +26,8 @@ from collocation_sysid.fem.laws.materials import (
     as_damping,
     as_material,
 )
-from collocation_sysid.program.linear_algebra.block_band import full_matrix
+from collocation_sysid.fem.pattern import SymmetricPattern
+from collocation_sysid.program.linear_algebra.block_band import full_skew_values
 from collocation_sysid.testing.damping_check import damping_stress
 from collocation_sysid.testing.property_check import EXACT, PropertyCheck
 from collocation_sysid.testing.small_problems import DENSITY_KG_M3, usual_constants
@@ -43,6 +45,16 @@ SPIN_RAD_S = 20.0
 SECOND_DERIVATIVES = 1e-8
 # Size of a large change of a position [m], for differences.
 LARGE_CHANGE_M = 0.03
+
+
+def full_matrix(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
+    """Return the sparse matrix (3n, 3n) of the symmetric part with lower triangle `lower` (m,) and
+    the skew part with lower triangle `skew`, (m,) or (0,) for none.
+    """
+    matrix = pattern.matrix(lower)
+    if skew.size:
+        matrix.data += full_skew_values(pattern, skew)
+    return matrix
 
 
 @dataclass(frozen=True, eq=False)

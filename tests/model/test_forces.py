@@ -10,6 +10,7 @@ import pytest
 from kit.checks import assert_derivative
 from kit.densities import parameters, with_core
 from kit.forces import breath, forces_alone, foundation
+from kit.internal_force_check import full_matrix
 from kit.problems import GUESS, driven_bar, hung_cube, nodes_where
 
 from collocation_sysid.common.time_dependence import at_times, interpolate_in_time, scale_loads
@@ -21,7 +22,6 @@ from collocation_sysid.model.force_term import States
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.model.parameters import Parameters, Unknown
 from collocation_sysid.program.collocation import Collocation
-from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Force, Markers, Nuisance, PointMass
 

@@ -7,11 +7,11 @@ from itertools import product
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from kit.internal_force_check import full_matrix
 from kit.problems import TRUTH, box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
-from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 from collocation_sysid.program.linear_algebra.supernodal import load_mkl
 

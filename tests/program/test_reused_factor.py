@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from kit.internal_force_check import full_matrix
 from kit.problems import (
     GUESS,
     TRUTH,
@@ -22,7 +23,6 @@ from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward import newton_solver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.linear_algebra import factorisation, reused_factor
-from collocation_sysid.program.linear_algebra.block_band import full_matrix
 from collocation_sysid.program.linear_algebra.factorisation import Factoriser
 from collocation_sysid.program.linear_algebra.reused_factor import (
     FactorSequence,

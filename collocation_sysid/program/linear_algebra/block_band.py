@@ -354,16 +354,6 @@ class Submatrix:
         return self._matrix
 
 
-def full_matrix(pattern: SymmetricPattern, lower: Array, skew: Array) -> sp.csc_array:
-    """Return the sparse matrix (3n, 3n) of the symmetric part with lower triangle `lower` (m,) and
-    the skew part with lower triangle `skew`, (m,) or (0,) for none.
-    """
-    matrix = pattern.matrix(lower)
-    if skew.size:
-        matrix.data += full_skew_values(pattern, skew)
-    return matrix
-
-
 def skew_block_band(
     columns: int,
     row_starts: Index,
