@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import Annotated
 
 import typer
 
-from ..common.display import Line, duration
+from ..common.display import Line
 from ..common.files import require_possible, run_name
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive
 from ..errors import InputError
-from ..extras.studies import (
-    PlannedRun,
-    RunOptions,
-    RunStore,
-    Starts,
-    plan_comparison,
-    plan_models,
-    run_all,
-)
+from ..extras.studies import PlannedRun, RunOptions, Starts, plan_comparison, plan_models, run_all
 from ..extras.studies.arguments import parse_methods, read_truth
 from ..extras.studies.model_variants import models, parse_branches, parse_dampings, parse_materials
 from ..extras.studies.planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES
 from ..extras.studies.rows import SuccessCriterion
-from ..fem.kernels import available_threads
+from ..extras.studies.run_execution import Record
 from ..problem import Problem
 from .command_options import OneMethod, OutputFolder, OutputOptions, ProblemOptions, command, option
 from .common import error_console, interruption_exit, print_result, shown_progress
@@ -83,8 +73,6 @@ def compare_methods(
 
     All methods solve the same problem from the same guesses. To compare the materials, damping laws
     or branches of a body, use the command compare-models.
-
-    Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
     named = parse_methods(methods)
     problem = source.read_problem(output.quiet)
@@ -146,15 +134,9 @@ def compare_models(
     A model applies to the complete body, or to the region named by --region. --with adds other
     problem files as models; each of them is combined with all stated materials, damping laws and
     numbers of branches.
-
-    Finished runs are kept in the output folder: the same command resumes an interrupted study.
     """
     if not with_ and {materials, damping, prony} == {None}:
         raise InputError("no models to compare; expected --materials, --damping, --prony or --with")
-    from ..extras.studies.progress import STUDY_FACTOR, expected_study_s
-    from ..runs.check import expected_search_s
-
-    is_announced = not (output.quiet or study.dry_run)
     chosen = _single_method(method)
     problem = source.read_problem(output.quiet)
     others = [replace(source, problem=file).read_problem(output.quiet) for file in with_ or ()]
@@ -170,33 +152,11 @@ def compare_models(
         shown_progress("reading the models", quiet=output.quiet),
         counted_phase(StepUnit.PROBLEM, len(variants)),
     ):
-        began_s, used_s = perf_counter(), sum(os.times()[:4])
-        searches_s = []
         for variant in variants:  # an impossible model would fail every run
-            read = Problem.read(variant.path, variant.overrides, allow_code=source.allow_code)
-            if is_announced:
-                searches_s.append(expected_search_s(read))
+            Problem.read(variant.path, variant.overrides, allow_code=source.allow_code)
             complete_steps(StepUnit.PROBLEM)
-        used_s = max(sum(os.times()[:4]) - used_s, 0.5)
-        slowness = (perf_counter() - began_s) / used_s
     planned = plan_models(problem, variants, method=chosen, allow_code=source.allow_code)
-    if is_announced:
-        workers = 1 if study.limits.scheduler else study.limits.workers or available_threads()
-        total_s = expected_study_s(
-            searches_s, len(planned), worker_count=workers, slowness=slowness
-        )
-        about = "the first fit shows how long they take"
-        if total_s is not None:
-            about = (
-                f"they take {duration(total_s / STUDY_FACTOR)} to {duration(STUDY_FACTOR * total_s)} "
-                "(rough estimate; a law that fits badly takes several times as long)"
-            )
-        error_console.print(
-            f"{len(planned)} fits: {len(variants)} models, each to all data and without held-out "
-            f"data; {about}",
-            soft_wrap=True,
-        )
-    _run_study(MODEL_STUDY, planned, study, source, output)
+    _run_study(MODEL_STUDY, planned, study, source, output, yardstick=SuccessCriterion())
 
 
 def _single_method(text: str | None) -> str | None:
@@ -214,42 +174,40 @@ def _run_study(
     study: StudyOptions,
     source: ProblemOptions,
     output: OutputOptions,
-    yardstick: SuccessCriterion | None = None,
+    yardstick: SuccessCriterion,
 ) -> None:
     """Failed runs are in the tables; without any record no tables are written."""
     from ..extras.studies.progress import StudyProgress
-    from ..extras.studies.tables import load_report, plan_table
+    from ..extras.studies.tables import StudyReport, plan_table
 
-    name = run_name(source.problem)
-    folder = study.out or Path("runs") / f"{name}-{kind}"
-    store = RunStore(folder / "runs")
-    limits = study.limits
-    finished = [run.key for run in planned if store.load_finished(run.key, limits.time_limit_s)]
     if study.dry_run:
         if output.as_json:
-            listed = [{**run.as_dict(), "finished": run.key in finished} for run in planned]
+            listed = [run.as_dict() for run in planned]
             typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
         else:
-            print_result(plan_table(planned, finished))
+            print_result(plan_table(planned))
         return
+    name = run_name(source.problem)
+    folder = study.out or Path("runs") / f"{name}-{kind}"
     require_possible(folder)
-    remaining = [run for run in planned if run.key not in finished]
+    report = StudyReport(f"{STUDY_TITLES[kind]}: {name}", kind, tuple(planned), {}, yardstick)
     is_complete = True
     try:
-        with StudyProgress(
-            error_console, remaining, total=len(planned), quiet=output.quiet
-        ) as progress:
-            run_all(remaining, store, options=limits, on_record=progress.count_run)
+        with StudyProgress(error_console, len(planned), quiet=output.quiet) as progress:
+
+            def count(run: PlannedRun, record: Record) -> None:
+                report.records[run.label] = record
+                progress.count_run(run, record)
+
+            run_all(planned, study.limits, count)
     except KeyboardInterrupt:
         is_complete = False
-    report = load_report(
-        f"{STUDY_TITLES[kind]}: {name}", kind, planned=planned, store=store, yardstick=yardstick
-    )
     if report.records:
         report.write(folder)
     if not is_complete:
         raise interruption_exit(
-            f"{len(report.records)} of {len(planned)} runs are kept in {folder}"
+            f"the tables of {len(report.records)} of {len(planned)} runs are in {folder}",
+            continues=False,
         )
     failures = [Line(each, "doubtful") for each in report.failures]
     if (hidden := len(failures) - SHOWN_FAILURES) > 0:

@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from .budget.systematic_effects import DEVIATIONS
 from .budget.variance_sources import BETWEEN, MESH, NOISE, NUISANCES, NUMERICAL
 
-LAW = "law"
-
 # One remedy per source of the budget, as an imperative phrase that ends a sentence.
 REMEDIES: Mapping[str, str] = {
     **{name: row.remedy for name, row in DEVIATIONS.items() if row.remedy},
@@ -18,7 +16,6 @@ REMEDIES: Mapping[str, str] = {
     NUMERICAL: "raise transcription.substeps, or run refine",
     MESH: "solve on a finer mesh, or run refine",
     BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
-    LAW: "record larger strains, which distinguish the material laws",
 }
 
 

@@ -14,12 +14,12 @@ from typing import Any, TypeVar
 from collocation_sysid.extras.studies import (
     PlannedRun,
     RunOptions,
-    RunStore,
     Starts,
     plan_comparison,
     run_all,
 )
 from collocation_sysid.extras.studies.rows import Row, SuccessCriterion, run_row
+from collocation_sysid.extras.studies.run_execution import Record
 from collocation_sysid.problem import Problem
 
 T = TypeVar("T")
@@ -54,15 +54,12 @@ class Variant:
 
 
 def run_variants(
-    path: Path, variants: Sequence[Variant], folder: Path, *, time_s: float = 60.0, workers: int = 2
+    path: Path, variants: Sequence[Variant], *, time_s: float = 60.0, workers: int = 2
 ) -> dict[str, Row]:
     """Run all variants of the method of a problem file, and return the row of each by its name.
 
-    Runs whose records are in the folder are not repeated; a run that does not end within `time_s` [s]
-    is killed `GRACE_S` later.
+    A run that does not end within `time_s` [s] is killed `GRACE_S` later.
     """
-    store = RunStore(folder / "runs")
-    limits = RunOptions(workers=workers, time_limit_s=time_s + GRACE_S)
     planned: dict[str, PlannedRun] = {}
     for variant in variants:
         overrides = variant.limited(time_s).overrides
@@ -70,25 +67,19 @@ def run_variants(
         (planned[variant.name],) = plan_comparison(
             problem, [variant.method], overrides, Starts(1), TRUTH
         )
-    names = {run.key: name for name, run in planned.items()}
-    run_all(
-        [
-            run
-            for run in planned.values()
-            if store.load_finished(run.key, limits.time_limit_s) is None
-        ],
-        store,
-        limits,
-        lambda record, _: _print_progress(names[record["key"]], record),
-    )
+    names = {id(run): name for name, run in planned.items()}
+    records: dict[str, Record] = {}
+
+    def keep(run: PlannedRun, record: Record) -> None:
+        name = names[id(run)]
+        records[name] = record
+        message = str(record["message"])[:100]
+        line = f"{name}: {record['outcome']}, {record['wall_s']:.1f} s: "
+        print(line + message, file=sys.stderr, flush=True)
+
+    run_all([*planned.values()], RunOptions(workers, time_s + GRACE_S), keep)
     criterion = SuccessCriterion(TRUTH)
-    return {name: run_row(run, store.load(run.key), criterion) for name, run in planned.items()}
-
-
-def _print_progress(name: str, record: Mapping[str, Any]) -> None:
-    message = str(record["message"])[:100]
-    line = f"{name}: {record['outcome']}, {record['wall_s']:.1f} s: "
-    print(line + message, file=sys.stderr, flush=True)
+    return {name: run_row(run, records.get(name), criterion) for name, run in planned.items()}
 
 
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

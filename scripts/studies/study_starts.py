@@ -29,11 +29,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest
 from script_arguments import make_parser
 from synthetic import HANGING, Swing, swing
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.extras.studies.rows import wilson_interval
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Penalty
@@ -387,7 +387,7 @@ def compare_methods(starts: NDArray[np.float64]) -> None:
                 ratios = np.array([found[key] for key in TRUTH]) / truth
                 successes += bool((np.abs(ratios - 1) <= SUCCESS_SHARE).all())
             times_s.append(time.perf_counter() - began_s)
-        low, high = wilson_interval(successes, len(times_s))
+        low, high = binomtest(successes, len(times_s)).proportion_ci(method="wilson")
         print(
             f"{name}: {successes} of {len(times_s)}, {100 * low:.0f}–{100 * high:.0f} %, "
             f"median time {np.median(times_s):.2g} s",

@@ -35,15 +35,15 @@ def test_table_1_sets_every_method_beside_truth_and_paper():
     stopped = row(rms_m=None, total_s=None, status="timeout")
     lines = cells(study_table1.table({"one": row(), "other": stopped}))
     truth, paper, one, other = lines
-    assert {len(line) for line in lines} == {12}
+    assert {len(line) for line in lines} == {11}
     assert one[1:5] == truth[1:5] == ["200", "300", "0.009", "1"]
     assert paper[1] == "734.3"
     assert (other[5], other[-1]) == ("–", "timeout")
 
 
-def test_table_1_names_options_that_the_methods_have(monkeypatch, tmp_path):
+def test_table_1_names_options_that_the_methods_have(monkeypatch):
     monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
-    rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS, tmp_path)
+    rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS)
     assert list(rows) == [each.name for each in study_table1.VARIANTS]
 
 

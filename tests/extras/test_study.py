@@ -5,20 +5,17 @@ from __future__ import annotations
 import json
 import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from kit.problem_files import TRUTH
 from kit.results import a_result, value
 
-from collocation_sysid.common import cluster
 from collocation_sysid.common.serialisation import as_json, content
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.studies import (
     PlannedRun,
     RunOptions,
-    RunStore,
     Starts,
     plan_comparison,
     run_all,
@@ -26,13 +23,7 @@ from collocation_sysid.extras.studies import (
     run_worker,
 )
 from collocation_sysid.extras.studies.arguments import parse_methods, read_truth
-from collocation_sysid.extras.studies.progress import remaining_time_s
-from collocation_sysid.extras.studies.rows import (
-    SuccessCriterion,
-    method_rows,
-    run_row,
-    wilson_interval,
-)
+from collocation_sysid.extras.studies.rows import SuccessCriterion, method_rows, run_row
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem import Problem
@@ -43,10 +34,9 @@ STAND_IN = """
 import json, os, sys
 behaviour, place, out = sys.argv[1:]
 planned = json.loads(sys.stdin.readline())
-with open(os.path.join(place, planned["key"]), "a") as tries:
+with open(place, "a") as tries:
     tries.write("x")
-    first = tries.tell() == 1
-if behaviour == "dies" or (behaviour == "dies once" and first):
+if behaviour == "dies":
     sys.stderr.write("Bus error\\n")
     sys.stderr.flush()
     os._exit(3)
@@ -60,36 +50,20 @@ with open(out, "w") as file:
 
 @pytest.fixture
 def stand_in(tmp_path, monkeypatch):
-    """``stand_in(behaviour)`` replaces the runs' processes; gives the tries of a run."""
+    """``stand_in(behaviour)`` replaces the runs' processes; gives the number of processes."""
     script, place = tmp_path / "stand_in.py", tmp_path / "tries"
     script.write_text(STAND_IN)
-    place.mkdir()
 
     def behave(behaviour: str):
         command = (sys.executable, str(script), behaviour, str(place))
         monkeypatch.setattr(run_execution, "COMMAND", command)
-        return lambda key: len((place / key).read_text())
+        return lambda: len(place.read_text())
 
     return behave
 
 
-@pytest.fixture
-def without_distributed(monkeypatch):
-    monkeypatch.setattr(cluster, "find_spec", lambda name: None)
-
-
-@pytest.fixture
-def a_scheduler():
-    """The address of one."""
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=":0"
-    ) as there:
-        yield there.scheduler_address
-
-
 def planned_runs(count: int) -> list[PlannedRun]:
-    return [PlannedRun(f"key{k}", "problem.toml", "interior-point", k) for k in range(count)]
+    return [PlannedRun("problem.toml", "interior-point", k) for k in range(count)]
 
 
 # The command line's words -------------------------------------------------------------------------
@@ -136,12 +110,11 @@ def test_a_truth_that_cannot_be_used_is_refused(given, message):
 def test_every_method_has_the_same_starts(tiny):
     problem = Problem.read("problem.toml")
     planned = plan_comparison(problem, ["interior-point", "reduced-space"], (), Starts(3, seed=4))
-    assert [run.make_label() for run in planned] == [
+    assert [run.label for run in planned] == [
         f"{method}, start {start}"
         for start in range(3)
         for method in ("interior-point", "reduced-space")
     ]
-    assert len({run.key for run in planned}) == 6
     for one, other in zip(planned[::2], planned[1::2], strict=True):
         assert one.guess == other.guess
     assert planned[0].guess == {item.name: item.guess for item in problem.parameters.free}
@@ -182,21 +155,6 @@ def test_fixed_parameters_stay(tiny):
     assert not any("mu_pa.guess" in override for override in start.overrides)
 
 
-def test_other_data_are_other_runs(tiny):
-    def key(*overrides: str) -> str:
-        problem = Problem.read("problem.toml", overrides)
-        return plan_comparison(problem, ["reduced-space"], overrides)[0].key
-
-    before = key()
-    assert key() == before
-    assert key("solver.reduced-space.tolerance=1e-6") != before
-    assert key("solver.shooting.tolerance=1e-6") == before  # an option of another method
-    assert key("solver.method=reduced-space") == before  # the method it had anyhow
-    markers = tiny / "swing_markers.csv"
-    markers.write_text(markers.read_text() + "\n")
-    assert key() != before
-
-
 @pytest.mark.parametrize(
     ("options", "where"),
     [({"starts": 0}, "starts"), ({"spread": 0.5}, "spread"), ({"seed": -1}, "seed")],
@@ -211,29 +169,22 @@ def test_starts_that_cannot_be_are_refused(options, where):
 
 def test_a_run_has_one_thread(stand_in):
     stand_in("answers")
-    record = run_execution.execute(planned_runs(1)[0].as_dict())
+    record = run_execution.execute(planned_runs(1)[0])
     assert record["outcome"] == "finished"
     assert record["threads"] == ["1", "1"]
-    assert record["attempts"] == 1
 
 
-def test_a_process_that_dies_once_is_tried_again(stand_in):
-    tries = stand_in("dies once")
-    record = run_execution.execute(planned_runs(1)[0].as_dict())
-    assert (record["outcome"], record["attempts"], tries("key0")) == ("finished", 2, 2)
-
-
-def test_a_process_that_always_dies_is_a_record(stand_in):
+def test_a_process_that_dies_is_a_record(stand_in):
     tries = stand_in("dies")
-    record = run_execution.execute(planned_runs(1)[0].as_dict(), retries=2)
-    assert (record["outcome"], tries("key0")) == ("crashed", 3)
+    record = run_execution.execute(planned_runs(1)[0])
+    assert (record["outcome"], tries()) == ("crashed", 1)
     assert record["message"] == "the process ended with code 3: Bus error"
 
 
 def test_a_late_run_is_killed(stand_in):
     tries = stand_in("hangs")
-    record = run_execution.execute(planned_runs(1)[0].as_dict(), time_limit_s=0.5)
-    assert (record["outcome"], tries("key0")) == ("timeout", 1)
+    record = run_execution.execute(planned_runs(1)[0], time_limit_s=0.5)
+    assert (record["outcome"], tries()) == ("timeout", 1)
     assert record["message"] == "ended at the time limit of 0.5 s"
 
 
@@ -258,7 +209,7 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(run_execution.time, "monotonic", lambda: 100.0 if ready.exists() else 0.0)
     planned = planned_runs(1)[0]
-    record = run_execution.execute(planned.as_dict(), time_limit_s=10.0)
+    record = run_execution.execute(planned, time_limit_s=10.0)
     assert record["outcome"] == "timeout"
     assert record["result"] == json.loads(found)
     assert run_row(planned, record, SuccessCriterion())["status"] == "timeout"
@@ -266,7 +217,7 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
 
 def test_a_stopped_study_ends_its_runs(stand_in):
     stand_in("hangs")
-    record = run_execution.execute(planned_runs(1)[0].as_dict(), is_stopped=lambda: True)
+    record = run_execution.execute(planned_runs(1)[0], is_stopped=lambda: True)
     assert record["outcome"] == "stopped"
 
 
@@ -288,81 +239,31 @@ def test_errors_of_a_run_are_stored_in_its_record(tiny, monkeypatch):
 # Many runs ----------------------------------------------------------------------------------------
 
 
-def assert_all_runs_are_kept(folder: Path, limits: RunOptions) -> None:
-    store, seen = RunStore(folder), []
-    runs = planned_runs(4)
-    run_all(runs, store, limits, lambda record, slots: seen.append((record["key"], slots)))
-    assert sorted(key for key, _ in seen) == [run.key for run in runs]
-    assert all(store.load(run.key)["start"] == run.start for run in runs)
-    assert {slots for _, slots in seen} == {limits.workers or 2}
-
-
-def test_runs_are_done_without_a_cluster(stand_in, without_distributed, tmp_path):
-    stand_in("dies once")
-    assert_all_runs_are_kept(tmp_path / "runs", RunOptions(workers=3))
-
-
-def test_runs_are_done_on_a_scheduler_by_its_address(stand_in, a_scheduler, tmp_path):
-    stand_in("dies once")
-    assert_all_runs_are_kept(tmp_path / "runs", RunOptions(scheduler=a_scheduler))
-
-
-def test_a_scheduler_without_the_library_names_the_extra(without_distributed, tmp_path):
-    with pytest.raises(InputError, match=r"pip install 'collocation-sysid\[cluster\]'"):
-        run_all(planned_runs(1), RunStore(tmp_path), RunOptions(scheduler="tcp://127.0.0.1:1"))
-
-
-def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(cluster, "CONNECT_WITHIN_S", 0.5)
-    with pytest.raises(
-        InputError, match=r"found 'tcp://127\.0\.0\.1:1', where no scheduler answers"
-    ):
-        run_all(planned_runs(1), RunStore(tmp_path), RunOptions(scheduler="tcp://127.0.0.1:1"))
-
-
-@pytest.mark.parametrize("clustered", [True, False])
-def test_an_interrupted_study_keeps_finished_runs(stand_in, tmp_path, request, clustered):
-    address = request.getfixturevalue("a_scheduler") if clustered else None
+def test_all_runs_are_reported(stand_in):
     stand_in("answers")
-    store, runs = RunStore(tmp_path / "runs"), planned_runs(20)
+    seen = []
+    runs = planned_runs(4)
+    run_all(runs, RunOptions(workers=3), lambda run, record: seen.append((run.start, record)))
+    assert sorted(start for start, _ in seen) == [run.start for run in runs]
+    assert {record["outcome"] for _, record in seen} == {"finished"}
 
-    def interrupt(record, slots):
+
+def test_an_interrupted_study_ends_its_runs(stand_in):
+    tries = stand_in("answers")
+    seen = []
+
+    def interrupt(run, record):
+        seen.append(run)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_all(runs, store, RunOptions(None if clustered else 1, address), interrupt)
-    assert sum(store.load(run.key) is not None for run in runs) == 1
-
-
-def test_a_run_is_done_again_when_there_is_hope(tmp_path):
-    store = RunStore(tmp_path / "runs")
-    outcomes = {"a": "finished", "b": "error", "c": "crashed", "d": "timeout"}
-    for key, outcome in outcomes.items():
-        store.save({"key": key, "outcome": outcome, "time_limit_s": 10.0})
-
-    def kept(limit):
-        return [key for key in outcomes if store.load_finished(key, limit)]
-
-    assert kept(10.0) == kept(5.0) == ["a", "b", "d"]
-    assert kept(20.0) == kept(None) == ["a", "b"]
-
-
-def test_half_a_file_is_no_run(tmp_path):
-    store = RunStore(tmp_path)
-    store.save({"key": "a", "outcome": "finished"})
-    file = tmp_path / "a.json"
-    file.write_text(file.read_text()[:10])
-    assert store.load("a") is None
+        run_all(planned_runs(20), RunOptions(workers=1), interrupt)
+    assert len(seen) == 1
+    assert tries() < 20
 
 
 @pytest.mark.parametrize(
-    ("options", "where"),
-    [
-        ({"workers": 0}, "workers"),
-        ({"time_limit_s": 0.0}, "time_limit_s"),
-        ({"workers": 2, "scheduler": "tcp://x:1"}, "workers"),
-    ],
+    ("options", "where"), [({"workers": 0}, "workers"), ({"time_limit_s": 0.0}, "time_limit_s")]
 )
 def test_limits_that_cannot_be_are_refused(options, where):
     with pytest.raises(InputError, match=f"^{where}: "):
@@ -370,21 +271,6 @@ def test_limits_that_cannot_be_are_refused(options, where):
 
 
 # Numbers ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("successes", "trials", "interval"),
-    [  # R. G. Newcombe, Statistics in Medicine 17, 1998, table I, method 3
-        (81, 263, (0.2553, 0.3662)),
-        (15, 148, (0.0624, 0.1605)),
-        (0, 20, (0.0, 0.1611)),
-        (1, 29, (0.0061, 0.1718)),
-        (20, 20, (0.8389, 1.0)),
-        (0, 0, (0.0, 1.0)),
-    ],
-)
-def test_wilson_intervals_agree_with_published_ones(successes, trials, interval):
-    assert wilson_interval(successes, trials) == pytest.approx(interval, abs=6e-5)
 
 
 def answer(run: PlannedRun, factor: float = 1.0, status: str = "converged") -> dict:
@@ -401,7 +287,7 @@ def answer(run: PlannedRun, factor: float = 1.0, status: str = "converged") -> d
 
 
 def test_success_needs_convergence_and_the_truth():
-    runs = [PlannedRun(f"{k}", "p", "a", k, guess=dict.fromkeys(TRUTH, 1.0)) for k in range(5)]
+    runs = [PlannedRun("p", "a", k, guess=dict.fromkeys(TRUTH, 1.0)) for k in range(5)]
     records = [
         answer(runs[0], 1.005),
         answer(runs[1], 1.02),
@@ -418,18 +304,3 @@ def test_success_needs_convergence_and_the_truth():
     assert summary["iterations"] == 7
     assert run_row(runs[1], records[1], SuccessCriterion(TRUTH, within=0.05))["success"]
     assert run_row(runs[1], records[1], SuccessCriterion())["success"]
-
-
-def test_the_time_left_follows_from_each_methods_runs():
-    walls = {"fast": [1.0, 3.0], "slow": [10.0]}
-    assert remaining_time_s(["fast", "fast", "slow"], walls, worker_count=1) == pytest.approx(14.0)
-    assert remaining_time_s(["fast"] * 8, walls, worker_count=2) == pytest.approx(8.0)
-    assert remaining_time_s(["slow"], walls, worker_count=8) == pytest.approx(10.0)
-    assert remaining_time_s(["unknown"], {"fast": [2.0]}, worker_count=1) == pytest.approx(2.0)
-    assert remaining_time_s(["fast"], {}, 1) is None
-    assert remaining_time_s([], walls, 1) is None
-
-
-def test_records_are_json(tmp_path):
-    RunStore(tmp_path).save({"key": "a", "outcome": "finished", "loss": float("nan")})
-    assert json.loads((tmp_path / "a.json").read_text())["loss"] is None

@@ -47,7 +47,6 @@ from ...statistics.linearised import (
 )
 from ...statistics.residuals.autocorrelation import ErrorProcess, error_processes
 from ...statistics.residuals.noise_level import ROUNDING
-from .law_disagreements import Disagreement, find_disagreements
 from .planning import PlannedRun, fitted_recordings
 from .rows import Row
 from .run_execution import Record
@@ -72,7 +71,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     planned : sequence of PlannedRun
         Runs of a comparison of models.
     records : mapping of str to Record
-        Finished runs by key.
+        Finished runs by label.
 
     Returns
     -------
@@ -89,7 +88,7 @@ def model_rows(planned: Sequence[PlannedRun], records: Mapping[str, Record]) -> 
     """
     of_model: dict[str, dict[str, Any]] = {}
     for run in planned:
-        fit = (records.get(run.key) or {}).get("model") or {}
+        fit = (records.get(run.label) or {}).get("model") or {}
         of_model.setdefault(run.model_name, {})[run.test_name or ""] = fit
     rows = [_model_row(label, fits) for label, fits in of_model.items()]
     _add_criterion(rows)
@@ -197,24 +196,18 @@ def chosen_row(rows: Sequence[Row]) -> Row | None:
     if best is None:
         fitted = [row for row in rows if row["delta_aic"] is not None]
         return min(fitted, key=lambda r: r["delta_aic"], default=None)
-    as_good = _equally_good(rows, LIKELY)
-    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
-
-
-def _equally_good(rows: Sequence[Row], errors: float) -> list[Row]:
-    """Return converged models as good as the best within `errors`, or in practice."""
-    return [
+    as_good = [
         row
         for row in rows
         if row["converged"]
         and row["log_ratio"] is not None
-        and row["log_ratio"] <= max(EQUIVALENT_ERROR, errors * row["log_ratio_error"])
+        and row["log_ratio"] <= max(EQUIVALENT_ERROR, LIKELY * row["log_ratio_error"])
     ]
+    return min(as_good, key=lambda row: (row["free"], row["held_out_rms"]))
 
 
 def advice(rows: Sequence[Row]) -> str:
-    """Return in words which model to use, why, and how certain that is, and in which estimates
-    equally good laws disagree, as one paragraph.
+    """Return in words which model to use, why, and how certain that is, as one paragraph.
 
     If no row is chosen, or no other model converged, it says so. If nothing was predicted it
     compares the AIC alone. Models that cannot predict all held-out data are named.
@@ -254,7 +247,7 @@ def bound_sentences(rows: Sequence[Row]) -> list[str]:
 
 
 def _reasons(rows: Sequence[Row], chosen: Row) -> str:
-    """Return which model to use, why, how certainly, and where others disagree."""
+    """Return which model to use, why, and how certainly."""
     others = [row for row in rows if row is not chosen and row["converged"]]
     use = f"Use {chosen['model']}"
     if not others:
@@ -271,22 +264,7 @@ def _reasons(rows: Sequence[Row], chosen: Row) -> str:
         return " ".join([f"{use}: no other model predicts the held-out samples.", *failures])
     rival = min(predicted, key=lambda row: row["log_ratio"])
     sentences = [f"{use}: {_comparison(chosen, rival)}.", _certainty(chosen, rival), *failures]
-    return " ".join([*sentences, *(each.describe() for each in law_disagreements(rows))])
-
-
-def law_disagreements(rows: Sequence[Row]) -> list[Disagreement]:
-    """Return the moduli and damping coefficients in which the models that predict as well as the
-    best disagree.
-
-    Models predict as well as the best within `SURE` standard errors. They disagree if the largest
-    estimate is more than `LEAST_DISAGREEMENT_RATIO` times the smallest, whatever the intervals; see
-    `find_disagreements`. Empty if no row is chosen, or if the chosen one has no prediction error
-    ("log_ratio" is None).
-    """
-    chosen = next((row for row in rows if row["chosen"]), None)
-    if chosen is None or chosen["log_ratio"] is None:
-        return []
-    return find_disagreements(_equally_good(rows, SURE), chosen)
+    return " ".join(sentences)
 
 
 def _failed_prediction(row: Row, chosen: Row) -> str:

@@ -114,15 +114,9 @@ def compare_models(
             by = method or problem.method
             if not isinstance(by, str):
                 raise InputError("found a method that is an object; expected the name of a method")
-            run = PlannedRun(
-                f"{name} without {test_name}",
-                problem=name,
-                method=by,
-                model_name=name,
-                test_name=test_name,
-            )
+            run = PlannedRun(problem=name, method=by, model_name=name, test_name=test_name)
             if log is not None:
-                log(f"fit {len(planned) + 1} of {len(held_out) * len(models)}: {run.make_label()}")
+                log(f"fit {len(planned) + 1} of {len(held_out) * len(models)}: {run.label}")
             planned.append(run)
-            records[run.key] = {"model": fit_record(problem, by, test_name)}
+            records[run.label] = {"model": fit_record(problem, by, test_name)}
     return ModelComparison(tuple(model_rows(planned, records)))

@@ -6,25 +6,19 @@ Each run can therefore be repeated with ``collocation-sysid solve PROBLEM --meth
 
 from __future__ import annotations
 
-import hashlib
-import itertools
-import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...common.installation import package_version
 from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Count, OneOrMore
 from ...errors import InputError
 from ...problem import Problem
 from ...problem.reading import read_problem_file
 from ...problem.schema import ParameterSection, ProblemFile
-from ...recording.sources.logs import stored_files
 from .model_variants import ModelVariant
 
 # Kinds of studies: the names of their commands, which are in JSON and in folder names.
@@ -33,17 +27,12 @@ MODEL_STUDY = "compare-models"
 STUDY_TITLES = {METHOD_STUDY: "Comparison of methods", MODEL_STUDY: "Comparison of models"}
 # Largest number of starts: more would be a mistake.
 MOST_STARTS = 10_000
-# Hexadecimal digits of a run's key: 80 bits, so that two of 10,000 runs never agree.
-KEY_LENGTH = 20
 
 
 @dataclass(frozen=True)
 class PlannedRun:
     """One run of a study."""
 
-    # Hash of everything that determines the result: problem, data files, method, start, options,
-    # version.
-    key: str
     problem: str  # absolute path of the problem file
     method: str
     start: int = 0  # number of the start; 0 is the file's guess
@@ -57,9 +46,10 @@ class PlannedRun:
     # of methods.
     test_name: str | None = None
 
-    def make_label(self) -> str:
-        """Return the short description of the run for the user: model and held-out recording, or
-        method and start.
+    @property
+    def label(self) -> str:
+        """Short description of the run for the user: model and held-out recording, or method and
+        start; the runs of a study have different ones.
         """
         if self.test_name is None:
             return f"{self.method}, start {self.start}"
@@ -75,8 +65,7 @@ class Starts:
     """Starts of the runs: the first at the file's guess, the others around the truth, or the guess
     without one.
 
-    A start depends only on the seed, its number and the estimated parameters, so that more of them
-    can be added later.
+    A start depends only on the seed, its number and the estimated parameters.
 
     Attributes
     ----------
@@ -254,9 +243,7 @@ def fitted_recordings(problem: Problem) -> list[str]:
 def _planned_run(
     path: Path, file: ProblemFile, method: str | None, overrides: Sequence[str], **more: Any
 ) -> PlannedRun:
-    """The key is a hash of all that decides the result, not of the path."""
-    method = method or file.solver.method
-    start = more.get("start", 0)
+    """Return the run of a file with its overrides."""
     guess = {
         name: section.guess
         for name, section in file.parameters.items()
@@ -264,36 +251,10 @@ def _planned_run(
         and section.fixed is None
         and section.tied_to is None
     }
-    content = file.model_dump(mode="json", exclude_unset=True, by_alias=True)
-    solver = content.get("solver", {})
-    content["solver"] = {key: solver[key] for key in ("huber", method) if key in solver}
-    content["solver"]["method"] = method
-    of_study = start if more.get("test_name") is None else f"without {more['test_name']}"
-    hashes = _file_hashes(content, path.parent)
-    decisive = [content, of_study, hashes, package_version()]
-    text = json.dumps(decisive, sort_keys=True)
-    key = hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
     return PlannedRun(
-        key, str(path.resolve()), method=method, overrides=tuple(overrides), guess=guess, **more
+        str(path.resolve()),
+        method=method or file.solver.method,
+        overrides=tuple(overrides),
+        guess=guess,
+        **more,
     )
-
-
-def _file_hashes(content: Any, folder: Path) -> dict[str, str]:
-    """Changed data give another run; missing files and folders are left out."""
-    hashes = {}
-    for text in _texts(content):
-        with suppress(OSError, ValueError):  # a text that is no file's name
-            if files := stored_files(folder / text):
-                each = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-                hashes[text] = " ".join(each)
-    return hashes
-
-
-def _texts(content: Any) -> Iterator[str]:
-    """Keys are not included."""
-    if isinstance(content, str):
-        yield content
-    elif isinstance(content, Mapping):
-        yield from itertools.chain.from_iterable(map(_texts, content.values()))
-    elif isinstance(content, (list, tuple)):
-        yield from itertools.chain.from_iterable(map(_texts, content))

@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...common.display import readable_stress
 from ...common.serialisation import read
-from ...fem.laws.constants import unit_of
+from ...fem.laws.constants import is_damping, unit_of, without_region
 from ...result.figure_style import (
     BLUE,
     COLOUR_CYCLE,
@@ -27,9 +27,11 @@ from ...result.figure_style import (
     symbol_as_mathtext,
 )
 from ...runs.result_content import Result
-from .law_disagreements import is_comparable
 from .rows import Row
 from .run_execution import Record
+
+# Moduli at small strain, which mean the same in every law, as damping coefficients do.
+MODULI = ("young_pa", "poisson")
 
 
 @own_settings()
@@ -42,7 +44,7 @@ def convergence_figure(rows: Sequence[Row], records: Mapping[str, Record]) -> Fi
     ----------
     rows : sequence of Row
         Rows of `run_row`, one for each run, also for missing ones.
-    records : mapping of key of the run to Record
+    records : mapping of label of the run to Record
         Records, at least of the runs with a result, with its history.
     """
     runs_of_method: dict[str, list[Row]] = {}
@@ -57,7 +59,7 @@ def convergence_figure(rows: Sequence[Row], records: Mapping[str, Record]) -> Fi
         colour = COLOUR_CYCLE[number % len(COLOUR_CYCLE)]
         style: dict[str, Any] = {"color": colour, "lw": LINE_PT, "marker": ".", "ms": 3}
         for k, row in enumerate(runs):
-            history = read(Result, records[row["key"]]["result"]).history
+            history = read(Result, records[row["label"]]["result"]).history
             times = [line.time_s for line in history]
             for axes, name in zip(panels, ("loss", "violation_n"), strict=True):
                 values = np.array([getattr(line, name) for line in history], dtype=float)
@@ -92,7 +94,12 @@ def model_figure(rows: Sequence[Row]) -> Figure | None:
         Rows of `model_rows`; models without a prediction or an interval have an empty line.
     """
     parameters = dict.fromkeys(name for row in rows for name in row["parameters"])
-    names = [n for n in parameters if is_comparable(n) and any(n in row["budget"] for row in rows)]
+    names = [
+        name
+        for name in parameters
+        if (without_region(name) in MODULI or is_damping(name))
+        and any(name in row["budget"] for row in rows)
+    ]
     predicted = any(row["log_ratio"] is not None for row in rows)
     panels = [*(["prediction"] if predicted else []), *names]
     if not panels:

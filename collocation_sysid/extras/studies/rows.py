@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field
-from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -18,26 +17,14 @@ from .run_execution import TIMEOUT, Record
 
 Row = dict[str, Any]
 
-
 # Quality and cost of a run, from its result.
 NUMBERS: dict[str, Callable[[Result], float | None]] = {
-    "loss": lambda r: r.history[-1].loss if r.history else None,
     "rms_m": lambda r: r.fit.rms_m,
     "violation_n": lambda r: r.dynamics.max_violation_n,
     "violation_relative": lambda r: r.dynamics.max_violation_relative,
-    "rollout_rms_m": lambda r: r.rollout.rms_m,
-    "rollout_max_m": lambda r: r.rollout.max_m,
     "iterations": lambda r: r.iterations,
-    "evaluations": lambda r: r.evaluations,
-    "build_s": lambda r: r.timing_s.build,
-    "evaluations_s": lambda r: r.timing_s.evaluations,
-    "linear_algebra_s": lambda r: r.timing_s.linear_algebra,
     "total_s": lambda r: r.timing_s.total,
 }
-# Numbers of which the summary of a method has the median over its runs.
-MEDIANS = tuple(name for name in NUMBERS if name not in ("loss", "rollout_max_m"))
-# 97.5 % quantile of the standard normal distribution.
-NORMAL_975 = 1.959963984540054
 
 
 @validated
@@ -65,31 +52,15 @@ class SuccessCriterion:
         )
 
 
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return the 95 % interval of a success rate (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
-
-    Unlike the normal approximation it holds at rates of 0 and 1 and for few of the `trials`. It is
-    (0, 1) without trials, begins at 0 without `successes`, and ends at 1 without failures.
-    """
-    if trials == 0:
-        return 0.0, 1.0
-    rate = successes / trials
-    z2 = NORMAL_975**2
-    centre = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    spread = sqrt(z2 * (rate * (1 - rate) / trials + z2 / (4 * trials**2))) / (1 + z2 / trials)
-    low = 0.0 if successes == 0 else centre - spread
-    return low, 1.0 if successes == trials else centre + spread
-
-
 # Runs ---------------------------------------------------------------------------------------------
 
 
 def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion) -> Row:
     """Return one run as a flat row; values are None if they are not known or NaN.
 
-    The columns are "key", "method", "start", "status", "converged", "success", those of the
-    parameters, the names in `NUMBERS` (quality and cost, such as "loss" and "rms_m"),
-    "wall_s", "attempts" and "message". The columns of the parameters are ``guess_NAME``,
+    The columns are "label", "method", "start", "status", "converged", "success", those of the
+    parameters, the names in `NUMBERS` (quality and cost, such as "rms_m"),
+    "wall_s" and "message". The columns of the parameters are ``guess_NAME``,
     ``value_NAME``, and ``error_NAME`` (relative to the truth, only for parameters whose truth is
     known).
 
@@ -111,7 +82,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
     is_accurate = all(error is not None and error <= yardstick.within for error in errors)
     numbers = {name: None if result is None else number(result) for name, number in NUMBERS.items()}
     row = {
-        "key": run.key,
+        "label": run.label,
         "method": run.method,
         "start": run.start,
         "status": record["outcome"] if is_timeout or result is None else result.status,
@@ -120,7 +91,6 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         **parameters,
         **numbers,
         "wall_s": record.get("wall_s"),
-        "attempts": record.get("attempts"),
         "message": record.get("message", ""),
     }
     return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
@@ -173,16 +143,12 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
     """Runs with the status "missing" are not counted."""
     done = [row for row in rows if row["status"] != "missing"]
     successes = sum(row["success"] for row in done)
-    low, high = wilson_interval(successes, len(done))
-    medians = (*error_columns(rows), *MEDIANS)
+    medians = (*error_columns(rows), *NUMBERS)
     known = {name: [row[name] for row in done if row[name] is not None] for name in medians}
     return {
         "method": method,
         "runs": len(done),
         "converged": sum(row["converged"] for row in done),
         "successes": successes,
-        "success_rate": successes / len(done) if done else None,
-        "success_low": low,
-        "success_high": high,
         **{name: float(np.median(each)) if each else None for name, each in known.items()},
     }

@@ -1,9 +1,7 @@
-"""Execution of runs, each in its own process, and storage of their records.
+"""Execution of runs, each in its own process.
 
-`execute` starts a process, watches it, stops it after the time limit, and repeats it if it crashes:
-a time limit or a segmentation fault affects only that run. Workers are threads of this process, or
-workers of a Dask cluster. Records of finished runs are stored as one JSON file each, written
-atomically. Use `run_all` for all runs of a study.
+`execute` starts a process, watches it, and stops it after the time limit: a time limit or a
+segmentation fault affects only that run. Use `run_all` for all runs of a study.
 """
 
 from __future__ import annotations
@@ -11,26 +9,19 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import secrets
 import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import IO, Any
 
-from ...common.cluster import connected, distributed
-from ...common.files import write_text_file
 from ...common.installation import python_command
 from ...common.isolated_process import killed_by
-from ...common.serialisation import as_json
 from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Positive
-from ...errors import InputError
 from ...fem.kernels import available_threads
 from .planning import PlannedRun
 
@@ -56,45 +47,32 @@ GRACE_S = 10.0
 
 
 def execute(
-    planned: dict[str, Any],
+    planned: PlannedRun,
     time_limit_s: float | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
-    retries: int = 1,
 ) -> Record:
     """Execute a run in its own process and return its record, whatever happens to the process.
 
     Parameters
     ----------
-    planned : dict
-        A `PlannedRun` as a dictionary.
     time_limit_s : float, optional
         Time after which the process is asked to end, loading included [s]; it is killed if it does
         not. The record then contains the best iterate, if there is one. No limit by default.
     is_stopped : callable
         Function that is called now and then; the process is killed once it returns true.
-    retries : int
-        Further attempts if the process crashes.
 
     Returns
     -------
     dict
-        The fields of `planned`, those of `run_worker.record_of_run` for the last attempt (of a
-        process that was stopped, crashed or exceeded the limit at least "outcome" and "message"),
-        its "wall_s" [s], the number of "attempts" and "time_limit_s".
+        The record of `run_worker.record_of_run` (of a process that was stopped, crashed or exceeded
+        the limit at least "outcome" and "message"), and its "wall_s" [s].
     """
-    attempts = 0
-    record = {}
-    while attempts <= retries:
-        attempts += 1
-        began = time.monotonic()
-        record = _attempt(planned, time_limit_s, stopped=is_stopped)
-        record["wall_s"] = time.monotonic() - began
-        if record["outcome"] != CRASHED:
-            break
-    return {**planned, **record, "attempts": attempts, "time_limit_s": time_limit_s}
+    began = time.monotonic()
+    record = _record(planned.as_dict(), time_limit_s, stopped=is_stopped)
+    return {**record, "wall_s": time.monotonic() - began}
 
 
-def _attempt(
+def _record(
     planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
 ) -> Record:
     """Execute a run once, in a process with one thread."""
@@ -182,58 +160,6 @@ STOPPED = "stopped"
 Record = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class RunStore:
-    """Records in the folder ``runs/`` of a study."""
-
-    folder: Path  # folder of the records
-
-    def save(self, record: Record) -> None:
-        """Write the record of a run, atomically, to the file of its "key"; an earlier record is
-        replaced, and missing folders are made.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be written.
-        KeyError
-            If the record has no "key".
-        """
-        write_text_file(self._file(record["key"]), as_json(record) + "\n")
-
-    def load(self, key: str) -> Record | None:
-        """Return the record of a run; None if it does not exist, cannot be read, or has another
-        key.
-        """
-        try:
-            record = json.loads(self._file(key).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return None
-        return record if isinstance(record, dict) and record.get("key") == key else None
-
-    def load_finished(self, key: str, time_limit_s: float | None) -> Record | None:
-        """Return the record of a run; None if the run should be executed again.
-
-        A run is repeated if it crashed, or if it exceeded a time limit below the present one. A run
-        that ended with an error is not repeated.
-
-        Parameters
-        ----------
-        time_limit_s : float or None
-            Present time limit [s]; None for no limit.
-        """
-        record = self.load(key)
-        if record is None or record["outcome"] == CRASHED:
-            return None
-        if record["outcome"] == TIMEOUT:
-            previous_limit_s = record.get("time_limit_s") or 0.0
-            return record if time_limit_s is not None and time_limit_s <= previous_limit_s else None
-        return record
-
-    def _file(self, key: str) -> Path:
-        return self.folder / f"{key}.json"
-
-
 @validated
 class RunOptions:
     """Execution of the runs of a study.
@@ -242,122 +168,46 @@ class RunOptions:
     ----------
     workers : int
         Number of runs computed in parallel; by default the number of cores.
-    scheduler : ADDRESS
-        Address of a dask.distributed scheduler; its workers need the same files.
     time_limit_s : --time-limit SECONDS
         Time after which a run is stopped, including the time for loading [s]; a stopped run counts
         as a failure.
     """
 
     workers: AtLeastOne | None = None
-    scheduler: str | None = None
     time_limit_s: Positive | None = None
-
-    def __post_init__(self) -> None:
-        if self.workers is not None and self.scheduler is not None:
-            raise InputError(
-                "the scheduler has workers of its own; state either a scheduler or a number of "
-                "workers",
-                None,
-                where="workers",
-            )
-
-
-# Start of a run, which returns the future of its record; number of workers; end of all runs.
-Executor = tuple[Callable[[PlannedRun], Future], int, Callable[[], Any]]
 
 
 def run_all(
     planned: Sequence[PlannedRun],
-    store: RunStore,
     options: RunOptions,
-    on_record: Callable[[Record, int], None] = lambda record, worker_count: None,
+    on_record: Callable[[PlannedRun, Record], None],
 ) -> None:
-    """Execute the runs of a study and store their records, each as soon as it has ended; return
-    when all have ended.
-
-    Runs that fail, crash or exceed the time limit are stored like others. Runs that were stopped
-    are neither stored nor reported. Without runs nothing happens.
+    """Execute the runs of a study, and return when all have ended.
 
     Parameters
     ----------
     planned : sequence of PlannedRun
-        Runs, started in this order; the caller has removed finished ones.
-    store : RunStore
-        Storage of the records.
+        Runs, started in this order.
     options : RunOptions
-        Options of the execution: threads of this process, or the workers of a scheduler.
+        Number of runs at once, by default one for each available thread, and their time limit.
     on_record : callable
-        Function that is called with every new record, in the order in which runs end, and the
-        number of runs at once.
+        Function that is called with every run and its record, in the order in which runs end; also
+        for runs that fail, crash or exceed the time limit.
 
     Raises
     ------
-    InputError
-        If the scheduler cannot be reached, or a record cannot be written.
     KeyboardInterrupt
-        After the running runs have been told to end; finished ones are in the store.
+        After the running runs have been told to end.
     """
-    if not planned:
-        return
-    executor = _cluster_executor if options.scheduler else _thread_executor
-    with executor(options) as (submit, worker_count, stop):
-        futures = {submit(run): run for run in planned}
+    stop = threading.Event()
+    with ThreadPoolExecutor(options.workers or available_threads()) as executor:
+        futures = {
+            executor.submit(execute, run, options.time_limit_s, stop.is_set): run for run in planned
+        }
         try:
             for future in as_completed(futures):
-                record = _result_record(future, futures[future], limits=options)
-                if record["outcome"] != STOPPED:
-                    store.save(record)
-                    on_record(record, worker_count)
+                on_record(futures[future], future.result())
         except BaseException:
-            for future in futures:
-                future.cancel()
-            stop()
+            stop.set()
+            executor.shutdown(cancel_futures=True)
             raise
-
-
-def _result_record(future: Future, planned: PlannedRun, limits: RunOptions) -> Record:
-    """A lost worker is a crash."""
-    try:
-        return future.result()
-    except Exception as error:
-        return {
-            **planned.as_dict(),
-            "outcome": CRASHED,
-            "message": f"the worker was lost ({type(error).__name__}: {error})",
-            "attempts": 1,
-            "time_limit_s": limits.time_limit_s,
-            "wall_s": None,
-        }
-
-
-@contextmanager
-def _thread_executor(limits: RunOptions) -> Iterator[Executor]:
-    """The end waits for submitted runs; only `stop` ends running ones."""
-    worker_count = limits.workers or available_threads()
-    stop = threading.Event()
-    with ThreadPoolExecutor(worker_count) as executor:
-
-        def submit(run: PlannedRun) -> Future:
-            return executor.submit(execute, run.as_dict(), limits.time_limit_s, stop.is_set)
-
-        yield submit, worker_count, stop.set
-
-
-@contextmanager
-def _cluster_executor(limits: RunOptions) -> Iterator[Executor]:
-    """The end waits for submitted runs; `stop` ends them through an event of the cluster."""
-    flag = f"collocation-sysid-stop-{secrets.token_hex(8)}"
-    with connected(limits.scheduler) as client:
-        stop = distributed().Event(flag, client=client)
-        with client.get_executor(pure=False) as executor:
-
-            def submit(run: PlannedRun) -> Future:
-                return executor.submit(_execute_on_worker, run.as_dict(), limits.time_limit_s, flag)
-
-            yield submit, max(1, sum(client.nthreads().values())), stop.set
-
-
-def _execute_on_worker(planned: dict[str, Any], time_limit_s: float | None, flag: str) -> Record:
-    """Execute a run in a process of its own on a worker."""
-    return execute(planned, time_limit_s, is_stopped=distributed().Event(flag).is_set)

@@ -11,11 +11,11 @@ from typing import Any
 from ...common.display import Shown, Table, TitledParts, as_markdown
 from ...common.files import SCHEMA, replaced_file, write_text_file
 from ...fem.laws.constants import symbol_of, symbol_with_unit
-from .model_choice import advice, display_unit, law_disagreements, model_notes, model_rows
+from .model_choice import advice, display_unit, model_notes, model_rows
 from .planning import METHOD_STUDY, MODEL_STUDY, PlannedRun
 from .plots import convergence_figure, model_figure
 from .rows import Row, SuccessCriterion, error_columns, method_rows, run_row
-from .run_execution import Record, RunStore
+from .run_execution import Record
 
 # Resolution of the picture [pixels per inch], for a page.
 RESOLUTION_DPI = 150
@@ -29,7 +29,7 @@ class StudyReport:
     title: str
     kind: str
     planned: tuple[PlannedRun, ...]
-    records: Mapping[str, Record]  # mapping of str to Record: records of finished runs by key
+    records: dict[str, Record]  # dict of str to Record: records of finished runs by label
     yardstick: SuccessCriterion
 
     @property
@@ -40,7 +40,7 @@ class StudyReport:
         if self.kind == MODEL_STUDY:
             return model_rows(self.planned, self.records)
         return [
-            run_row(run, self.records.get(run.key), yardstick=self.yardstick)
+            run_row(run, self.records.get(run.label), yardstick=self.yardstick)
             for run in self.planned
         ]
 
@@ -63,9 +63,9 @@ class StudyReport:
         and message. Runs without a record do not count.
         """
         return [
-            f"{run.make_label()}: {record['outcome']}: {record.get('message', '')}"
+            f"{run.label}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
-            if (record := self.records.get(run.key)) is not None
+            if (record := self.records.get(run.label)) is not None
             and not {"result", "model"} & record.keys()
         ]
 
@@ -83,11 +83,11 @@ class StudyReport:
         return [*explained, *remaining]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the results for JSON, with dataclasses that `as_json` converts.
+        """Return the results for JSON.
 
         The keys are "schema", "kind", "title", "problem" (path of the first run's file), "runs",
         "notes" and "failures"; for a comparison of methods also "truth" (None if unknown), "within"
-        and "methods", and of models "advice" and "laws".
+        and "methods", and of models "advice".
         """
         rows = self.rows
         content: dict[str, Any] = {
@@ -100,7 +100,7 @@ class StudyReport:
             "failures": self.failures,
         }
         if self.kind == MODEL_STUDY:
-            return content | {"advice": advice(rows), "laws": law_disagreements(rows)}
+            return content | {"advice": advice(rows)}
         return content | {
             "truth": dict(self.yardstick.truth) or None,
             "within": self.yardstick.within,
@@ -128,58 +128,19 @@ class StudyReport:
                 figure.savefig(draft, dpi=RESOLUTION_DPI)
 
 
-def load_report(
-    title: str,
-    kind: str,
-    planned: Sequence[PlannedRun],
-    store: RunStore,
-    yardstick: SuccessCriterion | None = None,
-) -> StudyReport:
-    """Return the report of planned runs from their stored records.
-
-    Parameters
-    ----------
-    title, kind
-        See `StudyReport`.
-    planned : sequence of PlannedRun
-        All runs of the study, at least one; those without a record remain to be done.
-    store : RunStore
-        Storage of the records.
-    yardstick : SuccessCriterion, optional
-        Criterion of success; by default convergence alone.
-    """
-    loaded = {run.key: store.load(run.key) for run in planned}
-    records = {key: record for key, record in loaded.items() if record is not None}
-    return StudyReport(
-        title,
-        kind,
-        planned=tuple(planned),
-        records=records,
-        yardstick=yardstick or SuccessCriterion(),
-    )
-
-
-def plan_table(planned: Sequence[PlannedRun], finished: Sequence[str]) -> Table:
-    """Return a table of the runs of a study with their guesses ("–" if there is none), and which of
-    them are finished.
-
-    Parameters
-    ----------
-    planned : sequence of PlannedRun
-        Runs; they are numbered from 1.
-    finished : sequence of str
-        Keys of the finished runs.
+def plan_table(planned: Sequence[PlannedRun]) -> Table:
+    """Return a table of the runs of a study, numbered from 1, with their guesses ("–" if there is
+    none).
     """
     rows = tuple(
         (
             str(number),
-            run.make_label(),
+            run.label,
             " ".join("–" if g is None else f"{g:.4g}" for g in run.guess.values()),
-            "finished" if run.key in finished else "to do",
         )
         for number, run in enumerate(planned, start=1)
     )
-    return Table("", ("", "run", "guess", ""), rows=rows, names=4)
+    return Table("", ("", "run", "guess"), rows=rows, names=3)
 
 
 Cell = Callable[[Row], str]

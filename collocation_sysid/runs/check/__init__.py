@@ -46,7 +46,7 @@ from ...statistics.scale_identifiability import scale_concerns, scale_reference,
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
 from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
-from .cost import MethodCost, cost_concerns, cost_notes, estimated_sweeps_s, method_costs, nonzeros
+from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
@@ -341,19 +341,6 @@ def _views_notes(collocation: Collocation, z: Array) -> list[str]:
         return [note] if (note := views_note(collocation, z)) else []
     except SimulationError:
         return []
-
-
-def expected_search_s(problem: Problem) -> float | None:
-    """Return a rough estimate of the time of a search in reduced space [s], from one sweep over the
-    first samples at the guesses, or at typical values without; None if these cannot be simulated.
-    """
-    first = shortened_problem(problem).collocation()
-    first = replace(first, parameters=typical_parameters(first.parameters, SOFT_PA))
-    try:
-        z, failures = initial_variables(first)
-    except SimulationError:  # no stress-free shape
-        return None
-    return None if failures else estimated_sweeps_s(problem.collocation(), first, z=z)
 
 
 def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:

@@ -33,7 +33,7 @@ from ..estimates import Estimate, IntervalCoordinate
 from ..linearised import LinearisedFit, covariance_of_fit, gauss_newton_step, least_squares_of_fit
 from ..thresholds import DETERMINED, GRANTED
 from ..uncertainty import Uncertainty
-from .combined_intervals import NORMAL_95, Interval, combine, widened_interval
+from .combined_intervals import NORMAL_95, Interval, combine
 from .consider_analysis import ResidualChanges, with_relaxed_columns
 from .discretisation_error import DiscretisationError, estimate_changes
 from .memory_effect import RELAXATION_TIME
@@ -71,40 +71,6 @@ class BudgetLine:
     systematic: float
     # Correction for known effects in the same coordinate, contained in `value`.
     known_effect: float = 0.0
-
-    def with_source(
-        self, source: str, deviation: float, coordinate: IntervalCoordinate
-    ) -> BudgetLine:
-        """Return the budget with one more source of variance.
-
-        Parameters
-        ----------
-        source : str
-            Name of the source.
-        deviation : float
-            Its standard deviation in the coordinate of the estimate.
-
-        Notes
-        -----
-        The source counts as systematic. Bounds are not applied. A source of this name in `shares`
-        is replaced, although its variance remains in the total.
-        """
-        low, high = map(coordinate.from_value, self.combined95)
-        known_variance = ((high - low) / 2 / NORMAL_95) ** 2
-        total = known_variance + deviation**2
-        shares = {name: share * known_variance / total for name, share in self.shares.items()}
-        shares[source] = deviation**2 / total
-        least, most = widened_interval(
-            (low, high), coordinate.from_value(self.value), deviation=deviation
-        )
-        return BudgetLine(
-            self.value,
-            _ranked(shares),
-            combined95=(coordinate.to_value(least), coordinate.to_value(most)),
-            combined_std_error=(most - least) / 2 / NORMAL_95 / coordinate.derivative(self.value),
-            systematic=float(np.hypot(self.systematic, deviation)),
-            known_effect=self.known_effect,
-        )
 
 
 @dataclass(frozen=True, eq=False)
