@@ -44,7 +44,7 @@ SMALL_BYTES = 50_000_000
 LONGEST_REASON = 200
 RESULT_FILE = "result.json"
 # Version of the form of result.json.
-SCHEMA = 5
+SCHEMA = 6
 # Remedy for a damaged file, at the end of a message.
 AGAIN = "; run the command that wrote it again"
 

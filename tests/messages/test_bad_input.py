@@ -702,7 +702,7 @@ def test_a_damaged_run_cannot_be_drawn(tiny):
     (tiny / "result.json").write_text('{"history": [')
     np.savez(tiny / "trajectory.npz", t_s=np.zeros(3))
     assert_refused(tiny, ("damaged", "run the command that wrote it again"), "plot", ".")
-    (tiny / "result.json").write_text('{"schema": 5}')
+    (tiny / "result.json").write_text('{"schema": 6}')
     assert_refused(tiny, ("damaged", "solve the problem again"), "plot", ".")
 
 
