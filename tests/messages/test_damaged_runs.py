@@ -196,7 +196,7 @@ def test_damaged_frames_are_refused(run: Path, content: str):
 @pytest.mark.parametrize("command", ["report", "plot", "animate", "refine"])
 def test_a_run_of_another_version_is_refused(run: Path, command: str):
     entry(1, "schema")(run)
-    assert "result.json has schema 1; expected 5, which this version writes" in refused(
+    assert "result.json has schema 1; expected 6, which this version writes" in refused(
         command, run
     )
 
