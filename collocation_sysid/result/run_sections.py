@@ -245,9 +245,7 @@ def _undetermined_sentence(result: Result) -> list[str]:
             sources.append(f"{symbol_of(name)} (largest contribution: {largest})")
     if not sources:
         return []
-    return [
-        f"not determined, because the combined interval is wider than the value: {listed(sources)}"
-    ]
+    return [f"not determined: {listed(sources)}"]
 
 
 def _coverage_sentence(result: Result) -> str:

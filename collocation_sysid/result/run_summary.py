@@ -24,7 +24,7 @@ from ..fem.laws.constants import (
 from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.variance_sources import source_label
-from ..statistics.combinations import precision_text
+from ..statistics.combinations import WIDE, precision_text
 from .alternative_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,
@@ -214,14 +214,16 @@ def _limit(result: Result) -> Iterator[str]:
 
 
 def effect_of_remedy(result: Result, name: str) -> str:
-    """Return the effect on an estimate of knowing what its largest source stands for; "" if it is
-    determined anyway.
+    """Return the effect on an estimate of knowing what its largest source stands for; "" unless
+    this determines it.
     """
     estimate = result.estimates[name]
     if estimate.is_determined or estimate.combined95 is None or estimate.combined95[0] <= 0:
         return ""
     lower, upper = estimate.combined95
     factor = (upper / lower) ** (0.5 * np.sqrt(max(0.0, 1 - result.limits[name].share)))
+    if factor >= WIDE:
+        return ""
     return f": {symbol_of(name)} would then be determined {precision_text(factor)}"
 
 

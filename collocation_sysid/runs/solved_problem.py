@@ -571,7 +571,7 @@ class SolvedProblem:
         names, values, covariance = self._stated_covariance()
         if not names or self.uncertainty is None:
             return ()
-        vague = {name for name in names if not self._is_determined_alone(name)}
+        vague = {name for name in names if not self.estimates[name].is_determined}
         places = [self._estimated_names.index(name) for name in names]
         noise = self.uncertainty.complete_covariance[np.ix_(places, places)]
         moduli = self._modulus_slopes(names)
@@ -583,9 +583,6 @@ class SolvedProblem:
     def principal_directions(self) -> tuple[Direction, ...]:
         """Independent combinations of the constants of `combinations`, the best determined first."""
         return principal_directions(*self._stated_covariance())
-
-    def _is_determined_alone(self, name: str) -> bool:
-        return self.estimates[name].reason is None and self.estimates[name].is_determined
 
     def _stated_covariance(self) -> tuple[list[str], Array, Array]:
         """Names, values and covariance of scalars that are not at a bound."""

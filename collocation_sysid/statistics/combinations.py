@@ -34,8 +34,8 @@ LARGEST_SHARE = 0.1
 # standard deviations; and smallest power that is written, relative to the largest one.
 MEMBER = 0.2
 SMALLEST_POWER = 0.05
-# Half width of an interval, as a factor, from which on the interval is wider than the value:
-# f − 1/f = 1.
+# Half width of an interval, as a factor, from which on the interval is wider than the value, so that
+# this is not determined (`ReportedEstimate.is_determined`): f − 1/f = 1.
 WIDE = (1 + 5**0.5) / 2
 # Half width, as a factor, from which on an interval is no information.
 HOPELESS = 1e4
@@ -298,16 +298,18 @@ def lone_constants(
     combinations: Sequence[Combination],
 ) -> tuple[Combination, ...]:
     """Return the undetermined constants with a positive value that belong to no combination, and
-    would be determined without noise; arguments as of `find_combinations`.
+    would be determined without noise; arguments as of `find_combinations`. One that the covariance
+    alone would determine has no precision to state.
 
     `noise` (k, k) is the part of the covariance by noise: what an assumption of the budget leaves
     undetermined, no measurement of another kind is sought for.
     """
     combined = {name for each in combinations for name in each.determined.names}
     combined |= undetermined_names(names, covariance - noise)
+    lone = undetermined_names(names, covariance) & set(undetermined) - combined
     found = []
     for k, name in enumerate(names):
-        if name in undetermined and name not in combined and values[k] > 0:
+        if name in lone and values[k] > 0:
             alone = Direction.from_weights(names, values, np.eye(len(names))[k], covariance)
             found.append(Combination(alone, alone))
     return tuple(found)

@@ -254,11 +254,27 @@ def test_a_predicted_remedy_determines_a_constant():
 def test_the_effect_of_a_remedy_is_stated_for_the_determined_constant():
     estimate = SimpleNamespace(is_determined=False, combined95=(1.0, 16.0))
     result: Any = SimpleNamespace(
-        estimates={"lambda_pa": estimate}, limits={"lambda_pa": Limit(False, "scale", 0.75, "")}
+        estimates={"lambda_pa": estimate}, limits={"lambda_pa": Limit(False, "scale", 0.9375, "")}
     )
-    assert (
-        effect_of_remedy(result, "lambda_pa")
-        == ": λ would then be determined to within a factor of 2"
-    )
+    # Of the factor 4, with a sixteenth of the variance of its logarithm.
+    assert effect_of_remedy(result, "lambda_pa") == ": λ would then be determined to ±41 %"
     estimate.is_determined = True
     assert not effect_of_remedy(result, "lambda_pa")
+    result.limits["lambda_pa"] = Limit(False, "scale", 0.75, "")
+    estimate.is_determined = False
+    assert not effect_of_remedy(result, "lambda_pa")  # a factor of 2 does not determine it
+
+
+def test_a_constant_that_is_open_for_another_reason_has_no_precision():
+    """Its interval covers the whole range between its bounds, to which it is not known better."""
+    strain = np.linspace(0.02, 0.2, 7)
+    blank = cs.Specimen("uniaxial", strain, 0 * strain, 1.0, area_error=0.0, strain_zero=0.0)
+    truth = {"young_pa": 1e5, "poisson": 0.45}
+    (stress_pa,) = cs.simulate(blank.experiment(), truth).custom_sensor_values
+    sigma_pa = 0.05 * np.abs(stress_pa).max()
+    pulled = replace(blank, stress_pa=stress_pa[:, 0], sigma_pa=sigma_pa)
+    options = cs.UncertaintyOptions(noise="given", assumptions=cs.Assumptions.exact())
+    unknown = {"young_pa": cs.Unknown(1e5, lower=0.99e5, upper=1.01e5)}
+    run = cs.run(cs.Problem([pulled.experiment()], truth | unknown, uncertainty=options))
+    assert not run.estimates["young_pa"].is_determined
+    assert not run.vague_constants

@@ -81,8 +81,10 @@ class ReportedEstimate(Estimate):
 
     @property
     def is_determined(self) -> bool:
-        """Whether the combined interval is not wider than the value; false if there is none."""
-        if self.combined95 is None:
+        """Whether the combined interval exists and is not wider than the value, and no `reason`
+        leaves this open: the rule of the table, of combinations and of remedies.
+        """
+        if self.combined95 is None or self.reason is not None:
             return False
         low, high = self.combined95
         return high - low <= abs(self.value)
