@@ -13,6 +13,7 @@ from ..common.time_dependence import at_times, values_over_time
 from ..errors import InputError, listed, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
+from ..recording.homogeneous_deformation import shape_factor
 from ..recording.hysteresis import loading_rows
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_checks import (
@@ -80,6 +81,9 @@ class SpecimenReader:
             self._add_note(f"{section.file}: {which} not read: {', '.join(table.unread)}")
         specimen = self._specimen(table)
         deformation = replace(specimen.find_deformation(), columns=table.columns)
+        if section.length_m and section.area_m2:  # also beside a column of strains
+            shape = shape_factor(section.length_m, section.area_m2)
+            deformation = replace(deformation, shape_factor=shape)
         with located(file):
             require_plausible_specimen(
                 specimen, is_stretch=not {"stretch", "volume_ratio"}.isdisjoint(table.columns)

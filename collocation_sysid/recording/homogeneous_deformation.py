@@ -56,6 +56,8 @@ class HomogeneousDeformation:
     # of a test bench over that length, so that the compliance of the bench adds to it; 0 if the
     # strain was measured on the specimen.
     area_over_length_m: float = 0.0
+    # Loaded area over the lateral surface of a round specimen, see `shape_factor`; 0 if unknown.
+    shape_factor: float = 0.0
     # Quantities of the columns of its file, such as "displacement" and "lateral_strain"; empty
     # without a file.
     columns: tuple[str, ...] = ()
@@ -118,6 +120,11 @@ def _indices(component: str) -> tuple[int, int]:
     """Return the indices of a component of F, such as (0, 2) of "xz" and of "-xz"."""
     direction, node = component.removeprefix("-")
     return AXES.index(direction), AXES.index(node)
+
+
+def shape_factor(length_m: float, area_m2: float) -> float:
+    """Return the area over the lateral surface of a round specimen of this length and area."""
+    return float(np.sqrt(area_m2 / np.pi)) / (2 * length_m)
 
 
 def transverse_stretch(axial: float, transverse: float | None) -> float:

@@ -34,6 +34,7 @@ from .homogeneous_deformation import (
     TESTS,
     HomogeneousDeformation,
     cell_mesh,
+    shape_factor,
 )
 from .nuisance import Nuisance
 from .poses import PoseSequence
@@ -240,14 +241,18 @@ class Specimen:
         """Return the kind of deformation of the test, with the components of F that it prescribes.
 
         With `length_m` and `area_m2` it has also the area over the length of the specimen, which
-        the compliance of the test bench needs.
+        the compliance of the test bench needs, and the shape factor.
         """
         deformation = DEFORMATIONS[self.test]
         if self.axial_stretch != 1 or self.transverse_stretch is not None:
             deformation = deformation.pre_stretched(self.axial_stretch, self.transverse_stretch)
         if self.length_m is None or self.area_m2 is None:
             return deformation
-        return replace(deformation, area_over_length_m=self.area_m2 / self.length_m)
+        return replace(
+            deformation,
+            area_over_length_m=self.area_m2 / self.length_m,
+            shape_factor=shape_factor(self.length_m, self.area_m2),
+        )
 
     @classmethod
     def relaxation(

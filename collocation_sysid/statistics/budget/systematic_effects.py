@@ -37,7 +37,11 @@ from ...program.collocation import ExperimentIterate
 from ...program.reactions.forces import forces_on_dofs, reaction_forces
 from ...recording.deviation import WIDENING, Deviation
 from ...recording.grasp import free_rigid_motions
-from ...recording.homogeneous_deformation import STRESS_PER_FORCE, HomogeneousDeformation
+from ...recording.homogeneous_deformation import (
+    CELL_SIZE_M,
+    STRESS_PER_FORCE,
+    HomogeneousDeformation,
+)
 from ...recording.nuisance import KINDS
 from ...recording.placement import place_markers
 from ...recording.specimen_files import specimen_strains
@@ -78,6 +82,8 @@ MEMORY_SHARE = 0.1
 # that any error of the model needs an impossible one (0.7 to 0.9 in twins without any).
 WIDENING_OF_ANISOTROPY = 4.0
 _AXES = "xyz"
+# Shape factor of a pressed specimen of unknown size: four times as wide as high.
+FLAT_SHAPE_FACTOR = 1.0
 # Poisson's ratio of an incompressible material.
 INCOMPRESSIBLE_POISSON = 0.5
 # Deviation of each component of a vector of length one with an unknown direction.
@@ -661,6 +667,29 @@ def _effective_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return _gauge_length(at, 0) if is_pulled else None
 
 
+def _specimen_sticking(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of platens to which a pressed specimen without a mesh sticks, by the
+    logarithm of the ratio of its stiffness to that between lubricated platens.
+
+    Of a disc with the shape factor S this ratio is 1 + 2 S² if it is incompressible (Gent & Lindley,
+    Proc. Inst. Mech. Eng. 173, 1959). The addition grows with ν², and ends at the ratio of the
+    modulus of confined compression to E.
+    """
+    deformation = at.iterate.transcription.experiment.specimen
+    if deformation is None or deformation.test != "uniaxial":
+        return None
+    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    is_pressed = at.iterate.x[:, 3 * (1 + normal) + direction] < CELL_SIZE_M
+    ((lame_pa, shear_pa),) = at.body.lame(at.theta).values()
+    young_pa, poisson = engineering_constants(lame_pa, shear_pa)
+    flat = 8 * (poisson * (deformation.shape_factor or FLAT_SHAPE_FACTOR)) ** 2
+    confined = (lame_pa + 2 * shear_pa) / young_pa - 1
+    if not is_pressed.any() or not flat:
+        return None
+    stiffer = np.log1p(flat * confined / (flat + confined))
+    return Effect(stiffer * at.internal_n() * is_pressed[:, None])
+
+
 def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of friction on nodes that slide along platens, perpendicular to the loading
     axis, per unit of the coefficient; None for a dynamic experiment and without platens.
@@ -927,8 +956,8 @@ ASSUMPTIONS = (
         considered=0.05,
         description="relative difference of the stiffness along one axis from that across it",
         assumed="the material is equally stiff along all axes",
-        remedy="repeat the recording with the body loaded along another axis, test specimens cut "
-        'along each axis, or state anisotropy = "none" where the material is known to be isotropic',
+        remedy='state how the body was made, such as made = "cast" in [object]; or repeat the recording '
+        "with the body loaded along another axis, or test specimens cut along each axis",
         effect=_anisotropy,
         axes="x y z",
         of_specimens=True,
@@ -1054,6 +1083,19 @@ ASSUMPTIONS = (
         remedy="measure the strain of the narrow part with marks or an extensometer, or state the "
         "effective length, the integral of its smallest area over the area along the specimen",
         effect=_effective_length,
+        of_specimens=True,
+    ),
+    Deviation(
+        "specimen_sticking",
+        "1",
+        is_one_sided=True,  # friction does not make a specimen softer
+        considered=1.0,
+        description="sticking to the platens of a specimen without a mesh that is pressed, as a fraction "
+        "of that without any slip",
+        remedy="state length_m and area_m2 of the specimen; if its platens are lubricated, state "
+        'specimen_sticking = "none" in [uncertainty.assumptions]; if its faces stick, use a test bench '
+        "with a mesh",
+        effect=_specimen_sticking,
         of_specimens=True,
     ),
     Deviation(
