@@ -180,9 +180,8 @@ class Penalty(PenaltyOptions):
 
     Attributes
     ----------
-    schedule : {"geometric", "progress", "constant"}
-        How ρ increases from `rho` to `rho_max`: by `rho_factor` after every stage, only after
-        stages that left more than a quarter of the violation, or not at all.
+    schedule : {"geometric", "constant"}
+        How ρ increases from `rho` to `rho_max`: by `rho_factor` after every stage, or not at all.
     """
 
     name: ClassVar[str] = "penalty"
@@ -191,7 +190,7 @@ class Penalty(PenaltyOptions):
     rho: Positive = 1e2
     rho_max: Positive = 1e8
     violation: Positive = 1e-3
-    schedule: Literal["geometric", "progress", "constant"] = "geometric"
+    schedule: Literal["geometric", "constant"] = "geometric"
 
     @property
     def last_rho(self) -> float:
@@ -199,24 +198,17 @@ class Penalty(PenaltyOptions):
         return self.rho if self.schedule == "constant" else self.rho_max
 
     def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
-        """Return the next stage, with a larger ρ if an increase is due by the schedule, or the
-        stage reached its minimum; see `PenaltyOptions.next_stage` for the arguments.
-
-        ρ increases by `rho_factor`, up to `last_rho`. If neither holds, ρ is that of the stage.
-        The multipliers stay zero.
+        """Return the next stage, with ρ larger by `rho_factor`, up to `last_rho`; see
+        `PenaltyOptions.next_stage` for the arguments. The multipliers stay zero.
 
         Raises
         ------
         SearchEnded
-            If an increase is due by the schedule, but ρ is at its limit: with the status `STALLED`
-            if the stage reached its minimum, else with `ITERATION_LIMIT`.
+            If ρ is at its limit: with the status `STALLED` if the stage reached its minimum, else
+            with `ITERATION_LIMIT`.
         """
         rho = stage.merit.rho
-        is_increase_due = (
-            self.schedule != "progress"
-            or stage.violation.relative > FALL * previous_violation.relative
-        )
-        if is_increase_due and rho >= self.last_rho:
+        if rho >= self.last_rho:
             if stage.is_minimum:
                 message = (
                     "The merit function is at its minimum, but the equations of motion "
@@ -229,8 +221,7 @@ class Penalty(PenaltyOptions):
                 f"the tolerance {stage.tolerance:.2g}. Raise inner_iterations or choose another inner "
                 "solver.",
             )
-        if is_increase_due or stage.is_minimum:
-            rho = min(self.rho_factor * rho, self.last_rho)
+        rho = min(self.rho_factor * rho, self.last_rho)
         return Stage(replace(stage.merit, rho=rho), self.tolerance)
 
 
