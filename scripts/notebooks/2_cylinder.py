@@ -235,6 +235,7 @@ print(f"{rows} × {columns}, {100 * jacobian.nnz / rows / columns:.2f} % nonzero
 # %%
 rollout = run.rollouts["swing"]
 assert not isinstance(rollout, str), rollout
+assert rollout.rms_m
 noise_mm = 1e3 * np.sqrt(3) * 0.0005
 print(f"fit                   {1e3 * solution.rms_m:.3f} mm RMS")
 print(f"forward simulation    {1e3 * rollout.rms_m:.3f} mm RMS")
