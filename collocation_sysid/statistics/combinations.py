@@ -22,7 +22,7 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..common.display import short
-from ..fem.laws.constants import symbol_of, unit_of
+from ..fem.laws.constants import is_density, is_modulus, symbol_of, unit_of
 from .budget.combined_intervals import NORMAL_95
 
 Form = Literal["sum", "product", "unstated"]
@@ -247,8 +247,8 @@ def find_combinations(
     undetermined: Collection[str],
     moduli: Mapping[str, Array] | None = None,
 ) -> tuple[Combination, ...]:
-    """Return the combinations that are determined although one of their constants alone is not,
-    the best determined in units of its constants first.
+    """Return the combinations of moduli and densities that are determined although one of their
+    constants alone is not, the best determined in units of its constants first.
 
     Parameters
     ----------
@@ -272,13 +272,15 @@ def find_combinations(
             break
         inside = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
         members = known[inside]
-        if len(members) < 2 or not {names[k] for k in members.tolist()} & set(undetermined):
+        own = [names[k] for k in members.tolist()]
+        if len(own) < 2 or not set(own) & set(undetermined):
             continue
+        if not all(is_modulus(name) or is_density(name) for name in own):
+            continue  # of no use to an engineer
         within = covariance[np.ix_(members, members)]
         variances, vectors = _eigenpairs(scaled[np.ix_(inside, inside)])
         if variances[0] > LARGEST_SHARE:
             continue  # the constants left out belong to it
-        own = [names[int(k)] for k in members]
         weights = vectors[0] / deviations[members]
         best = Direction.from_weights(own, values[members], weights, within, smallest=0.0)
         loosest = Direction.from_weights(own, values[members], _eigenpairs(within)[1][-1], within)
@@ -403,6 +405,8 @@ def _equal_modulus(
     """Return the derived modulus of these constants alone that is about as precise."""
     others = np.setdiff1d(np.arange(len(covariance)), members)
     for name, slope in moduli.items():
+        if not is_modulus(name):
+            continue
         size = np.abs(slope[members]).max(initial=0.0)
         if not size or np.abs(slope[others]).max(initial=0.0) > SMALLEST_POWER * size:
             continue

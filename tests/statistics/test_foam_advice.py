@@ -42,3 +42,19 @@ def test_rubbers_are_compared_with_laws_of_rubbers(power):
 )
 def test_a_law_of_several_terms_is_compared_with_one_of_more_terms(law, richer):
     assert richer in advised(law)
+
+
+@pytest.mark.parametrize(("largest", "is_advised"), [(0.04, False), (0.4, True)])
+def test_laws_are_compared_where_they_can_differ(largest, is_advised):
+    strain = np.linspace(0.004, largest, 7)
+    pulled = cs.Specimen("uniaxial", strain, 1e4 * strain, 10.0).experiment(name="pull")
+    concerns = [
+        Concern("noise/larger", data={"factor": 4.8, "stated": "sigma_m"}),
+        Concern(
+            "noise/sensor",
+            data={"marker": "pull/stress", "factor": 4.8, "stated": "sigma_pa", "count": 1},
+        ),
+    ]
+    for each in as_specimen_concerns(concerns, [pulled]):
+        assert "sigma_pa" in each.message
+        assert ("compare laws" in each.message) is is_advised

@@ -114,10 +114,9 @@ def test_confounded_parameters_have_one_note():
 
 
 def test_combinations_are_stated_after_single_parameters():
-    of = parameters(ENGINEERING)
-    found = uncertainty(spread([0.15, 0.15, 0.02, 0.02], {(0, 1): -0.99}), of)
-    values = np.array([of.guesses[name] for name in found.names])
-    (each,) = find_combinations(found.names, values, found.complete_covariance, ("poisson",))
+    found = uncertainty(spread([0.15, 0.15, 0.02, 0.02], {(0, 1): -0.99}))
+    values = np.array([found.estimates[name].value for name in found.names])
+    (each,) = find_combinations(found.names, values, found.complete_covariance, ("mu_pa",))
     sentences = identifiability_sentences(found, (each,))
     assert sentences[1] == each.statement()
     assert any("other elastic constants" in sentence for sentence in sentences[2:])

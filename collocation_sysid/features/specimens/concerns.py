@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
+from ...fem.laws.damping_admissibility import STRAIN
 from ...recording.experiment import Experiment
 from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic
 from ...recording.specimen_files import moduli_of, specimen_strains
@@ -45,7 +46,8 @@ def as_specimen_concerns(
 
     The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
     too simple is the most frequent cause of the others, unless one sample makes nearly all of them;
-    in its place "specimen/branches" about tables of moduli, at whose small strain all laws are linear.
+    in its place "specimen/branches" about tables of moduli, at whose small strain all laws are linear,
+    and "noise/larger" where laws hardly differ, at strains below `STRAIN`.
 
     Parameters
     ----------
@@ -66,6 +68,9 @@ def as_specimen_concerns(
         codes["noise/larger"] = "specimen/branches"
         data["branches"] = max(len(p.prony) for each in experiments for p in each.body.parts)
         data["remedy"] = "add branches of the memory, [[object.prony]]"
+    elif all(np.abs(strain).max() < STRAIN for strain in strains):
+        codes["noise/larger"] = "noise/larger"
+        data["remedy"] = "measure the area and unloaded length"
     replaced = [
         replace(
             concern,
