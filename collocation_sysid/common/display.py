@@ -34,6 +34,8 @@ NUMBER_AT_START = re.compile(r"^(\d{1,9})(?=[.)](?:\s|$))")
 BACKTICKS = re.compile(r"`+")
 # Width of plain text [characters]: wide enough that no line is wrapped.
 WIDE = 200
+# Relative change of an estimate that is too large to be predicted to first order.
+LARGEST_CHANGE = 0.5
 # Tables with more columns than this break their headings into two lines.
 MANY = 5
 # Cells with longer texts [characters] get a wider column in HTML.
@@ -215,6 +217,13 @@ def number(value: float | None, digits: int = 5) -> str:
     if value is None or not isfinite(value):
         return "–"
     return f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e")
+
+
+def predicted_change(change: float, text: str) -> str:
+    """Return the text of a relative change that is predicted to first order, but "more than half"
+    beyond `LARGEST_CHANGE`.
+    """
+    return text if abs(change) <= LARGEST_CHANGE else "more than half"
 
 
 def millimetres(metres: float | None) -> str:

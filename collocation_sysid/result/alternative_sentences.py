@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from ..common.display import LARGEST_CHANGE, predicted_change
 from ..errors import listed
 from ..fem.laws.constants import is_modulus, symbol_of, unit_of
 from ..runs.result_content import Result
@@ -21,16 +22,20 @@ def alternative_sentences(result: Result) -> Iterator[str]:
         if defined:
             values = [
                 f"{symbol_of(name)} about {each.values[name]:.3g} {unit_of(name)}".strip()
+                if abs(each.values[name] - known[name].value)
+                <= LARGEST_CHANGE * abs(known[name].value)
+                else f"{symbol_of(name)} different by more than half"
                 for name in defined
             ]
             yield f"{each.condition}: {listed(values)}"
         elif (name := _shown_modulus(each.values)) is not None and known[name].value:
             change = each.values[name] / known[name].value - 1
             if each.assumption == "rest_shape":
-                by = f"{abs(change):.0%} (object.rest_shape is not stated)"
+                size, end = f"{abs(change):.0%}", " (object.rest_shape is not stated)"
             else:
-                by = f"{change:+.0%}; {remedy_for(each.assumption)}"
-            yield f"{each.condition}, {symbol_of(name)} would change by about {by}"
+                size, end = f"{change:+.0%}", f"; {remedy_for(each.assumption)}"
+            by = predicted_change(change, f"about {size}")
+            yield f"{each.condition}, {symbol_of(name)} would change by {by}{end}"
 
 
 def origin_sentences(result: Result) -> Iterator[str]:

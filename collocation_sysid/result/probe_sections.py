@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..common.display import Table, TitledParts, short
+from ..common.display import Table, TitledParts, predicted_change, short
 from ..errors import listed
 from ..fem.laws.constants import symbol_of
 from ..runs.result_content import Result
@@ -157,7 +157,10 @@ def _change_with_ratios(move: EstimateChange | None, value: float) -> str:
 
 
 def _change_text(move: EstimateChange, value: float) -> str:
-    return f"{100 * move.change / abs(value):+.2f} %" if value else f"{move.change:+.2g}"
+    if not value:
+        return f"{move.change:+.2g}"
+    change = move.change / abs(value)
+    return predicted_change(change, f"{100 * change:+.2f} %")
 
 
 def _conclusions(result: Result) -> Iterator[str]:

@@ -24,6 +24,7 @@ from ..common.display import (
     flattened_parts,
     millimetres,
     number,
+    predicted_change,
     readable_stress,
     rounded,
     two_digits,
@@ -195,7 +196,7 @@ def parameter_section(result: Result) -> TitledParts:
     if "mesh" in result.discretisation_kinds:
         parts.append(refinement_table(result))
     elif corrected := [
-        f"{symbol_of(name)} {100 * (error.extrapolated / optimum - 1):+.2g} %"
+        f"{symbol_of(name)} {_percent(error.extrapolated / optimum - 1)}"
         for name, error in result.numerical_errors.items()
         if (optimum := values[name].optimum)
         and values[name].statistical95 is not None
@@ -203,7 +204,7 @@ def parameter_section(result: Result) -> TitledParts:
     ]:
         parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
     if estimated := [
-        f"{symbol_of(name)} {-100 * error.estimated_mesh / abs(optimum):+.2g} %"
+        f"{symbol_of(name)} {_percent(-error.estimated_mesh / abs(optimum))}"
         for name, error in result.numerical_errors.items()
         if error.estimated_mesh is not None and (optimum := values[name].optimum)
     ]:
@@ -212,7 +213,7 @@ def parameter_section(result: Result) -> TitledParts:
             f"contain: {', '.join(estimated)}"
         )
     if known := [
-        f"{symbol_of(name)} {100 * each.known_correction / each.value:+.2g} %"
+        f"{symbol_of(name)} {_percent(each.known_correction / each.value)}"
         for name, each in values.items()
         if each.known_correction and each.value
     ]:
@@ -223,6 +224,10 @@ def parameter_section(result: Result) -> TitledParts:
     parts += _largest_contributions(result)
     parts += origin_sentences(result)
     return TitledParts("Parameters", (*parts, *result.basis))
+
+
+def _percent(change: float) -> str:
+    return predicted_change(change, f"{100 * change:+.2g} %")
 
 
 def stated_as_undetermined(result: Result) -> set[str]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from ..common.display import LARGEST_CHANGE
 from ..errors import InputError, SimulationError
 from ..fem.body import Body
 from ..fem.laws.constants import YOUNG, without_region
@@ -28,8 +29,6 @@ from .check.body import LINEAR, bending_concerns, slenderness
 MESH = "mesh"
 # Code of the concern about a large estimated error of the mesh.
 MESH_ERROR = "mesh/error"
-# Relative change of an elastic constant on a finer mesh that is too large for an estimate.
-LARGEST_CHANGE = 0.5
 # Largest change of a logarithm: a larger one is no estimate.
 LARGEST_STEP = 2.0
 # Moduli of which a larger change shows that the estimate to first order does not hold.
@@ -77,7 +76,7 @@ def estimate_mesh_error(
     before = parameter_values(collocation, solution.q)
     modulus = next(_modulus_beyond_first_order(before, values), "")
     if modulus:
-        reason = f"to first order, {modulus} would change to {values[modulus]:.2g} Pa"
+        reason = f"to first order, {modulus} would change by more than half"
         return known, _unknown_note(reason)
     linear = collocation.parameters.linear_names
     is_linear = np.array([item.name in linear for item in collocation.parameters.free], dtype=bool)

@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.display import short
+from ..common.display import LARGEST_CHANGE, predicted_change, short
 from ..errors import listed
 from ..fem.laws.constants import symbol_of, unit_of
 from ..model.parameters import Parameters, is_default_bound
@@ -350,8 +350,10 @@ def numerical_concerns(
         return []
     value = optimum[worst].value
     percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
+    change = predicted_change(percent / 100, f"{percent:+.2g} %")
     code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
-    return [Concern(code, data={"name": worst, "percent": percent, "errors": largest})]
+    data = {"name": worst, "percent": percent, "change": change, "errors": largest}
+    return [Concern(code, data=data)]
 
 
 def probe_concerns(
@@ -419,6 +421,8 @@ def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
     if move is None:
         return f"{symbol_of(name)} not determined"
     value = correction * move.value
+    if abs(move.change) > LARGEST_CHANGE * abs(move.value - move.change):
+        return f"{symbol_of(name)} different by more than half"
     return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
 
 

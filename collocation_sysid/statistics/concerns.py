@@ -390,7 +390,7 @@ TOPICS: dict[str, Topic] = {
         "command refine RUN measures the remaining error.",
         messages={
             "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
-            "corrected by {percent:+.2g} %, {errors:.2g} standard uncertainties; raise "
+            "corrected by {change}, {errors:.2g} standard uncertainties; raise "
             "transcription.substeps, or run refine to measure the error",
             "damping": "the time-stepping scheme adds a damping ratio of {added:.2g} to the "
             "{damping:.2g} of the first mode of '{experiment}': raise transcription.substeps, or "
@@ -440,10 +440,10 @@ TOPICS: dict[str, Topic] = {
         'damping_law = "none" in [uncertainty.assumptions].',
         messages={
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
-            "{percent:+.2g} %, {errors:.2g} standard uncertainties; use smaller steps "
+            "{change}, {errors:.2g} standard uncertainties; use smaller steps "
             "(transcription.substeps) or a finer mesh",
             "error": "the mesh is too coarse: on one with half the edge lengths {name} would change "
-            "by about {percent:+.2g} %, too much for an estimate to first order; refine the mesh",
+            "by more than half, too much for an estimate to first order; refine the mesh",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",

@@ -191,6 +191,8 @@ def test_more_error_of_the_step_than_noise_is_to_be_checked(answer):
     (found,) = concerns(97.77)
     assert (found.code, found.grade) == ("scheme/step", "check")
     assert "corrected by -3 %, 3 standard uncertainties" in found.message
+    (large,) = concerns(40.0)
+    assert "corrected by more than half, " in large.message
 
 
 def test_other_numbers_of_levels_are_refused(answer):

@@ -11,12 +11,19 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.features.specimens.concerns import as_specimen_concerns
+from collocation_sysid.result.alternative_sentences import alternative_sentences
 from collocation_sysid.result.probe_sections import _conclusions, is_another_effect
 from collocation_sysid.runs.check.body import bending_concerns
-from collocation_sysid.statistics.assessment import Assessment, _noisy_marker_concerns
+from collocation_sysid.statistics.assessment import (
+    Assessment,
+    _noisy_marker_concerns,
+    _relaxed_estimate,
+)
+from collocation_sysid.statistics.budget.alternatives import Alternative
 from collocation_sysid.statistics.concerns import Concern
 from collocation_sysid.statistics.estimates import derived_estimates
 from collocation_sysid.statistics.linearised import DerivedModuli
+from collocation_sysid.statistics.probes.relaxed_assumptions import EstimateChange
 from collocation_sysid.statistics.residuals.diagnostics import Outlier
 
 CHECK = Assessment((Concern("noise/larger"),))
@@ -177,3 +184,44 @@ def test_noisy_residuals_of_a_force_are_not_those_of_a_marker():
     assert "swing/force are 8.4 times sigma_n: check sigma_n" in concern.message
     for word in ("label", "reference_m", "sigma_m"):
         assert word not in concern.message
+
+
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.3, "E +30.00 % and ν +12.00 %"), (-30.21, "E more than half and ν")]
+)
+def test_a_change_beyond_first_order_has_no_number(share, said):
+    moves = {
+        "young_pa": EstimateChange(1e4 * (1 + share), 1.0, 1e4 * share, 2.0, 1.0),
+        "poisson": EstimateChange(0.28, 0.01, 0.03, 2.0, 1.0),
+    }
+    probe: Any = SimpleNamespace(
+        name="clock_rate",
+        kind="assumption",
+        sentences=("clock_rate",),
+        chi_squared=30.0,
+        size=0.1,
+        size_error=0.01,
+        moves=moves,
+    )
+    values = {"young_pa": 1e4, "poisson": 0.25}
+    estimates = {
+        name: SimpleNamespace(value=value, statistical95=(0.9 * value, 1.1 * value))
+        for name, value in values.items()
+    }
+    result: Any = SimpleNamespace(
+        probes=[probe], estimates=estimates, parameters=values, budget={}, trust=CHECK
+    )
+    assert f"the estimates change by {said}" in next(_conclusions(result))
+    told = _relaxed_estimate(probe, "young_pa", 1.0)
+    assert (told == "E different by more than half") is (abs(share) > 0.5)
+    other = Alternative("mass", "with another mass", {"young_pa": 1e4 * (1 + share)})
+    law = Alternative("damping_law", "with another law", {"gamma_r_s": 1e-3 * (1 + share)})
+    estimates["gamma_r_s"] = SimpleNamespace(value=1e-3)
+    result.alternatives = (other, law)
+    change, value = alternative_sentences(result)
+    if abs(share) > 0.5:
+        assert change.startswith("with another mass, E would change by more than half; ")
+        assert value == "with another law: γ_r different by more than half"
+    else:
+        assert change.startswith("with another mass, E would change by about +30%; ")
+        assert value == "with another law: γ_r about 0.0013 s"
