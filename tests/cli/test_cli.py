@@ -121,7 +121,7 @@ ESTIMATE_KEYS = {
 
 
 def test_the_result_has_every_promised_key(solved):
-    assert solved.result["schema"] == 5
+    assert solved.result["schema"] == 6
     assert solved.result["status"] == "converged"
     for key, inner in RESULT_KEYS.items():
         assert key in solved.result

@@ -56,7 +56,7 @@ def test_assumptions_have_a_field_for_each_row():
 
 BY_ORIGIN = {row.name for row in ASSUMPTIONS if row.by_origin}
 REPORTED = {"platen_stick", "section"}  # by default only as an alternative, outside the intervals
-ONE_SIDED = {"grip_layer_m", "machine_compliance_m_n", "marker_mass_kg"}
+ONE_SIDED = {"grip_layer_m", "machine_compliance_m_n", "marker_mass_kg", "specimen_sticking"}
 
 
 def test_defaults_by_origin_name_ways_of_making_a_body_or_origins_of_its_mesh():

@@ -146,7 +146,7 @@ def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
     solution = solve(Problem([described], GUESS, substeps=1), "reduced-space")
     (experiment,) = (each.experiment for each in solution.collocation.transcriptions)
     changed = with_body(experiment, with_laws(experiment.body, None, DAMPINGS["rayleigh"]))
-    refits = _Refitter(solution, experiment, sweeps=20)
+    refits = _Refitter(solution, experiment)
     refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
     refits.near_answer.add(changed)
     assert refits.fit(changed) is not None
