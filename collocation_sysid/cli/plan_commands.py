@@ -53,11 +53,19 @@ def plan(
 
     The motion begins at rest, ends at rest without residual vibration, and respects the limits. The
     output folder contains poses.csv for the robot, the predicted points, pictures, a film and
-    plan.json. Ctrl-C stops the search and keeps the best plan so far; the exit code is then 130
-    (143 after SIGTERM).
+    plan.json. Ctrl-C stops the search, or the pictures, and keeps the best plan so far; the exit code
+    is then 130 (143 after SIGTERM). It is 1 if the search did not converge, or the plan misses what
+    is wanted.
     """
     from ..extras.planning import Task, plan_motion
-    from ..extras.planning.folder import PLAN_FILE, plan_json, plan_summary, write_plan
+    from ..extras.planning.folder import (
+        FILM_FILE,
+        PLAN_FILE,
+        REPORT_FILE,
+        plan_json,
+        plan_summary,
+        write_plan,
+    )
     from ..extras.planning.trajectory_log import require_trajectory_packages
 
     if rate is not None and not 0 < rate < float("inf"):
@@ -102,6 +110,11 @@ def plan(
             answer, folder, rate_hz=rate, with_film=film, with_mcap=mcap, say=progress.announce
         )
     output.print_result(plan_json(answer), plan_summary(answer, folder))
+    wanted = (REPORT_FILE, FILM_FILE) if film else (REPORT_FILE,)
+    if missing := [name for name in wanted if not (folder / name).is_file()]:
+        raise interruption_exit(
+            f"the plan is kept in {folder}, without {' and '.join(missing)}", continues=False
+        )
     if answer.interrupted:
         raise typer.Exit(EXIT_INTERRUPTED)
     exceeds = answer.exceeds_error or answer.exceeds_width or answer.exceeds_body_limits

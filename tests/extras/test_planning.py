@@ -22,6 +22,7 @@ from scipy.stats import norm
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.planning import durations, motion_plan, reduced_solver
+from collocation_sysid.extras.planning import folder as planning_folder
 from collocation_sysid.extras.planning.folder import (
     command_times_s,
     plan_json,
@@ -1812,6 +1813,57 @@ def test_an_interrupt_before_a_plan_is_simulated_writes_nothing(tmp_path, monkey
     assert outcome.code == 130
     assert "interrupted: nothing was written to" in outcome.err
     assert not (tmp_path / "plan").exists()
+
+
+def write_task(folder: Path, text: str) -> list[object]:
+    """Write a problem, a task and limits; return the words of the command that plans it."""
+    problem = write_problem(folder, {"swing": 10})
+    (folder / "task.toml").write_text(text)
+    (folder / "limits.toml").write_text(LIMITS_TEXT)
+    return ["plan", problem, folder / "task.toml", "--limits", folder / "limits.toml",
+            "--out", folder / "plan"]  # fmt: skip
+
+
+def test_a_reference_beyond_the_limits_of_the_hand_is_missed(tmp_path: Path):
+    """The hand stays within 0.3 m."""
+    words = write_task(tmp_path, GOOD.replace("[0.02, 0.0, nan]", "[0.75, 0.0, nan]"))
+    outcome = run_command(*words, "--no-film")
+    assert outcome.code == 1, outcome.err
+    assert "next: execute" not in outcome.out
+    content = json.loads((tmp_path / "plan" / "plan.json").read_text())
+    (found,) = content["references"]
+    assert found["largest_m"] == pytest.approx(0.45, abs=0.05)
+    assert found["accepted_m"] == pytest.approx(0.375)
+    (line,) = [each for each in outcome.out.splitlines() if "misses its reference" in each]
+    assert f"low misses its reference by {1e3 * found['largest_m']:.3g} mm" in line
+    assert "limited by workspace_m" in line
+    assert (tmp_path / "plan" / "poses.csv").is_file()
+
+
+def test_a_plan_that_misses_its_band_exceeds_the_error():
+    """The largest error of 1.15 mm is inside a band of 1.3 mm, and outside of one of 0.26 mm."""
+    inside, outside = (known_plan(factor * np.array([0.1, 0.05, 0.5, 0.5])) for factor in (1, 0.2))
+    for plan in (inside, outside):
+        error = plan.tracking_error(plan.program.references[0])
+        assert error.accepted_m == error.band_m
+    assert not inside.exceeds_error
+    assert outside.exceeds_error
+    assert any("tip misses its reference by 1.15 mm" in str(line) for line in plan_summary(outside))
+
+
+@pytest.mark.parametrize("interrupted", ["save_pictures", "film"])
+def test_an_interrupt_of_pictures_keeps_the_plan(tmp_path, monkeypatch, interrupted):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(planning_folder, interrupted, interrupt)
+    outcome = run_command(*write_task(tmp_path, GOOD))
+    assert outcome.code == 130
+    assert "interrupted: the plan is kept in" in outcome.err
+    for name in ("plan.json", "poses.csv", "check.toml", "predicted_markers.csv"):
+        assert (tmp_path / "plan" / name).stat().st_size
+    assert (tmp_path / "plan" / "report.html").is_file() == (interrupted == "film")
+    assert not (tmp_path / "plan" / "motion.gif").exists()
 
 
 @pytest.mark.long

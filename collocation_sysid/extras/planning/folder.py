@@ -13,6 +13,8 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.display import Line, Picture, Shown, Table, TitledParts
 from ...common.serialisation import as_json
+from ...common.signal_handling import INTERRUPTS
+from ...errors import listed
 from ...fem.laws.constants import symbol_of
 from ...recording import write_markers_csv, write_poses_csv
 from ...recording.writers import write_columns_csv
@@ -58,7 +60,8 @@ def write_plan(
     with_mcap: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Write the folder of a plan atomically, and return its path.
+    """Write the folder of a plan atomically, and return its path; Ctrl-C leaves out the remaining
+    pictures, the report and the film.
 
     It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
     acceleration), command_<name>.csv of each planned tendon and pressure, predicted_points.csv,
@@ -86,35 +89,50 @@ def write_plan(
     """
     target = Path(folder)
     with replaced_folder(target, marker_file=PLAN_FILE, content_word="plan") as place:
-        t_s = command_times_s(plan, rate_hz)
-        write_poses_csv(place / POSES_FILE, plan.poses(t_s))
-        write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
-        write_commands(plan, place, t_s)
-        for name, content in execution_problems(plan, place, target.resolve()).items():
-            (place / name).write_text(problem_text(name, content), encoding="utf-8")
-        if with_mcap:
-            write_trajectory_mcap(plan, place / TRAJECTORY_FILE, t_s)
-        if plan.points_m:
-            write_markers_csv(
-                place / PREDICTION_FILE,
-                plan.t_s,
-                names=[*plan.points_m],
-                positions_m=np.stack([*plan.points_m.values()], axis=1),
-            )
-        figures = plan_figures(plan)
-        save_pictures(place, figures)
-        pictures = (Picture(place / f"{name}.png", CAPTIONS[name]) for name in figures)
-        title = f"Plan for {plan.program.body.template.name!r}"
-        report = TitledParts(title, (*plan_summary(plan), *pictures), level=1)
-        (place / REPORT_FILE).write_text(report_html(report), encoding="utf-8")
-        if with_film:
-            say("rendering the film of the motion")
-            replay = MotionRecord.from_experiment(
-                plan.fine.experiment, (plan.fine.positions_m, _references_m(plan))
-            )
-            film(replay, place / FILM_FILE, fps=FRAMES_PER_SECOND, names=("predicted", "wanted"))
-        (place / PLAN_FILE).write_text(as_json(plan_json(plan)), encoding="utf-8")
+        try:
+            with INTERRUPTS.deferred():
+                _write_results(plan, place, target, rate_hz=rate_hz, with_mcap=with_mcap)
+            figures = plan_figures(plan)
+            save_pictures(place, figures)
+            pictures = (Picture(place / f"{name}.png", CAPTIONS[name]) for name in figures)
+            title = f"Plan for {plan.program.body.template.name!r}"
+            report = TitledParts(title, (*plan_summary(plan), *pictures), level=1)
+            (place / REPORT_FILE).write_text(report_html(report), encoding="utf-8")
+            if with_film:
+                say("rendering the film of the motion (Ctrl-C keeps the plan)")
+                replay = MotionRecord.from_experiment(
+                    plan.fine.experiment, (plan.fine.positions_m, _references_m(plan))
+                )
+                film(
+                    replay, place / FILM_FILE, fps=FRAMES_PER_SECOND, names=("predicted", "wanted")
+                )
+        except KeyboardInterrupt:
+            if not (place / PLAN_FILE).is_file():  # the second one
+                raise
+            (place / FILM_FILE).unlink(missing_ok=True)
     return target
+
+
+def _write_results(
+    plan: MotionPlan, place: Path, target: Path, *, rate_hz: float | None, with_mcap: bool
+) -> None:
+    """Write what a plan is without its pictures; plan.json at the end."""
+    t_s = command_times_s(plan, rate_hz)
+    write_poses_csv(place / POSES_FILE, plan.poses(t_s))
+    write_columns_csv(place / HAND_FILE, hand_columns(plan, t_s))
+    write_commands(plan, place, t_s)
+    for name, content in execution_problems(plan, place, target.resolve()).items():
+        (place / name).write_text(problem_text(name, content), encoding="utf-8")
+    if with_mcap:
+        write_trajectory_mcap(plan, place / TRAJECTORY_FILE, t_s)
+    if plan.points_m:
+        write_markers_csv(
+            place / PREDICTION_FILE,
+            plan.t_s,
+            names=[*plan.points_m],
+            positions_m=np.stack([*plan.points_m.values()], axis=1),
+        )
+    (place / PLAN_FILE).write_text(as_json(plan_json(plan)), encoding="utf-8")
 
 
 def command_times_s(plan: MotionPlan, rate_hz: float | None = None) -> Array:
@@ -219,6 +237,30 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
     }
 
 
+def _missed_lines(plan: MotionPlan) -> list[Shown]:
+    """Return by how much a plan misses what is accepted, and what limits it."""
+    enough_s = plan.sufficient_duration_s
+    longer = (
+        ""
+        if enough_s is None
+        else f"duration_s = {enough_s:.3g} with the times of references in proportion, or "
+    )
+    limits = listed([each.name for each in plan.binding_limits if each.gain_per_percent > 0])
+    cause = f"limited by {limits}" if limits else "no limit of the hand binds"
+    if plan.program.task.largest_error_m is not None:
+        missed = [
+            f"the largest error is {1e3 * plan.largest_error_m:.3g} mm, more than largest_error_m"
+        ]
+    else:
+        missed = [
+            f"{each.name} misses its reference by {1e3 * error.largest_m:.3g} mm, more than "
+            f"{1e3 * error.accepted_m:.3g} mm: half of its way, or its band"
+            for each in plan.program.references
+            if (error := plan.tracking_error(each)).largest_m > error.accepted_m
+        ]
+    return [Line(f"{each}; {cause}; expected {longer}wider limits", "check") for each in missed]
+
+
 def _limit_lines(plan: MotionPlan) -> list[Shown]:
     """Return the lines about limits, and about an error that is larger than accepted."""
     lines: list[Shown] = []
@@ -231,19 +273,7 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
             f"(limits {each.lowest:.4g} to {each.highest:.4g} {each.unit})"
         )
     if plan.exceeds_error:
-        enough_s = plan.sufficient_duration_s
-        longer = (
-            ""
-            if enough_s is None
-            else f"duration_s = {enough_s:.3g} with the times of references in proportion, or "
-        )
-        lines.append(
-            Line(
-                f"the largest error is {1e3 * plan.largest_error_m:.3g} mm, more than "
-                f"largest_error_m; expected {longer}wider limits",
-                "check",
-            )
-        )
+        lines += _missed_lines(plan)
     units = {
         "largest_stretch": ("largest stretch", 1.0, ""),
         "clearance_m": ("clearance", 1e3, " mm"),
@@ -356,8 +386,9 @@ def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
     shown += _limit_lines(plan)
     if folder is None:
         return shown
-    shown.append(f"written to {folder}; the page is {REPORT_FILE}")
-    if (folder / CHECK_FILE).is_file():
+    page = f"; the page is {REPORT_FILE}" if (folder / REPORT_FILE).is_file() else ""
+    shown.append(f"written to {folder}{page}")
+    if (folder / CHECK_FILE).is_file() and not plan.exceeds_error:
         shown.append(
             "next: execute the plan, replace poses.csv and predicted_markers.csv with the recorded "
             f"files, and run collocation-sysid solve {folder / CHECK_FILE}"

@@ -70,6 +70,10 @@ class TrackingError:
     # Root mean square and largest distance from the reference [m]; NaN if only velocities count.
     rms_m: float
     largest_m: float
+    # Largest distance with which the point follows its reference [m]: what the task states, or else
+    # half of the way of the point (of the hand, if the point is held), and not more than the band,
+    # but at least `Reference.sigma_m`; NaN if only velocities count.
+    accepted_m: float
     # Largest half width of the 95 % band of a coordinate [m], see `MotionPlan.half_widths_m`; None
     # if that is not known.
     band_m: float | None
@@ -383,18 +387,26 @@ class MotionPlan:
         """Return the predicted deviation of a point from its reference."""
         counted = np.isfinite(reference.position_m)
         if not counted.any():
-            return TrackingError(np.nan, np.nan, None, None)
-        deviation = np.where(counted, self.points_m[reference.name] - reference.position_m, 0.0)
+            return TrackingError(np.nan, np.nan, np.nan, None, None)
+        found = self.points_m[reference.name]
+        deviation = np.where(counted, found - reference.position_m, 0.0)
         at = counted.any(axis=1)
         distance = np.linalg.norm(deviation[at], axis=1)
-        rms = float(np.sqrt(np.mean(distance**2)))
+        rms, largest = float(np.sqrt(np.mean(distance**2))), float(distance.max())
+        way_m = _farthest(np.where(counted, reference.position_m - found[0], 0.0))
+        if way_m < reference.sigma_m:
+            way_m = _farthest(self.motion.derivatives(self.t_s).value[:, :3])
+        half_m = max(way_m / 2, reference.sigma_m)
+        stated_m = self.program.task.largest_error_m
         if self.std_m is None:
-            return TrackingError(rms, float(distance.max()), None, None)
+            return TrackingError(rms, largest, stated_m or half_m, None, None)
         std = np.where(counted, self.std_m[reference.name], 0.0)[at]
+        band_m = self.band_factor * float(std.max())
         return TrackingError(
             rms,
-            float(distance.max()),
-            self.band_factor * float(std.max()),
+            largest,
+            stated_m or min(half_m, max(band_m, reference.sigma_m)),
+            band_m,
             float(np.sqrt(np.mean(distance**2 + np.sum(std**2, axis=1)))),
         )
 
@@ -432,9 +444,14 @@ class MotionPlan:
 
     @property
     def exceeds_error(self) -> bool:
-        """Whether the error is larger than the task accepts."""
+        """Whether the error is larger than the task accepts; if it states nothing, whether a point
+        misses its reference, see `TrackingError.accepted_m`.
+        """
         accepted_m = self.program.task.largest_error_m
-        return accepted_m is not None and self.largest_error_m > accepted_m
+        if accepted_m is not None:
+            return self.largest_error_m > accepted_m
+        errors = map(self.tracking_error, self.program.references)
+        return any(each.largest_m > each.accepted_m for each in errors)
 
     @cached_property
     def largest_error_m(self) -> float:
@@ -606,6 +623,10 @@ def plan_motion(
     seconds = time.perf_counter() - began_s
     say("simulating the plan with fine time steps")
     return MotionPlan(program, answer, _finely_simulated(program, answer.c), seconds, sufficient_s)
+
+
+def _farthest(displacements_m: Array) -> float:
+    return float(np.linalg.norm(displacements_m, axis=1).max())
 
 
 def _finely_simulated(program: PlannedProgram, c: Array) -> Trajectory:
