@@ -149,7 +149,7 @@ def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> It
     }
     name = max(changes, key=lambda each: abs(changes[each]), default="")
     if name and abs(changes[name]) > LARGEST_CHANGE:
-        yield Concern(MESH_ERROR, "check", data={"name": name, "percent": 100 * changes[name]})
+        yield Concern(MESH_ERROR, "check", data={"name": name})
 
 
 def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None) -> list[str]:

@@ -349,10 +349,10 @@ def numerical_concerns(
     if largest <= MOVED:
         return []
     value = optimum[worst].value
-    percent = 100 * (refinement.errors[worst].extrapolated - value) / abs(value)
-    change = predicted_change(percent / 100, f"{percent:+.2g} %")
+    change = (refinement.errors[worst].extrapolated - value) / abs(value)
     code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
-    data = {"name": worst, "percent": percent, "change": change, "errors": largest}
+    text = predicted_change(change, f"{100 * change:+.2g} %")
+    data = {"name": worst, "change": text, "errors": largest}
     return [Concern(code, data=data)]
 
 

@@ -272,7 +272,7 @@ def find_combinations(
             break
         inside = np.flatnonzero(np.abs(vector) > MEMBER * np.abs(vector).max())
         members = known[inside]
-        own = [names[k] for k in members.tolist()]
+        own = [names[int(k)] for k in members]
         if len(own) < 2 or not set(own) & set(undetermined):
             continue
         if not all(is_modulus(name) or is_density(name) for name in own):

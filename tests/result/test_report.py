@@ -193,7 +193,7 @@ def test_concerns_name_their_remedy(run_folder: Path, tmp_path: Path):
     copy = tmp_path / "run"
     shutil.copytree(run_folder, copy)
     whole = Result.read(copy)
-    data = {"name": "mu_pa", "percent": 3.0, "change": "+3 %", "errors": 4.0}
+    data = {"name": "mu_pa", "change": "+3 %", "errors": 4.0}
     concerns = (
         Concern("scheme/step", data=data),
         Concern("information/bound", data=data | {"names": ["mu_pa"]}),
