@@ -190,7 +190,7 @@ def _run_study(
     name = run_name(source.problem)
     folder = study.out or Path("runs") / f"{name}-{kind}"
     require_possible(folder)
-    report = StudyReport(f"{STUDY_TITLES[kind]}: {name}", kind, tuple(planned), {}, yardstick)
+    report = StudyReport(f"{STUDY_TITLES[kind]}: {name}", kind, tuple(planned), yardstick)
     is_complete = True
     try:
         with StudyProgress(error_console, len(planned), quiet=output.quiet) as progress:

@@ -104,7 +104,6 @@ class PropertyCheck:
         *,
         statement: str,
         scale: ArrayLike = 1.0,
-        tolerance: float = DIFFERENCES,
     ) -> None:
         """Compare all columns of a derivative with central differences of the function.
 
@@ -119,8 +118,6 @@ class PropertyCheck:
             What it means if they differ.
         scale : (n,) array or float
             Size of a large change of each entry of `point`.
-        tolerance : float
-            Largest difference, relative to the largest entry of the derivative times its scale.
 
         Raises
         ------
@@ -147,9 +144,9 @@ class PropertyCheck:
         size = derivative_size(found, function(point))
         self.require_equal(
             found,
-            closest(found, differences, tolerance=tolerance * size),
+            closest(found, differences, tolerance=DIFFERENCES * size),
             statement=f"{statement}, by central differences",
-            tolerance=tolerance,
+            tolerance=DIFFERENCES,
             scale=size,
         )
 

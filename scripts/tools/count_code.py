@@ -131,6 +131,7 @@ def count_executed(checkout: Path) -> dict[str, int]:
         command = ["solve", str(problem), "--out", str(Path(folder) / "run"), "--quiet"]
         done = subprocess.run(
             [sys.executable, "-c", EXECUTED, *command],
+            cwd=folder,
             env=os.environ | {"PYTHONPATH": str(checkout)},
             capture_output=True,
             text=True,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import exp
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,9 @@ class StudyReport:
     title: str
     kind: str
     planned: tuple[PlannedRun, ...]
-    records: dict[str, Record]  # dict of str to Record: records of finished runs by label
     yardstick: SuccessCriterion
+    # dict of str to Record: records of finished runs by label
+    records: dict[str, Record] = field(default_factory=dict)
 
     @property
     def rows(self) -> list[Row]:
