@@ -100,7 +100,7 @@ class IntervalCoordinate:
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.is_odds:
-                return float(np.log(value / (0.5 - value)))
+                return float(np.log(np.divide(value, 0.5 - value)))
             return value if self.is_linear else float(np.log(value))
 
     def to_value(self, x: float) -> float:

@@ -29,6 +29,7 @@ from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.estimates import IntervalCoordinate
 from collocation_sysid.statistics.linearised import linearise_fit, observable_responses
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
@@ -386,3 +387,10 @@ def test_an_interval_too_wide_to_be_of_use_has_no_standard_error():
     assert "factor of 10" in (estimate.reason or "")
     assert any(n.startswith("gamma_m_1_s is not identifiable") for n in uncertainty.notes)
     assert uncertainty.estimates["mu_pa"].statistical_std_error is not None
+
+
+def test_the_ends_of_the_domain_of_poissons_ratio_have_infinite_coordinates():
+    at = IntervalCoordinate.for_estimate("poisson", (0.3, 0.5), linear=False)
+    assert at.from_value(0.5) == np.inf
+    assert at.from_value(0.0) == -np.inf
+    assert at.to_value(at.from_value(0.3)) == pytest.approx(0.3)
