@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -101,6 +101,19 @@ class InputError(ValueError):
         those that the error has already are kept.
         """
         return InputError(self.message, self.source or source, where=self.where or where)
+
+
+class ImplausibleMarkersError(InputError):
+    """Tracks that cannot belong to the body of an experiment."""
+
+    def __init__(self, message: str, experiment: Any, constants: Mapping[str, float]) -> None:
+        super().__init__(message, where="markers")
+        # Where the cause is sought, and physical values by name.
+        self.experiment = experiment
+        self.constants = constants
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, None, str]]:
+        return InputError, (self.message, None, "markers")
 
 
 def require_among(

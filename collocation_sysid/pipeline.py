@@ -35,7 +35,6 @@ from .runs.check.cost import require_memory
 from .runs.expected_precision import with_measurements
 from .runs.forward_simulation import simulate_experiments, step_error
 from .runs.mesh_resolution import estimate_mesh_error
-from .runs.misspecifications import cause_notes, find_misspecifications
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
@@ -251,6 +250,8 @@ def run(
             if answer.solution.status is Status.INTERRUPTED:
                 return timed(answer)
             if seek_causes and answer.budgeted is None:
+                from .judge.engine import cause_notes, find_misspecifications
+
                 say("testing possible causes of the misfit")
                 causes = find_misspecifications(answer.solution)
                 tested = cause_notes(answer.solution, causes)

@@ -31,7 +31,7 @@ from typer.main import get_command, get_command_from_info
 
 from ..common.installation import package_version
 from ..common.signal_handling import INTERRUPTS, heed_interrupts, leave
-from ..errors import InputError, SimulationError, hint_at
+from ..errors import ImplausibleMarkersError, InputError, SimulationError, hint_at
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
 FAMILIES = (
@@ -175,7 +175,7 @@ def _run_command() -> None:
     try:
         _root_command()(prog_name="collocation-sysid")
     except InputError as error:
-        _exit_with_error("error", error, code=EXIT_BAD_INPUT)
+        _exit_with_error("error", error, code=EXIT_BAD_INPUT, end=_likely_cause(error))
     except OSError as error:
         where = error.filename or "standard output, or a temporary file"
         _exit_with_error(
@@ -187,8 +187,22 @@ def _run_command() -> None:
         restore()
 
 
-def _exit_with_error(kind: str, error: Exception, code: int) -> NoReturn:
+def _likely_cause(error: BaseException | None) -> str:
+    """Return the likely cause of an `ImplausibleMarkersError`, or of an error that one caused, as an
+    addition to its message; empty if none is known.
+    """
+    while error is not None and not isinstance(error, ImplausibleMarkersError):
+        error = error.__cause__
+    if error is None:
+        return ""
+    from ..judge.modes import find_misspecifications_by_modes
+
+    causes = find_misspecifications_by_modes(error.experiment, error.constants)
+    return f"; likely {causes[0].message}" if causes else ""
+
+
+def _exit_with_error(kind: str, error: Exception, code: int, end: str = "") -> NoReturn:
     error_console.print(
-        Text(f"{kind}: ", style="red").append(str(error), style="default"), soft_wrap=True
+        Text(f"{kind}: ", style="red").append(f"{error}{end}", style="default"), soft_wrap=True
     )
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""Likely errors and concerns of one kind of measurement or force.
+"""Concerns and notes of one kind of measurement or force.
 
 Runs and checks iterate over `features.registry.FEATURES` and call the functions of each `Feature`;
 they name no feature. A function that a feature does not set contributes nothing.
@@ -9,35 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..methods.solution import Solution
-from ..problem import Problem
-from ..program.collocation import Collocation, ExperimentIterate
+from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, Topic
-from ..statistics.misspecification.hypothesis import Hypothesis
 from .measurement_results import PredictionErrors
 
 
 def _nothing(*_: object) -> tuple[()]:
     return ()
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatedCheck:
-    """Simulation at the guess, with which a check compares the description of a problem."""
-
-    problem: Problem  # checked problem
-    collocation: Collocation  # its nonlinear program
-    # Experiments simulated at the guess, perhaps only their first samples.
-    parts: Sequence[ExperimentIterate]
-    causes: Sequence[Hypothesis]  # likely errors that are known already
-    is_full: bool  # whether comparisons are made however long they take
-    # ``fit_s(samples)``, the estimated time [s] to fit the first samples to the markers.
-    fit_s: Callable[[int], float]
-    report_progress: Callable[[str], None]  # called with progress messages
-    # Whether `parts` are simulated; false if a simulation failed, and a body is only moved rigidly
-    # with its grasp.
-    is_simulated: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +31,6 @@ class Feature:
         Messages of its concerns of general topics, by code.
     require_valid : callable
         ``require_valid(experiment)`` raises an `InputError` for data that cannot be fitted.
-    hypotheses : callable
-        ``hypotheses(experiment)``: likely errors in the description, without a simulation.
-    simulated_hypotheses : callable
-        ``simulated_hypotheses(check)``: the same by comparison with a simulation, and notes.
-    fit_hypotheses : callable
-        ``fit_hypotheses(solution)``: the same by the residuals of a fit.
     guess_concerns : callable
         ``guess_concerns(parts, is_complete)``: concerns about the simulation at the guess, of which
         `is_complete` is false if it ends before the recordings.
@@ -72,11 +45,6 @@ class Feature:
     topics: Mapping[str, Topic] = field(default_factory=dict)
     messages: Mapping[str, str] = field(default_factory=dict)
     require_valid: Callable[[Experiment], object] = _nothing
-    hypotheses: Callable[[Experiment], Iterable[Hypothesis]] = _nothing
-    simulated_hypotheses: Callable[[SimulatedCheck], tuple[Sequence[Hypothesis], Sequence[str]]] = (
-        lambda _: ((), ())
-    )
-    fit_hypotheses: Callable[[Solution], Iterable[Hypothesis]] = _nothing
     guess_concerns: Callable[[Sequence[ExperimentIterate], bool], Iterable[Concern]] = _nothing
     concerns: Callable[[Sequence[ExperimentIterate]], Iterable[Concern]] = _nothing
     simulation_concerns: Callable[[str, PredictionErrors], Iterable[Concern]] = _nothing

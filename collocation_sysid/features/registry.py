@@ -8,10 +8,8 @@ from .contact.feature import CONTACT
 from .feature import Feature
 from .image_tracks.feature import IMAGE_TRACKS
 from .outlines.feature import OUTLINES
-from .specimens.feature import SPECIMENS
-from .wrenches.feature import WRENCH
 
-FEATURES: tuple[Feature, ...] = (WRENCH, CONTACT, CAMERAS, IMAGE_TRACKS, OUTLINES, SPECIMENS)
+FEATURES: tuple[Feature, ...] = (CONTACT, CAMERAS, IMAGE_TRACKS, OUTLINES)
 for _feature in FEATURES:
     declare_topics(_feature.topics)
     declare_messages(_feature.messages)

@@ -31,7 +31,7 @@ from ..recording.homogeneous_deformation import DEFORMATIONS
 from ..recording.node_selection import selection_from_section
 from ..recording.specimen import cell_body, conditioned
 from ..recording.specimen_checks import require_equal_units
-from ..statistics.misspecification.plausibility import SIZES_M, size_and_density_hypotheses
+from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
 from .density_guesses import with_declared_densities, with_guessed_densities
 from .named_files import existing_file

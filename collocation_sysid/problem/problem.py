@@ -25,7 +25,7 @@ from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
 from ..recording.impact_steps import impact_steps
-from ..statistics.misspecification.plausibility import size_and_density_hypotheses
+from ..statistics.plausibility import size_and_density_hypotheses
 from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .options import Origin, RolloutOptions, UncertaintyOptions
 

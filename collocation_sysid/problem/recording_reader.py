@@ -16,7 +16,7 @@ from ..common.array_types import Array
 from ..common.checked_arrays import point_text
 from ..common.declarations import keys_of
 from ..common.schema_tables import declared_in
-from ..errors import InputError, hint_at, listed, located
+from ..errors import ImplausibleMarkersError, InputError, hint_at, listed, located
 from ..fem.body import Body
 from ..methods.starts.stiffness_scan import typical_constants
 from ..model.parameters import Parameters
@@ -42,7 +42,6 @@ from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.sources.logs import stored_files
 from ..recording.time_tables import is_within_experiment
-from ..statistics.misspecification.modes import find_misspecifications_by_modes
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
 from .marker_tracking import (
@@ -649,7 +648,7 @@ def require_plausible_markers(
     Parameters
     ----------
     constants : mapping of str to float
-        Physical values by name, to find the likely cause, which the message then names.
+        Physical values by name, for a search of the likely cause.
     frames_fault : str
         Known fault of the frames of poses and markers, which the message begins with; then no other
         cause is sought.
@@ -658,11 +657,7 @@ def require_plausible_markers(
         return
     if frames_fault:
         raise InputError(f"{frames_fault}; {message}", where="markers")
-    likeliest = "".join(
-        f"; likely {cause.message}"
-        for cause in find_misspecifications_by_modes(experiment, constants)[:1]
-    )
-    raise InputError(message + likeliest, where="markers")
+    raise ImplausibleMarkersError(message, experiment, constants)
 
 
 def _implausible_markers(experiment: Experiment) -> str | None:

@@ -108,13 +108,6 @@ class Deviation:
         ``effect(at, index)``, the linear change of the equations of motion (`systematic_effects.
         Effect`) by one unit along the axis with this index, for an experiment `at` the answer; None
         where it has none. A deviation with such an effect is considered and tested, not estimated.
-    corrected : callable, optional
-        ``corrected(experiment, amplitudes)``, the experiment without the deviation and the data of
-        its message, for a likely mistake that is tested by a refit where a linear step along
-        `effect` explains the residuals; None where that is impossible. `amplitudes` are those of
-        the step along each axis.
-    is_whole : bool
-        Whether it happens as a whole or not at all, so that the amplitude of that step is one.
     of_specimens : bool
         Whether `effect` concerns homogeneous specimens too, which have neither a mesh nor grips.
     is_one_sided : bool
@@ -191,8 +184,6 @@ class Deviation:
     of: Component = "recording"
     axes: str = ""
     effect: Callable[..., Any] | None = None
-    corrected: Callable[..., tuple[object, Mapping[str, object]] | None] | None = None
-    is_whole: bool = False
     of_specimens: bool = False
     is_one_sided: bool = False
     is_ruler: bool = False
@@ -230,8 +221,7 @@ class Deviation:
         """What can be done with the deviation: estimate it, consider it in the uncertainty budget,
         test it in every solve.
         """
-        is_tested = self.widening or self.corrected
-        is_possible = {"estimate": not self.effect, "consider": True, "test": is_tested}
+        is_possible = {"estimate": not self.effect, "consider": True, "test": self.widening}
         return tuple(mode for mode in get_args(Mode) if is_possible[mode])
 
     @property

@@ -35,6 +35,7 @@ from ..common.serialisation import content
 from ..errors import listed
 from ..features.measurement_results import SimulatedExperiment
 from ..fem.laws.constants import symbol_of, unit_of
+from ..judge import texts  # noqa: F401, declares messages of stored runs
 from ..recording.deviation import in_readable_unit
 from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment

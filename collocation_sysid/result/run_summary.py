@@ -21,10 +21,10 @@ from ..fem.laws.constants import (
     unit_of,
     without_region,
 )
-from ..runs.misspecifications import NO_CAUSE
 from ..runs.result_content import Result
 from ..statistics.budget.variance_sources import source_label
 from ..statistics.combinations import WIDE, precision_text
+from ..statistics.hypothesis import NO_CAUSE
 from .alternative_sentences import alternative_sentences
 from .probe_sections import (
     STIFFNESS_NAMES,

@@ -8,7 +8,6 @@
 - `forward_simulation`, `prediction`: simulate recordings with the estimates, and compare with the
 measurements.
 - `verdict`: concerns about a solution; `mesh_resolution`: concerns about too coarse meshes;
-`misspecifications`: likely errors in the description.
 - `numerical_error`: solve at finer discretisations, for the numerical error.
 - `solved_problem`: the solved problem with all of this; `result_builder` converts it to
   `result_content`, the content of

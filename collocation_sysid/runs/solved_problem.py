@@ -45,9 +45,9 @@ from ..statistics.combinations import (
 from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate, relative_derivatives
 from ..statistics.field_estimates import FieldEstimate, field_estimates
+from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli, LinearisedFit
-from ..statistics.misspecification.hypothesis import Hypothesis
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.probes.profile_likelihood import Profile
 from ..statistics.probes.relaxed_assumptions import Probe

@@ -36,12 +36,12 @@ from ..statistics.assessment import (
 )
 from ..statistics.concerns import Concern
 from ..statistics.instrument_misfit import InstrumentMisfit
-from ..statistics.misspecification.plausibility import (
+from ..statistics.plausibility import (
+    copied_measurements,
     density_concerns,
     material_hypothesis,
     size_and_density_hypotheses,
 )
-from ..statistics.misspecification.tracks import copied_measurements
 from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns

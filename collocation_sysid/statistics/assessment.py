@@ -30,8 +30,8 @@ from .budget.variance_sources import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name, limitless_shares
+from .hypothesis import Hypothesis
 from .instrument_misfit import InstrumentMisfit
-from .misspecification.hypothesis import Hypothesis
 from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
 from .probes.routine import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import Dependence

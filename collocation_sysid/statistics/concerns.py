@@ -54,14 +54,6 @@ TOPICS: dict[str, Topic] = {
         remedy="Compare units, frames, labels and clocks of the problem file with the laboratory's "
         "notes. The command check tests the recordings for common mistakes before a solve.",
         messages={
-            "poses-inverted": "the markers move as if the poses were inverted: invert them; a "
-            "pose must map the undeformed body to its current position",
-            "rotation-inverted": "the markers move as if the poses' rotations were inverted: "
-            "transpose the matrices or conjugate the quaternions, and leave the positions "
-            "unchanged",
-            "quaternion-order": "the markers move as if the quaternions were in another order: set "
-            'grasp.quaternion = "{order}" or swap the columns',
-            "length-unit": "{who} were {factor:g} times as large: {remedy}",
             "length-unit/size": "the body is {size_m:.3g} m large; expected {least:g} to {most:g} "
             "m: check {likely}",
             "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
@@ -77,19 +69,6 @@ TOPICS: dict[str, Topic] = {
             "density/metal": "the body is as dense as metal ({density_kg_m3:.4g} kg/m³) and as "
             "soft as rubber (E = {young_pa:.3g} Pa): both are 1000 times too large if the mass "
             "was stated in g instead of kg; check object.density_kg_m3 or mass_kg",
-            "gravity": "the markers hang as if gravity were along {axis}: set gravity_m_s2 = "
-            "[{vector}]",
-            "gripper-frame": "the markers move with the poses, but with a constant transform "
-            "between them: the mesh is not given in the frame whose poses were recorded; "
-            "multiply every pose on the right by the transform from the mesh's frame to the "
-            "gripper's, or fit the poses by grasp.markers",
-            "camera-frame": "the markers fit after one rigid motion of all of them: cameras and "
-            "robot use different world frames; set markers.template_m and template_window_s",
-            "frames": "{fault}",
-            "clock": "the markers' clock is {when} by about {by_ms:.3g} ms relative to that of the "
-            "poses: {do} t_s of the poses, or estimate it with nuisance.time_shift",
-            "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep} than stated: "
-            "compare the box of grasp.nodes with the ends of the fingers",
             "grasp": "the box of the grasp of '{experiment}' selects {nodes} nodes, but "
             "{nearly_grasped} more if it is enlarged by a tenth of an element's edge, or "
             "{nearly_free} fewer if it is reduced by as much, and the estimated stiffness "
@@ -101,119 +80,9 @@ TOPICS: dict[str, Topic] = {
             "long, and its stiffness is estimated too high, in bending by three to four times "
             "this share; mesh the body with a layer of nodes where the fingers end "
             "(object.edge_length_m), or let the box end at the nodes that are really held",
-            "markers-exchanged": "the names of markers are exchanged: {names}; correct "
-            "markers.labels or reference_m",
-            "markers-exchanged/later": "the names of markers are exchanged {when}: {names}; "
-            "correct them there, or remove these samples",
-            "hysteresis": "the force in unloading differs from that in loading by {sizes}, and an elastic "
-            "law is fitted between both branches: this is hysteresis of the material. To fit the loading "
-            "alone, end window_s at the largest displacement",
-            "law": "the material deforms by another law than stated, such as {material}: compare laws "
-            "with compare-models --materials",
-            "law/damping": "the material is damped by another law than stated, such as {damping}: "
-            "compare laws with compare-models --damping",
-            "law/both": "material and damping obey other laws than stated, such as {material} with "
-            "{damping}: compare laws with compare-models --materials and --damping",
-            "mesh-section": "the section of the body is {real}, and that of the mesh {meshed} and as wide: "
-            "mesh the section of the body (object.cylinder_m or box_m)",
-            "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
-            "its extents with those of the real body",
-            "mesh-coarse": "the mesh is too coarse for such accurate measurements: its estimated error "
-            "changes the predictions by {sigmas:.2g} sigma (RMS), which the constants do not absorb; "
-            "{remedy}",
-            "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare "
-            "it with the real body",
-            "mesh-mirrored/or-images": "the images are flipped (u to the left, or v upwards), or the mesh "
-            "is a mirror image of the body, along its {axis} axis: compare both with the real body",
-            "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "
-            "({down}) of the mesh, not a stress-free one: state object.rest_shape",
-            "several": "a correction of the description brings the residuals to the noise, but the "
-            "data do not tell which: {causes}",
-            "insufficient": "no single correction of the description brings the residuals to the "
-            "noise; these reduce them most: {causes}",
-            "tracks-filtered": "the tracks have hardly any noise above {frequency_hz:.2g} Hz "
-            "({percent:.2g} % of sigma_m above twice this frequency), as after a low-pass filter, "
-            "which changes the motion too: export the tracks without filtering",
-            "sensor-filtered": "{what} has hardly any noise above {frequency_hz:.2g} Hz "
-            "({percent:.2g} % of {stated} above twice this frequency), as after a low-pass filter, "
-            "which changes the signal too: export its values without filtering",
-            "markers-same": "the tracks of markers {first} and {second} are {by_mm:.2g} mm (RMS) apart, "
-            "but these markers are at different places of the body: one track is a copy of the other; "
-            "correct markers.labels, or omit one of them",
-            "markers-same/unplaced": "the tracks of markers {first} and {second} are {by_mm:.2g} mm "
-            "(RMS) apart: one track is a copy of the other; omit one of them",
-            "sensor-sign": "its values fit with the opposite sign: multiply them by -1, or reverse the "
-            "direction of the sensor in its description",
-            "sensor-unit": "its values fit if multiplied by {factor:.4g}: check the unit of its columns",
-            "sensor-axes": "its axes are exchanged or reversed: its values fit with ({axes}) in place "
-            "of (x, y, z); reorder the columns, or rotate the axes",
-            "sensor-zero": "its zero is wrong: its values fit if {offset} is subtracted; zero the "
-            "sensor before the recording, or estimate the offset",
-            "sensor-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s state: its "
-            "clock differs from that of the poses; correct t_s of this sensor",
             "measured-twice": "the values of {first} and {second} are exactly the same, which those of "
             "two measurements are not: one is a copy of the other; correct the file or its columns, or "
             "omit one of them",
-            "marker-held": "marker {marker} is exactly at one place in {count} samples, from t = "
-            "{t_s:.4g} s on, while another moves by {by_mm:.2g} mm: they are no measurements but a "
-            "gap that was filled; leave their cells blank",
-            "marker-slip": "marker {marker} slips at about t = {t_s:.4g} s: give it "
-            "markers.weights = 0, or end window_s before",
-            "marker-slip/alone": "marker {marker} slips by {by_mm:.2g} mm at t = {t_s:.4g} s, the "
-            "others do not: give it markers.weights = 0, or end window_s before",
-            "pose-jump": "the poses jump by {by_mm:.2g} mm at t = {t_s:.4g} s and the markers do "
-            "not: repair the poses there, or end window_s before",
-            "markers-jump": "all markers jump by {by_mm:.3g} mm at t = {t_s:.4g} s and the poses "
-            "do not, which a grasped body cannot do: a simulation may have failed and restarted, "
-            "or the file holds two recordings; end window_s before",
-            "markers-axes": "the markers fit with ({axes}) in place of (x, y, z): the axes in "
-            "their file are exchanged or reversed; reorder the columns, or rotate the tracks",
-            "poses-constant": "the markers move by {by_mm:.3g} mm, but the poses are constant and "
-            "nothing else drives the body, which starts at rest: check the file and the columns of "
-            "grasp.poses, and whether they are those of this recording",
-            "not-at-rest": "the markers move by {by_mm:.2g} mm (RMS) within the first "
-            "{within_ms:.3g} ms, in which the grasp moves by {grasp_mm:.2g} mm: the body was not at "
-            'rest at the beginning, as start = "equilibrium" assumes, or the clocks of markers and '
-            "poses differ; begin window_s, or the recording, when the body is at rest",
-            "unlike": "the tracks do not move like a grasped body: for every stiffness, the markers "
-            "of a simulated body are {by_mm:.3g} mm (RMS) away from them, on a body of "
-            "{size_mm:.3g} mm, and no single common mistake explains this; check frames, "
-            "poses and labels, and if the tracks were simulated, that the simulation was "
-            "stable",
-            "mesh-parts": "the mesh consists of {parts} unconnected parts, and no grasp holds "
-            "{loose} of them, the largest with {nodes} nodes: merge coincident nodes, or remove "
-            "loose parts from the mesh",
-            "obstacle-normal": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
-            "body at the first sample, and none of it with the opposite normal: reverse the "
-            "normal, which points out of the solid towards the body",
-            "obstacle-place": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed "
-            "body at the first sample: check its position, size, unit and the sign of its motion",
-            "specimen-true-stress": "its stresses fit as true stresses (force over deformed "
-            'area): set stress = "true", or divide the forces by the undeformed area',
-            "specimen-compression": "its strains and stresses fit as those of a compression test: "
-            "set strain_sign = -1 and stress_sign = -1",
-            "specimen-compression/widening": "its strains and stresses fit as those of a compression "
-            "test whose lateral strains are positive where the specimen becomes wider: set strain_sign "
-            "= -1 and stress_sign = -1, and multiply the lateral strains in the file by -1",
-            "specimen-percent": "its strains fit as percent: name the unit in the column, "
-            '"strain (%)"',
-            "specimen-kind": "its curve fits as that of a {test} test, with the same law: check the "
-            "kind of test; if it is right, compare laws with compare-models --materials",
-            "specimen-kind/likelier": "the curve fits better as that of another kind of test, with the "
-            "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
-            "specimen-kind/open": "the curve does not show the kind of test: with the same law it fits "
-            "as well as {kinds}, instead of {stated} ({young}); make sure that the kind is right",
-            "specimen-moduli": "its moduli fit if storage and loss modulus are exchanged: check which "
-            "column is which",
-            "specimen-gap": "its amounts of shear fit as the displacement over the distance before "
-            "axial_stretch: divide them by axial_stretch, or state the distance after it as length_m",
-            "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
-            "without it: leave the column out if this was not measured",
-            "specimen-area": "its stresses agree with those of the other specimens if they are "
-            "multiplied by {factor:.4g}, or the others divided by it, which is the factor of {mistake}: "
-            "check area and load of both",
-            "specimen-unit": "its stresses fit if multiplied by {factor:g}: the unit of the column "
-            "is probably {unit}",
         },
     ),
     "noise": Topic(

@@ -1,7 +1,7 @@
 """Thresholds of all tests of a fit: each number with its reason, and its study.
 
 A test decides by one of these numbers: the verdict (`assessment`), the probes of assumptions
-(`probes`), and the refits of likely mistakes (`misspecification`). Limits of effort, and ranges of
+(`probes`), and the refits of likely mistakes (package `judge`). Limits of effort, and ranges of
 what is physically possible, stand where they are used.
 """
 

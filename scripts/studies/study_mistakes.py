@@ -29,13 +29,13 @@ from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 from wrong_videos import PAIR_FAULTS, PLACE_FAULTS, VIDEO_FAULTS
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.features.cameras.feature import depth_image_hypotheses, may_be_images
-from collocation_sysid.features.wrenches.mistakes import wrench_mistakes
+from collocation_sysid.features.cameras.doubts import depth_image_hypotheses, may_be_images
+from collocation_sysid.features.wrenches.doubts import wrench_mistakes
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis, rank
+from collocation_sysid.statistics.hypothesis import Hypothesis, rank
 
 # Seed of the random choices of a mistake, such as which markers are exchanged.
 FAULT_SEED = 3

@@ -28,15 +28,15 @@ from collocation_sysid import Run, run
 from collocation_sysid.errors import InputError, SimulationError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
+from collocation_sysid.judge.engine import find_misspecifications
 from collocation_sysid.methods.starts.stiffness_scan import typical_constants
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.problem.recording_reader import require_plausible_markers
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers
-from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.misspecification.plausibility import size_and_density_hypotheses
+from collocation_sysid.statistics.plausibility import size_and_density_hypotheses
 
 # Samples, sampling interval [s] and time steps per sample; with fewer steps the verdict would
 # report the error of the scheme instead of the fault.

@@ -38,6 +38,7 @@ import collocation_sysid as cs
 from collocation_sysid import cli, pipeline
 from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sources, common
 from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.judge import engine
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.starts.start import Start
 from collocation_sysid.problem.reading import read_problem_file
@@ -260,7 +261,7 @@ def test_pictures_may_be_left_out(tiny):
 
 def test_the_time_of_checks_is_none_of_the_search(tiny, monkeypatch):
     wait_s = 1.5
-    monkeypatch.setattr(pipeline, "find_misspecifications", lambda _: time.sleep(wait_s) or ())
+    monkeypatch.setattr(engine, "find_misspecifications", lambda _: time.sleep(wait_s) or ())
     began_s = time.perf_counter()
     assert run_command("solve", "problem.toml", "--out", "run").code == 0
     took_s = time.perf_counter() - began_s
@@ -335,7 +336,7 @@ def test_an_interrupted_run_writes_its_best_iterate(tiny, monkeypatch):
 
     monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
     monkeypatch.setattr(
-        pipeline, "find_misspecifications", lambda _: pytest.fail("nobody waits for this")
+        engine, "find_misspecifications", lambda _: pytest.fail("nobody waits for this")
     )
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
@@ -396,12 +397,14 @@ def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     assert "no error bars" in result["missing"]
 
 
-@pytest.mark.parametrize("late", ["find_misspecifications", "profile_likelihoods"])
-def test_error_bars_survive_a_later_interrupt(tiny, monkeypatch, late):
+@pytest.mark.parametrize(
+    ("module", "late"), [(engine, "find_misspecifications"), (pipeline, "profile_likelihoods")]
+)
+def test_error_bars_survive_a_later_interrupt(tiny, monkeypatch, module, late):
     def interrupt(*_: object, **__: object) -> None:
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(pipeline, late, interrupt)
+    monkeypatch.setattr(module, late, interrupt)
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "interrupted: the steps after the error bars were skipped" in outcome.out

@@ -20,6 +20,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import ElementNodes
 from collocation_sysid.fem.meshes.selection import Face
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
+from collocation_sysid.judge.engine import _unloading
+from collocation_sysid.judge.modes import find_misspecifications_by_modes
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate
@@ -30,9 +32,6 @@ from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.result.synthesis import write_data
-from collocation_sysid.statistics.misspecification.hypothesis import corrected_hypothesis
-from collocation_sysid.statistics.misspecification.modes import find_misspecifications_by_modes
-from collocation_sysid.statistics.misspecification.refits import _unloading
 
 TIMES = [0.0, 0.1, 0.2]
 PRESSED_MM = [0.0, 0.25, 0.5]
@@ -379,7 +378,7 @@ def test_only_a_softer_unloading_is_hysteresis(tmp_path):
     assert unloading_difference(experiment) == pytest.approx(0.1, abs=0.01)
     collocation = Problem.read(tmp_path / "problem.toml").collocation()
     solution = SimpleNamespace(collocation=collocation)
-    assert corrected_hypothesis(_unloading(cast(Any, solution)), experiment) is None
+    assert _unloading(cast(Any, solution)).hypothesis(experiment) is None
 
 
 def test_the_loading_branch_has_the_peak_and_at_most_as_many_samples(tmp_path):

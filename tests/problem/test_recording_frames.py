@@ -12,12 +12,9 @@ from kit.robot_log import CAMERAS, CAMERAS_M, GRIPPER_M, SENSOR, SENSOR_M, robot
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.judge.modes import FRAME_CAUSES, find_misspecifications_by_modes
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_markers, write_markers_csv
-from collocation_sysid.statistics.misspecification.modes import (
-    FRAME_CAUSES,
-    find_misspecifications_by_modes,
-)
 
 EARTH_M_S2 = np.array([0.0, 0.0, -9.81])
 

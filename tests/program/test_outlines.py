@@ -28,7 +28,7 @@ from kit.silhouettes import (
 from PIL import Image
 
 import collocation_sysid as cs
-from collocation_sysid.features.outlines.feature import hypotheses
+from collocation_sysid.features.outlines.doubts import hypotheses
 from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
 from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
 from collocation_sysid.features.outlines.residual import OutlinesResidual

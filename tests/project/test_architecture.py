@@ -27,7 +27,7 @@ LAYERS = (
     {"statistics"},
     {"problem"},
     {"datasets"},
-    {"features"},
+    {"features", "judge"},
     {"runs"},
     {"result"},
     {"pipeline", "installation_check"},
@@ -89,7 +89,17 @@ def test_no_imports_go_in_circles():
 
 # Packages with the mathematics of an identification, and those that use it; see docs/core.md.
 CORE = ("fem", "recording", "model", "program", "methods", "statistics")
-OUTER = ("features", "runs", "result", "extras", "cli", "testing", "pipeline", "installation_check")
+OUTER = (
+    "features",
+    "judge",
+    "runs",
+    "result",
+    "extras",
+    "cli",
+    "testing",
+    "pipeline",
+    "installation_check",
+)
 
 
 def test_the_core_is_loaded_without_the_packages_that_use_it():
@@ -105,6 +115,25 @@ def test_the_core_is_loaded_without_the_packages_that_use_it():
     loaded = set(done.stdout.split())
     assert set(CORE) <= loaded
     assert not loaded & {*OUTER, "problem"}
+
+
+def test_a_problem_is_solved_without_the_judge(tmp_path):
+    """No import of a search reaches the package that seeks likely mistakes."""
+    code = (
+        "import sys\n"
+        "class Blocker:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.startswith('collocation_sysid.judge'): raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Blocker())\n"
+        "import collocation_sysid as cs\n"
+        "pull = cs.Specimen('uniaxial', [0.1, 0.2, 0.3], [1e4, 2e4, 3e4], 100.0).experiment()\n"
+        "fixed = {'kappa_pa': 1e9, 'gamma_r_s': 0.0, 'gamma_m_1_s': 0.0}\n"
+        "print(cs.solve(cs.Problem([pull], {'mu_pa': cs.Unknown()} | fixed)).status.converged)\n"
+        "import collocation_sysid.cli.problem_commands\n"
+    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.stdout.strip() == "True", done.stderr
 
 
 # The methods that need sparse exact matrices, and what checks or measures their programs.

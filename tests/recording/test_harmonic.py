@@ -10,7 +10,7 @@ from kit.problem_files import run_command, write_problem
 
 import collocation_sysid as cs
 from collocation_sysid.features.measurements import prediction_error
-from collocation_sysid.features.specimens.hypotheses import exchanged_moduli
+from collocation_sysid.features.specimens.doubts import exchanged_moduli
 from collocation_sysid.recording.specimen import is_harmonic
 from collocation_sysid.result.pictures.stress_strain import harmonic_picture
 from collocation_sysid.runs.check.measurements import check_recording

@@ -8,7 +8,7 @@ from kit.problem_files import run_command
 
 import collocation_sysid as cs
 from collocation_sysid.features.measurements import prediction_error, stated_sigmas
-from collocation_sysid.features.specimens.hypotheses import find_specimen_misspecifications
+from collocation_sysid.features.specimens.doubts import find_specimen_misspecifications
 from collocation_sysid.recording.specimen_files import specimen_strains
 from collocation_sysid.result.pictures.stress_strain import relaxation_picture
 

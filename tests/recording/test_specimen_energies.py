@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import collocation_sysid as cs
-from collocation_sysid.features.specimens.hypotheses import _hypotheses
+from collocation_sysid.features.specimens.doubts import _hypotheses
 from collocation_sysid.recording.homogeneous_deformation import DEFORMATIONS
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 from collocation_sysid.recording.specimen_stretches import isochoric_stretches

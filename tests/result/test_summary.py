@@ -22,10 +22,10 @@ from collocation_sysid.common.display import (
 from collocation_sysid.result.pictures.confidence import Confidence
 from collocation_sysid.result.run_sections import _cards, refinement_table
 from collocation_sysid.result.run_summary import next_step, run_summary
-from collocation_sysid.runs.misspecifications import NO_CAUSE
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.discretisation_error import DiscretisationError
 from collocation_sysid.statistics.concerns import Concern
+from collocation_sysid.statistics.hypothesis import NO_CAUSE
 
 MOST_LINES = 16
 

@@ -29,6 +29,7 @@ from collocation_sysid.features.measurements import (
     reason_against_copy,
 )
 from collocation_sysid.features.specimens.concerns import SPECIMEN_CODES, as_specimen_concerns
+from collocation_sysid.judge.tracks import filtered_signals
 from collocation_sysid.program.depth.surface_comparison import DepthError, SurfaceComparison
 from collocation_sysid.runs.verdict import _outlier_counts
 from collocation_sysid.statistics.assessment import (
@@ -38,10 +39,7 @@ from collocation_sysid.statistics.assessment import (
     prediction_concerns,
     validation_concerns,
 )
-from collocation_sysid.statistics.misspecification.tracks import (
-    copied_measurements,
-    filtered_signals,
-)
+from collocation_sysid.statistics.plausibility import copied_measurements
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 
 NUMBERS = (

@@ -12,14 +12,7 @@ from study_hidden_errors import TRUTH, twin
 
 from collocation_sysid import Problem, Unknown
 from collocation_sysid.fem.laws.materials import DAMPINGS
-from collocation_sysid.pipeline import solve
-from collocation_sysid.program.simulation import with_markers
-from collocation_sysid.runs.misspecifications import find_misspecifications
-from collocation_sysid.statistics.misspecification.hypothesis import (
-    Hypothesis,
-    corrected_hypotheses,
-)
-from collocation_sysid.statistics.misspecification.models import (
+from collocation_sysid.judge.bodies import (
     LinearCorrection,
     mirrored_meshes,
     other_materials,
@@ -28,8 +21,16 @@ from collocation_sysid.statistics.misspecification.models import (
     with_laws,
     with_shape,
 )
-from collocation_sysid.statistics.misspecification.refits import _named_alone_or_together, _Refitter
-from collocation_sysid.statistics.misspecification.tracks import _amplitudes, _cutoff, same_tracks
+from collocation_sysid.judge.doubt import corrected_hypotheses
+from collocation_sysid.judge.engine import (
+    _named_alone_or_together,
+    _Refitter,
+    find_misspecifications,
+)
+from collocation_sysid.judge.tracks import _amplitudes, _cutoff, same_tracks
+from collocation_sysid.pipeline import solve
+from collocation_sysid.program.simulation import with_markers
+from collocation_sysid.statistics.hypothesis import Hypothesis
 
 STEP_S = 0.01
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.judge.initial_motion import initial_motion_hypotheses
 from collocation_sysid.recording import Experiment, Force
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.misspecification.initial_motion import initial_motion_hypotheses
 
 TRUTH = {"young_pa": 1.5e3, "poisson": 0.3, "gamma_r_s": 0.004, "gamma_m_1_s": 0.5}
 SIGMA_M = 2e-4

@@ -12,11 +12,11 @@ import pytest
 from kit.problems import measured, pressed_cube
 
 import collocation_sysid as cs
+from collocation_sysid.judge.engine import find_misspecifications
 from collocation_sysid.methods.solve_recorder import initial_variables
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.runs import mesh_resolution
 from collocation_sysid.runs.mesh_resolution import estimate_mesh_error, mesh_resolution_concerns
-from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.numerical_error import finer_mesh
 from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.budget import mesh_error

@@ -17,7 +17,7 @@ from collocation_sysid.statistics.budget.alternatives import modulus_axis_senten
 from collocation_sysid.statistics.budget.systematic_effects import usual_deviations
 from collocation_sysid.statistics.budget.variance_sources import VarianceSources
 from collocation_sysid.statistics.estimates import Estimate
-from collocation_sysid.statistics.misspecification.plausibility import density_concerns
+from collocation_sysid.statistics.plausibility import density_concerns
 
 BOX = cs.box_mesh((0.04, 0.04, 0.08), (1, 1, 2))
 

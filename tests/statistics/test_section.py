@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.judge.bodies import with_other_section
 from collocation_sysid.statistics.budget.shape_error import other_section
-from collocation_sysid.statistics.misspecification.models import with_other_section
 
 WIDTH_M, LENGTH_M = 0.02, 0.1
 DENSITY_KG_M3 = 1000.0

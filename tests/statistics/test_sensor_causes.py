@@ -9,9 +9,9 @@ import pytest
 from kit.problems import GUESS, TRUTH, hung_cube, measured
 
 import collocation_sysid as cs
+from collocation_sysid.judge.engine import find_misspecifications
+from collocation_sysid.judge.sensors import whole_mistakes
 from collocation_sysid.program.simulation import simulate
-from collocation_sysid.runs.misspecifications import find_misspecifications
-from collocation_sysid.statistics.misspecification.sensors import whole_mistakes
 
 SIGMA = 2e-4
 STEPS = 15
@@ -56,13 +56,13 @@ MISTAKES = {
 }
 
 
-def test_likely_mistakes_of_a_sensor_are_deviations_that_correct_the_readings():
+def test_likely_mistakes_of_a_sensor_correct_the_readings():
     experiment = sensed(MISTAKES["sensor-unit"])
     probe, other = experiment.readings
     predicted = 1e-3 * probe.measured_values
     rows = {row.name: row for row in whole_mistakes(probe, predicted)}
     assert set(rows) == {"sensor-sign", "sensor-unit"}
-    corrected, data = rows["sensor-unit"].corrected(experiment, np.ones(1))
+    corrected, data = rows["sensor-unit"].correct(experiment, np.ones(1))
     assert data == {"factor": 1e-3}
     np.testing.assert_allclose(corrected.readings[0].measured_values, predicted)
     assert corrected.readings[1] is other

@@ -20,7 +20,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import Experiment, Wrench
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis
+from collocation_sysid.statistics.hypothesis import Hypothesis
 
 OFFSET_N = 0.8
 

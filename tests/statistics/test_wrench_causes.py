@@ -11,7 +11,8 @@ from kit.problems import GUESS
 from kit.wrench_fits import UNKNOWN, swung
 from wrong_twins import WRENCH_FAULTS
 
-from collocation_sysid.features.wrenches.mistakes import wrench_causes, wrench_mistakes
+from collocation_sysid.features.wrenches.doubts import wrench_causes, wrench_mistakes
+from collocation_sysid.judge.engine import find_misspecifications
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
@@ -19,9 +20,8 @@ from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.misspecification.hypothesis import rank
+from collocation_sysid.statistics.hypothesis import rank
 
 
 def changed(change: Callable[[Wrench], Wrench]) -> Collocation:

@@ -14,15 +14,15 @@ from depth_twins import TRUTH, hanging_twin, swinging_twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 
 import collocation_sysid as cs
-from collocation_sysid.features.cameras.feature import depth_image_hypotheses
+from collocation_sysid.features.cameras.doubts import depth_image_hypotheses
 from collocation_sysid.features.cameras.images import camera_image_hypotheses, equilibrium_shapes_m
 from collocation_sysid.features.cameras.times import camera_clock_hypotheses
+from collocation_sysid.judge.engine import find_misspecifications
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import check_problem, misspecification_hypotheses
-from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.runs.solving import solve
-from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis, rank
+from collocation_sysid.statistics.hypothesis import Hypothesis, rank
 
 # What the image of one moment shows, with the code that names it.
 OF_SHAPE = {

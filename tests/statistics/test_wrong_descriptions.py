@@ -20,6 +20,9 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.judge import engine
+from collocation_sysid.judge.contradictions import step_hypotheses
+from collocation_sysid.judge.engine import _is_reproduced, find_misspecifications
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
@@ -27,16 +30,12 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.runs.check.body import check_grasps, grasp_concerns
-from collocation_sysid.runs.misspecifications import find_misspecifications
 from collocation_sysid.statistics.assessment import cause_concerns
-from collocation_sysid.statistics.misspecification import refits
-from collocation_sysid.statistics.misspecification.hypothesis import Hypothesis
-from collocation_sysid.statistics.misspecification.plausibility import (
+from collocation_sysid.statistics.hypothesis import Hypothesis
+from collocation_sysid.statistics.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
-    step_hypotheses,
 )
-from collocation_sysid.statistics.misspecification.refits import _is_reproduced
 
 BEFORE = [
     "poses in mm",
@@ -276,7 +275,7 @@ def test_a_short_exchange_is_left_to_hubers_loss():
 @pytest.mark.long
 def test_exchanged_markers_are_not_fitted_again(monkeypatch):
     solution = solve(exchanged(soft("bar"), slice(20, None)))
-    monkeypatch.setattr(refits, "ReducedSpace", None)
+    monkeypatch.setattr(engine, "ReducedSpace", None)
     assert [cause.cause for cause in find_misspecifications(solution)] == ["markers-exchanged"]
 
 
@@ -290,8 +289,8 @@ def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rn
             sweeps.append(found.iterations)
             return found
 
-    monkeypatch.setattr(refits, "ReducedSpace", Counted)
-    monkeypatch.setattr(refits, "find_misspecifications_by_modes", lambda *_, **__: ())
+    monkeypatch.setattr(engine, "ReducedSpace", Counted)
+    monkeypatch.setattr(engine, "find_misspecifications_by_modes", lambda *_, **__: ())
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
     assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done

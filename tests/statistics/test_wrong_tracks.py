@@ -26,7 +26,8 @@ from kit.filmed import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.feature import notes, places_off_body, track_hypotheses
+from collocation_sysid.features.image_tracks.doubts import places_off_body, track_hypotheses
+from collocation_sysid.features.image_tracks.feature import notes
 from collocation_sysid.features.image_tracks.places import find_places
 from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
 from collocation_sysid.features.image_tracks.stated_cameras import hypotheses

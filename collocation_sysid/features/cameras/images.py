@@ -18,6 +18,7 @@ from ...common.array_types import Array
 from ...errors import SimulationError
 from ...fem.laws.constants import is_modulus
 from ...fem.laws.moduli import engineering_constants
+from ...judge.doubt import HypothesisTest
 from ...model.nuisance_map import NuisanceMap
 from ...program.depth.camera_alignment import AlignedPose, ExactCloud, iterate_alignments, thinned
 from ...program.depth.camera_model import DepthCameraModel
@@ -28,27 +29,9 @@ from ...recording.depth_camera import DepthCamera
 from ...recording.experiment import Experiment
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...recording.sample_times import TIME_TOLERANCE_S
-from ...statistics.misspecification.hypothesis import Hypothesis, HypothesisTest
+from ...statistics.hypothesis import Hypothesis
 from ...statistics.thresholds import CERTAIN, LEAST_IMPROVEMENT, MISFIT, ONE_OF_MANY
 
-# Messages of the hypotheses by the codes of their concerns.
-MESSAGES_OF_IMAGES = {
-    "description/camera-image": "the points fit with rows and columns of the image read {order}: the "
-    "image was flipped or rotated after the camera took it; undo that, or describe the "
-    "camera as it took the image",
-    "description/camera-matrix/focal": "the points fit with focal lengths {factor:g} times as large: "
-    "check fx and fy of camera.matrix, which are in pixels of these images",
-    "description/camera-matrix/size": "the points fit with camera.matrix multiplied by {factor:g}, "
-    "except for its last row: it is that of images of another size; state the matrix of "
-    "these images",
-    "description/camera-matrix/centre": "the points fit with the principal point {centre}, {how}: "
-    "state cx and cy of camera.matrix from the upper left corner, cx along the columns",
-    "description/camera-rays": "the points fit if the depths are distances along the rays: convert "
-    "them to depths along the optical axis, dividing by the length of K⁻¹ (u, v, 1)",
-    "description/camera-pose": "the points fit only if the camera is turned by {degrees:.2g}° and "
-    "shifted by {by_mm:.2g} mm, {deviations:.2g} standard deviations of its prior: "
-    "measure camera.pose again, or state nuisance.depth_pose",
-}
 # Young's moduli of the equilibria [Pa], stiff to soft.
 YOUNG_PA = np.geomspace(1e7, 1e2, 11)
 # Deformation over the body's diagonal between neighbouring shapes: the camera follows as much.

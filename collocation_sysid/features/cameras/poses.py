@@ -22,15 +22,8 @@ from ...program.depth.surface_correspondences import initial_gate_m
 from ...program.depth.visible_surface import VisibleSurface
 from ...recording.depth_camera import Depth, points_from_image
 from ...recording.experiment import Experiment
-from ...statistics.misspecification.hypothesis import Hypothesis
+from ...statistics.hypothesis import Hypothesis
 
-# Messages of the hypotheses by the codes of their concerns.
-MESSAGES_OF_POSES = {
-    "description/camera": "only {percent:.0f} % of the body's visible surface have measured points "
-    "within {within_mm:.3g} mm: check camera.pose (camera frame: x to the right, y down, "
-    "z forward) and the unit of the depth; check draws a picture of both",
-    "description/camera/likely": "hardly any points are near the body; they would be if {mistakes}",
-}
 # Share of the surface with points nearby below which the body is hardly visible.
 HARDLY = 0.1
 # Share from which on it is well visible.

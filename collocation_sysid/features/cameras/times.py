@@ -15,22 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array
+from ...judge.doubt import HypothesisTest
 from ...program.collocation import ExperimentIterate
 from ...program.depth.camera_alignment import thinned
 from ...program.depth.comparison import camera_residuals
 from ...program.depth.residual import DepthResidual
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
-from ...statistics.misspecification.hypothesis import Hypothesis, HypothesisTest
+from ...statistics.hypothesis import Hypothesis
 from ...statistics.thresholds import LEAST_IMPROVEMENT
 
-# Messages of the hypotheses by the codes of their concerns.
-MESSAGES_OF_TIMES = {
-    "description/camera-clock": "its images fit {by_ms:.3g} ms away from their times: its clock is "
-    "{when} relative to that of the poses; {do} its times",
-    "description/camera-order": "its images fit in reverse order: sort their files by time",
-    "description/camera-constant": "all its images show the same moment, although the body moves by "
-    "{by_mm:.3g} mm: check that the images are those of this recording",
-}
 # Fewest images whose order can be tested.
 FEWEST_IMAGES = 3
 # Most images that are compared, evenly spread.

@@ -7,74 +7,17 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...common.array_types import Array
 from ...methods.solution import Solution
 from ...model.contact.summary import ContactSummary, contact_summaries, surface_gaps_and_pressures
 from ...program.collocation import ExperimentIterate
 from ...recording.experiment import Experiment
-from ...recording.obstacle import Obstacle
-from ...recording.obstacle_solids import Plane
 from ...statistics.concerns import Concern, Topic, concern_if
-from ...statistics.misspecification.hypothesis import Hypothesis
 from ..feature import Feature
-from .obstacles import MESSAGES, obstacle_hypotheses
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
-# Penetration of a solid from which on a node is inside, over the body's diagonal.
-DEEP = 0.01
-# Largest share of the nodes that may be inside.
-MOST_INSIDE = 0.5
-
-
-def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses about parts of a body that no grasp holds, and about each obstacle that
-    contains more than half of it; they need no further test.
-    """
-    yield from _loose_parts(experiment)
-    for obstacle in experiment.obstacles:
-        yield from _containing(experiment, obstacle)
-
-
-def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """No grasp holds some of the parts; nothing is known without grasps, or with tendons."""
-    cells = experiment.body.cells
-    count = len(experiment.body.nodes_m)
-    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
-    edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
-    _, labels = connected_components(edges, directed=False)
-    parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
-    grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
-    loose = (
-        ~np.isin(parts, np.concatenate(grasped_labels))
-        if grasped_labels
-        else np.zeros(len(parts), dtype=bool)
-    )
-    if loose.any() and not experiment.tendons:
-        data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
-        yield Hypothesis("mesh-parts", f"'{experiment.name}'", data=data, strength=float(count))
-
-
-def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
-    """Blame the normal of a plane with the whole body behind it, else the place of the obstacle."""
-    nodes_m = experiment.rigid_positions(experiment.t_s[:1])[
-        0, : len(experiment.body.nodes.points_m)
-    ]
-    rotations, translations_m = obstacle.poses.at(experiment.t_s[:1])
-    gaps_m = obstacle.shape.signed_distances_m((nodes_m - translations_m[0]) @ rotations[0])
-    deep_m = DEEP * float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
-    share = float((gaps_m < -deep_m).mean())
-    if share <= MOST_INSIDE:
-        return
-    reversible = isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
-    code = "obstacle-normal" if reversible else "obstacle-place"
-    data = {"obstacle": obstacle.name, "percent": 100 * share}
-    yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=100 * share)
-
-
 AT_THE_GUESS = ", at the guess"
 TOPICS = {
     "contact": Topic(
@@ -98,17 +41,6 @@ TOPICS = {
         },
     )
 }
-
-
-def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
-    """Return likely errors in the placement of a body, or else in its obstacles and their loads."""
-    return tuple(placement_mistakes(experiment)) or tuple(obstacle_hypotheses(experiment))
-
-
-def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
-    """Yield likely errors in the obstacles of the fitted experiments and their loads."""
-    for transcription in solution.collocation.transcriptions:
-        yield from obstacle_hypotheses(transcription.experiment)
 
 
 def guess_concerns(parts: Sequence[ExperimentIterate], is_complete: bool) -> list[Concern]:
@@ -201,11 +133,4 @@ def contact_fields(
     return {"gaps_m": gaps_m, "pressures_pa": pressures_pa}
 
 
-CONTACT = Feature(
-    topics=TOPICS,
-    messages=MESSAGES,
-    hypotheses=hypotheses,
-    fit_hypotheses=fit_hypotheses,
-    guess_concerns=guess_concerns,
-    concerns=concerns,
-)
+CONTACT = Feature(topics=TOPICS, guess_concerns=guess_concerns, concerns=concerns)

@@ -41,6 +41,8 @@ from .rays import (
 )
 from .tracks import ImageTracks, stated_places
 
+# Factor between the errors of two poses that may both be right.
+SIMILAR_POSES = 2.0
 # Sine of the angle by which a ray may miss the body if the pose of the camera is exact, and in
 # standard deviations of the pose.
 LEAST_MISS = 5e-3

@@ -16,16 +16,16 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
+from ...judge.doubt import Doubt
+from ...judge.sensors import measurement_mistake
 from ...recording.camera import Camera
-from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.lost_points import missing_images
 from ...recording.measurement import Measurement
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
-from ...statistics.misspecification.hypothesis import Hypothesis, corrected_hypothesis
-from ...statistics.misspecification.sensors import measurement_mistake
+from ...statistics.hypothesis import Hypothesis
 from ...statistics.thresholds import CERTAIN
-from .places import poses_of_tracks
+from .places import SIMILAR_POSES, poses_of_tracks
 from .rays import facing, points_on_surface
 from .tracks import ImageTracks, stated_places
 
@@ -58,8 +58,6 @@ MOVING = 5.0
 UNLIKE = 0.6
 ALIKE, ALIKE_FOUND = 2.0, 2.5
 WELL_ALIKE, WELL_ALIKE_FOUND = 0.25, 0.4
-# Factor between the errors of two poses that may both be right.
-SIMILAR_POSES = 2.0
 # Factor between corrections that explain the tracks equally well, deviation of the motion below which
 # they do, and how many are named.
 SIMILAR = 1.3
@@ -84,21 +82,6 @@ FRAMES = {
 }
 # Transform of a world whose y axis points upwards to one whose z axis does.
 FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-
-MESSAGES = {
-    "description/image-tracks": "the points appear {distance_px:.3g} pixels (median) from where the "
-    "body is, which is {size_px:.3g} pixels large in the image: check camera.pose (x to the right, y "
-    "down, z forward, in metres), the calibration, places_m and start_s",
-    "description/image-tracks/likely": "the points are not where the body appears ({distance_px:.3g} "
-    "pixels off, median), but {nearer:.2g} times nearer if {mistake}",
-    "description/image-tracks/hidden": "{hidden} of {count} points with places_m are on sides of the "
-    "body that the camera does not see{remedy}",
-    "description/image-tracks/missing": "images are missing ({count}, the first before {t_s:.4g} s): "
-    "there all points move two or three times as far as before and after; state the time of each "
-    "image in t_s, as the video has them, not a frame rate",
-    "description/image-tracks/motion": "near the grasp the points do not move as the grasp does "
-    "(deviation {unlike:.2g} of its motion), but {nearer:.2g} times more alike if {mistake}",
-}
 
 
 # Measure of the tracks without a mistake, these tracks, and the clause that states the mistake.
@@ -362,22 +345,22 @@ class _Trial:
     # Corrections ------------------------------------------------------------------------------
 
     def without(
-        self, rows: Iterable[Deviation], measure: Callable[[ImageTracks], float]
+        self, rows: Iterable[Doubt], measure: Callable[[ImageTracks], float]
     ) -> list[_Tried]:
         """Return measure, tracks and clause without each mistake, the least measure first."""
         place = self.experiment.readings.index(self.declared)
-        found = [each for row in rows if (each := corrected_hypothesis(row, self.experiment))]
+        found = [each for row in rows if (each := row.hypothesis(self.experiment))]
         others = [(each.corrected.readings[place], each.data["mistake"]) for each in found]
         tried = [(measure(other), other, mistake) for other, mistake in others]
         return sorted(tried, key=lambda each: np.nan_to_num(each[0], nan=np.inf))
 
-    def mistakes(self) -> Iterator[Deviation]:
+    def mistakes(self) -> Iterator[Doubt]:
         """Yield mistakes of images and, if it is stated, of the pose."""
         yield from self._wrong_images()
         if self.declared.has_known_pose:
             yield from self._wrong_poses()
 
-    def _mistake(self, mistake: str, has_pose: bool = True, **changes: Any) -> Deviation:
+    def _mistake(self, mistake: str, has_pose: bool = True, **changes: Any) -> Doubt:
         """Without a pose, the pose is fitted again."""
 
         def without(_: Measurement) -> ImageTracks:
@@ -399,7 +382,7 @@ class _Trial:
             return fitted[0]
         return min(fitted, key=lambda each: float(np.nan_to_num(self.unlike(each), nan=np.inf)))
 
-    def _wrong_images(self) -> Iterator[Deviation]:
+    def _wrong_images(self) -> Iterator[Doubt]:
         stated = self.tracks
         matrix = stated.camera.require_matrix()
         width, height = stated.camera.size_px or (2 * matrix[0, 2] + 1, 2 * matrix[1, 2] + 1)
@@ -419,7 +402,7 @@ class _Trial:
         for new_u, new_v, mistake in flips:
             yield self._mistake(mistake, has_pose=False, pixels=np.stack([new_u, new_v], axis=-1))
 
-    def wrong_pixels(self) -> Iterator[Deviation]:
+    def wrong_pixels(self) -> Iterator[Doubt]:
         """Errors of the pose resemble pixels that are scaled, shifted or of another unit."""
         camera, stated = self.tracks.camera, np.asarray(self.tracks.pixels)
         matrix = camera.require_matrix()
@@ -460,7 +443,7 @@ class _Trial:
         tracked = np.asarray(self.tracks.pixels)[sample, known or self.is_seen[sample]]
         return np.asarray(_middle(shown) - _middle(tracked))
 
-    def reversed_order(self) -> Iterator[Deviation]:
+    def reversed_order(self) -> Iterator[Doubt]:
         """Yield images in reverse order, if nearly all points are seen."""
         within = self.within
         if self.is_seen[within].mean() >= MOSTLY_SEEN:
@@ -472,7 +455,7 @@ class _Trial:
     def image_count(self, described: ImageTracks) -> int:
         return len(self._within(described.sample_times_s))
 
-    def wrong_times(self) -> Iterator[Deviation]:
+    def wrong_times(self) -> Iterator[Doubt]:
         t_s = self.tracks.sample_times_s
         yield from self.reversed_order()
         for rate in RATES:
@@ -486,10 +469,10 @@ class _Trial:
             )
             yield self._mistake(mistake, t_s=t_s + delay_s)
 
-    def _wrong_poses(self) -> Iterator[Deviation]:
+    def _wrong_poses(self) -> Iterator[Doubt]:
         pose = self.tracks.camera.pose
 
-        def other(rotation: Array, position: Array, mistake: str) -> Deviation:
+        def other(rotation: Array, position: Array, mistake: str) -> Doubt:
             changed = np.eye(4)
             changed[:3, :3], changed[:3, 3] = rotation, position
             return self._mistake(mistake, camera=replace(self.tracks.camera, pose=changed))

@@ -20,17 +20,8 @@ from ...program.wrench_residual import WrenchResidual
 from ...recording.experiment import Experiment
 from ...recording.measured_wrench import COMPONENTS, UNITS
 from ...statistics.axes import with_other_axes
-from ...statistics.misspecification.hypothesis import Hypothesis
+from ...statistics.hypothesis import Hypothesis
 
-# Message of the offset by the code of its concern; those of other hypotheses are in
-# `mistakes`.
-MESSAGE_OF_OFFSET = {
-    "description/wrench-offset": "most of its deviation from the simulation at the guess{after} is an "
-    "offset, in {component} {offset} ({deviations:.3g} standard deviations of its noise): zero the "
-    "sensor before the grasp or subtract a reading without the body; or state "
-    "nuisance.tare = {{ prior_sigmas = {prior} }}, and nuisance.tool if a gripper hangs "
-    "between sensor and body"
-}
 # RMS deviation in standard deviations of the noise below which nothing is tested: guesses err.
 SMALLEST_MISFIT = 5.0
 # Share of the variance of the measured wrench that a corrected description must explain.

@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 from ...common.array_types import Array
 from ...common.serialisation import content
 from ...errors import SimulationError
-from ...features.feature import SimulatedCheck
 from ...features.measurements import lost_samples
 from ...features.registry import FEATURES
 from ...methods.reduced_space import ReducedSpace
@@ -38,10 +37,8 @@ from ...statistics.assessment import rotation_step_concerns, stability_concerns
 from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.combinations import Combination, with_something_to_state
 from ...statistics.concerns import Concern
-from ...statistics.misspecification.hypothesis import Hypothesis, rank
-from ...statistics.misspecification.modes import find_misspecifications_by_modes
-from ...statistics.misspecification.plausibility import size_and_density_hypotheses
-from ...statistics.misspecification.tracks import copied_measurements
+from ...statistics.hypothesis import Hypothesis, rank
+from ...statistics.plausibility import copied_measurements, size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
@@ -225,6 +222,9 @@ def check_problem(
         If a body has no stress-free shape at the guess. A simulation that fails otherwise raises
         nothing: a note states it, and the body is moved rigidly with the grasp instead.
     """
+    from ...judge.registry import SOURCES
+    from ...judge.source import SimulatedCheck
+
     report_progress = report_progress or (lambda _: None)
     lost = [note for each in problem.experiments for note in lost_samples(each)]
     collocation = problem.collocation()
@@ -263,8 +263,8 @@ def check_problem(
         is_simulated=not start_notes,
     )
     # In reverse order, because comparisons that need a fit are made only if no other is likely.
-    for feature in reversed(FEATURES):
-        found, found_notes = feature.simulated_hypotheses(check)
+    for source in reversed(SOURCES):
+        found, found_notes = source.simulated(check)
         if found:
             causes = rank((*causes, *found))
             check = replace(check, causes=causes)
@@ -478,6 +478,9 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     InputError
         For a size or a density that no body can have.
     """
+    from ...judge.modes import find_misspecifications_by_modes
+    from ...judge.registry import SOURCES
+
     constants = typical_constants(problem.parameters)
     odd = (oddity for body in problem.bodies for oddity in size_and_density_hypotheses(body))
     doubtful = (
@@ -486,9 +489,6 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         for cause in find_misspecifications_by_modes(e, constants, huber=problem.huber)
     )
     by_feature = (
-        cause
-        for feature in FEATURES
-        for e in problem.experiments
-        for cause in feature.hypotheses(e)
+        cause for source in SOURCES for e in problem.experiments for cause in source.described(e)
     )
     return (*odd, *rank((*by_feature, *doubtful)))

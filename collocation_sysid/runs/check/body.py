@@ -18,7 +18,7 @@ from ...fem.spatial_field import FieldResolution
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...statistics.concerns import Concern, concern_if
-from ...statistics.misspecification.plausibility import density_concerns
+from ...statistics.plausibility import density_concerns
 from ...statistics.stability_concerns import rest_stability_concerns
 
 # Mean-ratio quality below which an element's shape functions are poor.

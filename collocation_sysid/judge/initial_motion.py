@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ...common.array_types import Array
-from ...recording.experiment import Experiment
-from ..distributions import chi2_sf
-from .hypothesis import Hypothesis
+from ..common.array_types import Array
+from ..recording.experiment import Experiment
+from ..statistics.distributions import chi2_sf
+from ..statistics.hypothesis import Hypothesis
 
 # Fewest samples of the initial interval: third differences need four.
 FEWEST_SAMPLES = 6

@@ -12,19 +12,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...common.array_types import Array, root_mean
-from ...errors import InputError
-from ...methods.solution import Solution
-from ...recording.custom_sensor import CustomSensor
-from ...recording.deviation import Deviation
-from ...recording.experiment import Experiment
-from ...recording.measured_wrench import Wrench
-from ...recording.measurement import Measurement
-from ..axes import with_other_axes
-from ..linearised import LinearisedFit, linearise_fit
-from ..thresholds import BETTER, LEAST_DECREASE
-from .hypothesis import Correction, Hypothesis, corrected_hypothesis
-from .models import linear_step, projected_gram
+from ..common.array_types import Array, root_mean
+from ..errors import InputError
+from ..methods.solution import Solution
+from ..recording.custom_sensor import CustomSensor
+from ..recording.experiment import Experiment
+from ..recording.measured_wrench import Wrench
+from ..recording.measurement import Measurement
+from ..statistics.axes import with_other_axes
+from ..statistics.hypothesis import Hypothesis
+from ..statistics.linearised import LinearisedFit, linearise_fit
+from ..statistics.thresholds import BETTER, LEAST_DECREASE
+from .bodies import linear_step, projected_gram
+from .doubt import Correction, Doubt
 
 # Factors of wrong units: prefixes, percent, degrees, kilograms-force, pounds-force, psi, inches.
 FACTORS = (1e6, 1e3, 1e2, 1e1, 180 / np.pi, 9.80665, 4.4482216, 6894.757, 25.4)
@@ -91,13 +91,13 @@ def sensor_hypotheses(
         whole = whole_mistakes(sensor, predictions[sensor]) if is_plain else ()
         title = sensor.samples_text or sensor.title
         for row in (*whole, *linear):
-            if hypothesis := corrected_hypothesis(row, experiment):
+            if hypothesis := row.hypothesis(experiment):
                 yield replace(hypothesis, subject=f"{title} of '{experiment.name}'")
 
 
 def measurement_mistake(
     code: str, stated: Measurement, without: Callable[[Measurement], Measurement], **data: object
-) -> Deviation:
+) -> Doubt:
     """Return the row of a measurement that is described wrongly; its name is the code of the
     hypothesis, and `without` returns the measurement without the mistake.
     """
@@ -111,12 +111,12 @@ def measurement_mistake(
             return None
         return other, data
 
-    return Deviation(code, stated.unit, corrected=corrected, is_whole=True)
+    return Doubt(code, stated.unit, correct=corrected, is_whole=True)
 
 
 def _mistake(
     code: str, sensor: Measurement, values: Array, t_s: Array | None = None, **data: object
-) -> Deviation:
+) -> Doubt:
     """Return the row of a sensor that measured other values (S, m), or at other times (S,)."""
     times_s = sensor.sample_times_s if t_s is None else t_s
     return measurement_mistake(
@@ -124,7 +124,7 @@ def _mistake(
     )
 
 
-def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
+def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Doubt]:
     """Yield wrong signs, units and axes of a sensor."""
     measured = sensor.measured_values
     sigmas = sensor.sample_sigmas
@@ -144,7 +144,7 @@ def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]
         yield from _other_axes(sensor, predicted)
 
 
-def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
+def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Doubt]:
     measured = sensor.measured_values
 
     def misfit(values: Array) -> float:
@@ -159,7 +159,7 @@ def _other_axes(sensor: Measurement, predicted: Array) -> Iterator[Deviation]:
 
 def _linear_mistakes(
     sensor: Measurement, predicted: Array, fit: LinearisedFit, own: int, origin: Measurement
-) -> Iterator[Deviation]:
+) -> Iterator[Doubt]:
     """Yield a wrong zero and a wrong clock of a sensor, by the amounts that explain its residuals,
     the block `own` of the fit, best. Messages state the differences from `origin`, the sensor as it
     was stated.

@@ -17,26 +17,25 @@ from typing import Any
 
 import numpy as np
 
-from ...common.array_types import Array
-from ...common.time_dependence import at_times
-from ...errors import InputError, SimulationError
-from ...methods.reduced_search import UNLIMITED
-from ...methods.reduced_space import ReducedSpace
-from ...methods.solution import Solution, Status
-from ...methods.starts.continuation import first_samples
-from ...methods.starts.initial_trajectories import associated_at_guess
-from ...program.collocation import Collocation, ExperimentIterate
-from ...program.modes.modal_prediction import DeclaredMotion
-from ...recording.deviation import Deviation
-from ...recording.experiment import Experiment
-from ...recording.grasp import Grasp
-from ...recording.hysteresis import branch_differences, loading_branch, unloading_difference
-from ...recording.measurement_selection import measured_count
-from ...recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
-from ...recording.poses import PoseSequence
-from ..distributions import normal_isf
-from ..probes.relaxed_assumptions import NOISE
-from ..thresholds import (
+from ..common.array_types import Array
+from ..common.time_dependence import at_times
+from ..errors import InputError, SimulationError
+from ..methods.reduced_search import UNLIMITED
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution, Status
+from ..methods.starts.continuation import first_samples
+from ..methods.starts.initial_trajectories import associated_at_guess
+from ..program.collocation import Collocation, ExperimentIterate
+from ..program.modes.modal_prediction import DeclaredMotion
+from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp
+from ..recording.hysteresis import branch_differences, loading_branch, unloading_difference
+from ..recording.measurement_selection import measured_count
+from ..recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
+from ..recording.poses import PoseSequence
+from ..statistics.distributions import normal_isf
+from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
+from ..statistics.thresholds import (
     BETTER,
     CERTAIN,
     ESTIMATED_LAGS,
@@ -45,22 +44,17 @@ from ..thresholds import (
     INDISTINGUISHABLE,
     LINEAR,
     MIRRORED,
+    NOISE,
     PARTIAL,
     PARTLY,
     RARE,
     REPRODUCED,
     SLIP,
 )
-from .hypothesis import (
-    Correction,
-    Hypothesis,
-    HypothesisTest,
-    clock_hypothesis,
-    corrected_hypotheses,
-    rank,
-)
-from .models import LinearCorrection, coarse_mesh_hypotheses, mirrored_meshes, screened_bodies
+from .bodies import LinearCorrection, coarse_mesh_hypotheses, mirrored_meshes, screened_bodies
+from .doubt import Correction, Doubt, HypothesisTest, clock_hypothesis, corrected_hypotheses
 from .modes import ModalComparison, find_misspecifications_by_modes, gravity_hypotheses
+from .registry import SOURCES
 from .sensors import sensor_hypotheses, sensor_misfits
 from .tracks import exchanged_places, filtered_signals, same_tracks
 
@@ -303,7 +297,7 @@ def _gravity_hypotheses(declared: Experiment, comparison: ModalComparison) -> It
         yield replace(nearest, corrected=replace(declared, gravity_m_s2=gravity_m_s2))
 
 
-def _unloading(solution: Solution) -> Deviation:
+def _unloading(solution: Solution) -> Doubt:
     """Return the row of a material that unloads below its loading curve on a bench; without it only
     the loading branch is fitted. The message has the differences of all fitted experiments.
     """
@@ -315,10 +309,10 @@ def _unloading(solution: Solution) -> Deviation:
         fitted = [each.experiment for each in solution.collocation.transcriptions]
         return branch, {"sizes": branch_differences(each for each in fitted if not each.specimen)}
 
-    return Deviation("hysteresis", "1", corrected=corrected, is_whole=True)
+    return Doubt("hysteresis", "1", correct=corrected, is_whole=True)
 
 
-def _slip(fitted_m: Array) -> Deviation:
+def _slip(fitted_m: Array) -> Doubt:
     """Return an impossible row if two means explain no residuals `SLIP` times better than one."""
 
     def corrected(experiment: Experiment, _: Array) -> Correction:
@@ -340,7 +334,7 @@ def _slip(fitted_m: Array) -> Deviation:
         data = {"marker": markers.names[m], "t_s": experiment.t_s[clearest[m][1]]}
         return replace(experiment, markers=replace(markers, positions_m=tracks)), data
 
-    return Deviation("marker-slip", "m", corrected=corrected, is_whole=True)
+    return Doubt("marker-slip", "m", correct=corrected, is_whole=True)
 
 
 def _largest_step(residual: Array) -> tuple[float, int]:
@@ -563,7 +557,7 @@ def _lag_s(fitted: Solution) -> float:
     return lagged / max(moved, 1e-300)
 
 
-def _other_layer(deeper: bool) -> Deviation:
+def _other_layer(deeper: bool) -> Doubt:
     """Return the row of grasps of at least three nodes, and not of all."""
 
     def corrected(experiment: Experiment, _: Array) -> Correction:
@@ -586,7 +580,7 @@ def _other_layer(deeper: bool) -> Deviation:
             return None
         return other, {"deep": "more" if deeper else "fewer"}
 
-    return Deviation("grasp-layer", "1", corrected=corrected, is_whole=True)
+    return Doubt("grasp-layer", "1", correct=corrected, is_whole=True)
 
 
 GRASP_LAYERS = (_other_layer(deeper=True), _other_layer(deeper=False))
@@ -596,3 +590,39 @@ def _residual(experiment: Experiment, predicted_m: Array) -> Array:
     return np.where(
         experiment.markers.is_measured, predicted_m - experiment.markers.positions_m, np.nan
     )
+
+
+# The same for tests on benches and for motions.
+TESTED = {
+    True: "hysteresis, layer of the grasp, sensors, the law of the material",
+    False: "clock, slip in the grasp, gravity, layer of the grasp, sensors, the laws of the material",
+}
+
+
+def find_misspecifications(solution: Solution) -> tuple[Hypothesis, ...]:
+    """Return hypotheses of what is described wrongly, likeliest first; empty where the residuals
+    are noise.
+
+    Those of the features are always tested; others only if a measurement of an experiment
+    misses, see `motion_misspecifications`.
+
+    Returns
+    -------
+    tuple of Hypothesis
+        `strength` is the factor by which the misfit decreases without the mistake.
+    """
+    hypotheses = [hypothesis for source in SOURCES for hypothesis in source.fitted(solution)]
+    hypotheses += motion_misspecifications(solution, hypotheses)
+    return rank(hypotheses)
+
+
+def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, ...]:
+    """Return notes on causes that the data do not show (`Hypothesis.is_open`), or else that refits
+    found no cause of a misfit; empty if there is another cause, or if the measurements do not miss.
+    """
+    if causes:
+        return tuple(each.message for each in causes if each.is_open)
+    if not measurements_miss(solution):
+        return ()
+    is_static = all(each.experiment.is_static for each in solution.collocation.transcriptions)
+    return (f"{NO_CAUSE} ({TESTED[is_static]})",)

@@ -10,16 +10,16 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from ...common.array_types import Array, root_mean
-from ...program.experiment_iterate import ExperimentIterate
-from ...program.measured_motion import Predicted
-from ...recording.experiment import Experiment
-from ...recording.markers import Markers
-from ...recording.measurement import Measurement
-from ...recording.nuisance import PLACE
-from ..distributions import normal_isf
-from ..thresholds import RARE
-from .hypothesis import Hypothesis, exchanged_names
+from ..common.array_types import Array, root_mean
+from ..program.experiment_iterate import ExperimentIterate
+from ..program.measured_motion import Predicted
+from ..recording.experiment import Experiment
+from ..recording.markers import Markers
+from ..recording.nuisance import PLACE
+from ..statistics.distributions import normal_isf
+from ..statistics.hypothesis import Hypothesis
+from ..statistics.thresholds import RARE
+from .doubt import exchanged_names
 
 # RMS distance of two tracks over that of independent noise at one place, up to which they are the
 # same.
@@ -102,28 +102,6 @@ def same_tracks(experiment: Experiment) -> Iterator[Hypothesis]:
         data = {"first": names[i], "second": names[j], "by_mm": 1e3 * rms_m}
         yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=OTHER_PLACE)
         return
-
-
-def copied_measurements(experiments: Iterable[Experiment]) -> list[Hypothesis]:
-    """Return each pair of measurements, of the same or of two recordings, with a series of values
-    that is exactly the same in both; noise excludes this. Constant series do not count, and of
-    markers only those of two recordings, see `same_tracks`.
-    """
-    first: dict[bytes, tuple[Experiment, Measurement, str]] = {}
-    pairs: dict[tuple[Experiment, Measurement, Experiment, Measurement], Hypothesis] = {}
-    for experiment in experiments:
-        for measurement in experiment.measurements:
-            for name, values in measurement.series():
-                if len(np.unique(values[np.isfinite(values)])) < FEWEST_VALUES:
-                    continue
-                found = experiment, measurement, f"{name} of '{experiment.name}'"
-                earlier = first.setdefault(values.tobytes(), found)
-                is_track = isinstance(measurement, Markers) and earlier[0] is experiment
-                if earlier is not found and not is_track:
-                    data = {"first": earlier[2], "second": found[2]}
-                    twice = Hypothesis("measured-twice", data=data)
-                    pairs.setdefault((*earlier[:2], *found[:2]), twice)
-    return [*pairs.values()]
 
 
 def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Iterator[Hypothesis]:

@@ -16,21 +16,22 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.linalg import ArpackError
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array, Index
-from ...errors import SimulationError
-from ...program.modes.modal_prediction import DeclaredMotion, ModalResponse, delayed_tracks
-from ...recording.experiment import Experiment
-from ...recording.placement import LocatedBody, place_markers
-from ..axes import with_other_axes
-from ..thresholds import FITTED, LARGEST_MISFIT, LEAST_IMPROVEMENT, ONE_OF_MANY
-from .hypothesis import Hypothesis, HypothesisTest, clock_hypothesis, exchanged_names, rank
-from .initial_motion import initial_motion_hypotheses
-from .plausibility import (
+from ..common.array_types import Array, Index
+from ..errors import SimulationError
+from ..program.modes.modal_prediction import DeclaredMotion, ModalResponse, delayed_tracks
+from ..recording.experiment import Experiment
+from ..recording.placement import LocatedBody, place_markers
+from ..statistics.axes import with_other_axes
+from ..statistics.hypothesis import Hypothesis, rank
+from ..statistics.thresholds import FITTED, LARGEST_MISFIT, LEAST_IMPROVEMENT, ONE_OF_MANY
+from .contradictions import (
     load_sign_hypotheses,
     name_exchange_hypotheses,
     step_hypotheses,
     undriven_motion,
 )
+from .doubt import HypothesisTest, clock_hypothesis, exchanged_names
+from .initial_motion import initial_motion_hypotheses
 
 # Accuracy of small strains and a few modes, over the size of the body.
 ROUGHLY = 0.005

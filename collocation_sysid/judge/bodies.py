@@ -18,22 +18,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from ...common.array_types import Array
-from ...errors import InputError, SimulationError
-from ...fem.body import Body
-from ...fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
-from ...fem.meshes.mesh import TetMesh
-from ...fem.rest_shape import UnderGravity
-from ...methods.solution import Solution
-from ...recording.deviation import Deviation
-from ...recording.experiment import Experiment
-from ..budget.consider_analysis import changed_residuals
-from ..budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
-from ..budget.shape_error import GRAVITY_M_S2, other_section, sag_m
-from ..budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect, shape_effect
-from ..linearised import LinearisedFit, linearise_fit
-from ..thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
-from .hypothesis import Correction, Hypothesis, corrected_hypothesis
+from ..common.array_types import Array
+from ..errors import InputError, SimulationError
+from ..fem.body import Body
+from ..fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
+from ..fem.meshes.mesh import TetMesh
+from ..fem.rest_shape import UnderGravity
+from ..methods.solution import Solution
+from ..recording.deviation import Deviation
+from ..recording.experiment import Experiment
+from ..statistics.budget.consider_analysis import changed_residuals
+from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
+from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
+from ..statistics.budget.systematic_effects import (
+    Effect,
+    ExperimentAtAnswer,
+    section_effect,
+    shape_effect,
+)
+from ..statistics.hypothesis import Hypothesis
+from ..statistics.linearised import LinearisedFit, linearise_fit
+from ..statistics.thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
+from .doubt import Correction, Doubt
 
 AXES = "xyz"
 # Most hypotheses of a screening that are fitted again.
@@ -93,7 +99,7 @@ def with_laws(body: Body, material: Material | None, damping: DampingLaw | None)
     return body.with_parts(tuple(replace(part, **changed) for part in body.parts))
 
 
-def _likely_mistakes(body: Body) -> Iterator[Deviation]:
+def _likely_mistakes(body: Body) -> Iterator[Doubt]:
     materials = ("", *other_materials(body))
     dampings = ("", *other_dampings(body))
     for laws in [(m, d) for m in materials for d in dampings][1:]:
@@ -107,7 +113,7 @@ def _likely_mistakes(body: Body) -> Iterator[Deviation]:
         yield REST_SHAPE
 
 
-def _other_laws(material: str, damping: str) -> Deviation:
+def _other_laws(material: str, damping: str) -> Doubt:
     def effect(at: ExperimentAtAnswer, _: int) -> Effect:
         other = with_laws(at.stress_free_body, MATERIALS.get(material), DAMPINGS.get(damping))
         return Effect(at.internal_n(body=other) - at.internal_force_n)
@@ -118,10 +124,10 @@ def _other_laws(material: str, damping: str) -> Deviation:
         return other and (other, {"material": material, "damping": damping})
 
     which = "/both" if material and damping else "" if material else "/damping"
-    return Deviation(f"law{which}", "1", effect=effect, corrected=corrected, is_whole=True)
+    return Doubt(f"law{which}", "1", effect=effect, correct=corrected, is_whole=True)
 
 
-def _other_width(axis: int) -> Deviation:
+def _other_width(axis: int) -> Doubt:
     def effect(at: ExperimentAtAnswer, _: int) -> Effect:
         moved_m = np.zeros_like(at.body.nodes_m)
         points_m = at.body.nodes_m
@@ -137,7 +143,7 @@ def _other_width(axis: int) -> Deviation:
         way = "narrow" if width > 0 else "wide"
         return other and (other, {"axis": AXES[axis], "percent": 100 * abs(width), "way": way})
 
-    return Deviation("mesh-width", "1", effect=effect, corrected=corrected)
+    return Doubt("mesh-width", "1", effect=effect, correct=corrected)
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
@@ -166,14 +172,14 @@ def _of_other_section(experiment: Experiment, _: Array) -> Correction:
     return other, {"real": real, "meshed": meshed}
 
 
-SECTION = Deviation(
+SECTION = Doubt(
     "mesh-section",
     "1",
     effect=lambda at, _: section_effect(at),
-    corrected=_of_other_section,
+    correct=_of_other_section,
     is_whole=True,
 )
-REST_SHAPE = Deviation("rest-shape", "1", axes="x y z", effect=_scan_effect, corrected=_stress_free)
+REST_SHAPE = Doubt("rest-shape", "1", _stress_free, effect=_scan_effect, axes="x y z")
 
 
 def _is_uniform(body: Body) -> bool:
@@ -207,17 +213,19 @@ def screened_bodies(
     rows = [*_likely_mistakes(experiment.body)]
     if not rows:
         return
-    columns = changed_residuals(collocation, solution.z, [(row, 1.0) for row in rows])
+    # Of the deviation only the effect counts here.
+    changes = [Deviation(row.name, row.unit, axes=row.axes, effect=row.effect) for row in rows]
+    columns = changed_residuals(collocation, solution.z, [(each, 1.0) for each in changes])
     gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
     found: list[tuple[float, Hypothesis]] = []
     first = 1
-    for row in rows:
-        own = range(first, first + len(row.components))
+    for row, change in zip(rows, changes, strict=True):
+        own = range(first, first + len(change.components))
         first = own.stop
         decrease, amplitudes = linear_step(gram, own, np.ones(len(own)) if row.is_whole else None)
         if is_far and row.name == "law":
             decrease = np.inf
-        hypothesis = corrected_hypothesis(row, experiment, amplitudes)
+        hypothesis = row.hypothesis(experiment, amplitudes)
         if decrease >= LEAST_DECREASE and hypothesis is not None:
             found.append((decrease, hypothesis))
     found.sort(key=lambda each: -each[0])
@@ -297,7 +305,7 @@ def linear_step(
     return float(-2 * amplitudes @ gram[own, 0] - amplitudes @ among @ amplitudes), amplitudes
 
 
-def mirrored_meshes(experiment: Experiment) -> Iterator[Deviation]:
+def mirrored_meshes(experiment: Experiment) -> Iterator[Doubt]:
     """Yield the rows of a mesh that is a mirror image along an axis about the middle of its grasps,
     if that is another shape.
     """
@@ -322,12 +330,12 @@ def mirrored_meshes(experiment: Experiment) -> Iterator[Deviation]:
             yield _mirrored(axis, factors, code)
 
 
-def _mirrored(axis: int, factors: Array, code: str) -> Deviation:
+def _mirrored(axis: int, factors: Array, code: str) -> Doubt:
     def corrected(experiment: Experiment, _: Array) -> Correction:
         other = with_shape(experiment, factors)
         return other and (other, {"axis": AXES[axis]})
 
-    return Deviation(code, "1", corrected=corrected, is_whole=True)
+    return Doubt(code, "1", correct=corrected, is_whole=True)
 
 
 def _middle_of_grasps_m(experiment: Experiment) -> Array:

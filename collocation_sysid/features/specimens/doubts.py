@@ -28,11 +28,12 @@ from ...common.array_types import Array
 from ...common.display import readable_stress
 from ...errors import InputError, SimulationError, listed
 from ...fem.laws.moduli import engineering_constants
+from ...judge.doubt import Correction, Doubt, HypothesisTest
+from ...judge.source import Source
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
 from ...program.custom_sensor_residual import CustomSensorResidual
-from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.homogeneous_deformation import DEFORMATIONS, HomogeneousDeformation
@@ -49,12 +50,7 @@ from ...recording.specimen import (
 )
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
-from ...statistics.misspecification.hypothesis import (
-    Correction,
-    Hypothesis,
-    HypothesisTest,
-    corrected_hypothesis,
-)
+from ...statistics.hypothesis import Hypothesis
 from ...statistics.thresholds import (
     BETTER,
     CERTAIN,
@@ -211,7 +207,7 @@ def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
     corrections: dict[str, list[Experiment]] = {}
     for each in chosen:
         for row in _other_kinds(each):
-            if hypothesis := corrected_hypothesis(row, each):
+            if hypothesis := row.hypothesis(each):
                 corrections.setdefault(hypothesis.data["test"], []).append(hypothesis.corrected)
     stated = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
     if stated is None:
@@ -288,7 +284,7 @@ def _is_explained(
 ) -> bool:
     """Residuals below `MISFIT` σ, uncorrelated, plausible nuisances, and `DECISIVE` less χ²."""
     chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
-    corrected = tested.deviation and corrected_hypothesis(tested.deviation, chosen[index])
+    corrected = tested.doubt and tested.doubt.hypothesis(chosen[index])
     if not corrected:
         return False
     chosen[index] = corrected.corrected
@@ -370,13 +366,11 @@ def _residuals(part: ExperimentIterate) -> list[Array]:
 
 def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Hypothesis]:
     for row in likely_mistakes(experiment, other_slopes_pa):
-        if hypothesis := corrected_hypothesis(row, experiment):
+        if hypothesis := row.hypothesis(experiment):
             yield hypothesis
 
 
-def likely_mistakes(
-    experiment: Experiment, other_slopes_pa: Sequence[float]
-) -> Iterator[Deviation]:
+def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Doubt]:
     """Yield the likely mistakes about a specimen. The name of a row is the code of its hypothesis."""
     yield _mistake("specimen-true-stress", _of_engineering_stress)
     for code, is_widening in (("", False), ("/widening", True)):
@@ -397,7 +391,7 @@ def likely_mistakes(
                 yield _mistake("specimen-area", partial(_of_area, what=what, factor=factor))
 
 
-def _other_kinds(experiment: Experiment) -> Iterator[Deviation]:
+def _other_kinds(experiment: Experiment) -> Iterator[Doubt]:
     assert experiment.specimen is not None
     strain, _ = specimen_strains(experiment)
     kinds = CONFUSED_TESTS.get(experiment.specimen.test, ())
@@ -409,8 +403,8 @@ def _other_kinds(experiment: Experiment) -> Iterator[Deviation]:
         yield _mistake("specimen-kind", partial(_of_another_kind, test=test))
 
 
-def _mistake(name: str, corrected: Callable[[Experiment], Correction]) -> Deviation:
-    return Deviation(name, "1", corrected=lambda at, _: corrected(at), is_whole=True)
+def _mistake(name: str, corrected: Callable[[Experiment], Correction]) -> Doubt:
+    return Doubt(name, "1", lambda at, _: corrected(at), is_whole=True)
 
 
 def _of_engineering_stress(experiment: Experiment) -> Correction:
@@ -560,3 +554,6 @@ def _compressed(experiment: Experiment, is_widening: bool) -> Correction:
         for gauge in reversed_stress.readings
     ]
     return _strained(replace(reversed_stress, readings=readings), -1.0), {}
+
+
+SPECIMENS = Source(fitted=find_specimen_misspecifications)

@@ -19,6 +19,10 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...errors import InputError, SimulationError
+from ...judge.contradictions import load_sign_hypotheses
+from ...judge.doubt import Doubt, HypothesisTest
+from ...judge.sensors import measurement_mistake
+from ...judge.source import SimulatedCheck, Source
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...methods.starts.continuation import first_samples
@@ -27,49 +31,18 @@ from ...program.markers.residual import MarkerResidual
 from ...program.observables import ObservedMotion, ReactionForces
 from ...program.transcription import Transcription
 from ...program.wrench_residual import WrenchResidual, without_grasp_sensors
-from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.measured_wrench import Wrench
 from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ...recording.poses import Frame
 from ...statistics.axes import with_other_axes
 from ...statistics.budget.shape_error import other_section
-from ...statistics.misspecification.hypothesis import (
-    Hypothesis,
-    HypothesisTest,
-    corrected_hypothesis,
-)
-from ...statistics.misspecification.sensors import measurement_mistake
+from ...statistics.hypothesis import Hypothesis, rank
 from ...statistics.thresholds import BETTER, FITTED, NOISE_LEVEL, ONE_OF_MANY
+from .at_guess import wrench_deviations
 
-# Messages of the hypotheses by the codes of their concerns.
-MESSAGES = {
-    "description/wrench-sign": "it fits with the opposite sign: it is the force of the body on the "
-    "grasp instead of that of the grasp on the body; set sign = -1 in the table of the "
-    "wrench",
-    "description/wrench-sign/part": "its {what} fit with the opposite sign, the other components do "
-    "not: change the sign of these columns",
-    "description/wrench-axes": "its axes are exchanged or reversed: it fits with ({axes}) in place "
-    "of (x, y, z), both forces and torques; reorder the columns, rotate the sensor's axes, or "
-    "for a log state sensor_frame in the table of the wrench",
-    "description/wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of "
-    "the sensor, and the density or mass of the body",
-    "description/wrench-gain/section": "its {what} fit if multiplied by {factor:.3g}, as if the body had "
-    "{ratio:.3g} times its mass: probably the section of the body is {real}, and that of the mesh is not "
-    "and as wide, with the same density; mesh the section of the body, or check the sensor",
-    "description/wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: "
-    "set point_m = {point}, with which they fit",
-    "description/wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
-    "description/wrench-unit": "its {what} seem to be in {unit}: multiply them by {factor:g}",
-    "description/wrench-clock": "it was measured about {by_ms:.3g} ms {when} than its times t_s "
-    "state: its clock differs from that of the poses; correct t_s of the wrench, or "
-    "estimate the difference with nuisance.sensor_time",
-    "description/wrench-tare": "the sensor was probably zeroed while it carried the body: zero it "
-    "before the grasp, or widen nuisance.tare",
-    "description/sign": "along {axis} the displacement of grasp {grasp} and its force on the body have "
-    "opposite signs (correlation {correlation:.2f}), as if the body produced energy: "
-    "one of the signs is wrong; set sign = -1 for the displacement or for the wrench",
-}
+# Longest fit of the first samples to the markers that needs no request [s].
+LONGEST_FIT_S = 10.0
 # RMS residual of the markers in standard deviations above which the prediction is useless.
 MARKERS_MISFIT = 3.0
 # Largest number of sweeps of the fit to the markers, after a solve.
@@ -341,15 +314,15 @@ class _OneSensor:
     def _hypotheses(self) -> Iterator[Hypothesis]:
         subject = f"the wrench of '{self.part.transcription.experiment.name}'"
         for row, handicap in self._mistakes():
-            if (found := corrected_hypothesis(row, self.declared)) is not None:
+            if (found := row.hypothesis(self.declared)) is not None:
                 yield replace(found, subject=subject, handicap=handicap)
 
-    def _mistakes(self) -> Iterator[tuple[Deviation, float]]:
+    def _mistakes(self) -> Iterator[tuple[Doubt, float]]:
         wrench = self.sensor.wrench
 
         def mistake(
             code: str, without: Wrench, handicap: float = 1.0, **data: Any
-        ) -> tuple[Deviation, float]:
+        ) -> tuple[Doubt, float]:
             """Return the row of a sensor that measured `without`; `data` are for the message."""
             return measurement_mistake(code, wrench, lambda _: without, **data), handicap
 
@@ -398,7 +371,7 @@ class _OneSensor:
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
             data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
             yield mistake("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
-        tare = Deviation("wrench-tare", "σ", corrected=lambda *_: (self._with_tare(FREE_TARE), {}))
+        tare = Doubt("wrench-tare", "σ", lambda *_: (self._with_tare(FREE_TARE), {}))
         yield tare, 1.0
 
 
@@ -430,3 +403,55 @@ def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
         sigma_n=wrench.sigma_n * (larger if of_forces else 1.0),
         sigma_nm=wrench.sigma_nm and wrench.sigma_nm * (larger if of_torques else 1.0),
     )
+
+
+def simulated_hypotheses(check: SimulatedCheck) -> tuple[Sequence[Hypothesis], Sequence[str]]:
+    """Return likely errors of wrenches, and notes with the deviation of each from the simulation.
+
+    The first samples are fitted to the markers, unless another error is likely or the fit takes
+    long, which a note says. Wrenches that no such fit predicts are compared with the simulation at
+    the guess instead. Nothing is compared if the simulation failed.
+    """
+    deviations = wrench_deviations(check.parts) if check.is_simulated else []
+    notes = [deviation.note() for deviation in deviations]
+    if check.causes:
+        return (), notes
+    unpredicted = {each.experiment for each in deviations}
+    hypotheses: list[Hypothesis] = []
+    has_both = any(
+        each.wrenches and each.markers.sample_count for each in check.problem.experiments
+    )
+    fit_s = check.fit_s(CHECKED_SAMPLES) if has_both else 0.0
+    if has_both and not check.is_full and fit_s > LONGEST_FIT_S:
+        notes.append(
+            "the wrenches were not compared with the prediction from the markers, which would "
+            f"take about {fit_s:.2g} s; check --full does it"
+        )
+    elif has_both:
+        check.report_progress("comparing the wrenches with the prediction from the markers")
+        hypotheses, predicted = wrench_mistakes(check.collocation)
+        unpredicted -= set(predicted)
+        notes += [
+            f"no fit explains the markers of '{name}', so that its wrench was compared with the "
+            "simulation at the guess alone"
+            for name in sorted(unpredicted)
+        ]
+    for deviation in deviations:
+        if deviation.experiment in unpredicted:
+            hypotheses += deviation.hypotheses()
+    return rank(hypotheses), notes
+
+
+def fit_hypotheses(solution: Solution) -> list[Hypothesis]:
+    """Return likely errors of wrenches, by the residuals of a fit and by the signs of loads."""
+    return [
+        *wrench_causes(solution),
+        *(
+            hypothesis
+            for transcription in solution.collocation.transcriptions
+            for hypothesis in load_sign_hypotheses(transcription.experiment)
+        ),
+    ]
+
+
+WRENCHES = Source(simulated=simulated_hypotheses, fitted=fit_hypotheses)

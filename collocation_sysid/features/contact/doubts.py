@@ -10,32 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ...common.array_types import Array
+from ...judge.source import Source
+from ...methods.solution import Solution
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle, ObstacleForces
 from ...recording.obstacle_solids import Plane
-from ...statistics.misspecification.hypothesis import Hypothesis
+from ...statistics.hypothesis import Hypothesis
 
-# Messages of the hypotheses by the codes of their concerns.
-MESSAGES = {
-    "description/obstacle-pull": "its force pulls at the body with {pull_n:.3g} N, in {samples} of "
-    "{of_samples} samples, which contact without adhesion cannot do: its sign is wrong, or "
-    "it was zeroed during the contact; set sign = -1, or zero the load before the contact",
-    "description/obstacle-friction": "its force is up to {ratio:.2g} times as large along the plane as "
-    "along the normal, and its friction is stated as {stated:.2g}: correct friction, or "
-    "estimate it as a parameter",
-    "description/obstacle-fixed": "its load changes by {change_n:.3g} N, although neither it nor a "
-    "grasp moves: check its poses or displacement",
-    "description/obstacle-stroke": "it moves by {stroke_m:.3g} m, the body is {size_m:.3g} m large: "
-    "check the unit of its displacement or poses, which are in metres",
-    "description/obstacle-load/far": "it has a load although it is up to {by_mm:.3g} mm away from the "
-    "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
-    "description/obstacle-load/deep": "it has no load although it is up to {by_mm:.3g} mm inside the "
-    "undeformed body: check its place, its size, and the axis, sign and unit of its motion",
-    "description/obstacle-load/never": "it has a load although it never presses on the undeformed body, "
-    "along which it moves by {by_mm:.3g} mm: check the axis of its motion, and its place",
-}
 # Loads in standard deviations of their noise from which on they are loads.
 LOADED = 6.0
 # Share of the largest load that calibration and axes may be off.
@@ -49,6 +34,10 @@ PLACE = 0.05
 PRESSING = 0.05
 # Motion of an obstacle over the body's diagonal that no static test has.
 LARGEST_STROKE = 10.0
+# Penetration of a solid from which on a node is inside, over the body's diagonal.
+DEEP = 0.01
+# Largest share of the nodes that may be inside.
+MOST_INSIDE = 0.5
 # Most samples at which gaps are computed, evenly spread.
 MOST_SAMPLES = 30
 
@@ -256,3 +245,62 @@ def _smallest_gaps_m(experiment: Experiment, obstacle: Obstacle, times_s: Array)
         in_frame_m = (points_m - translations_m[k]) @ rotations[k]
         gaps_m[k] = obstacle.shape.signed_distances_m(in_frame_m).min()
     return gaps_m
+
+
+def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
+    """Yield hypotheses about parts of a body that no grasp holds, and about each obstacle that
+    contains more than half of it; they need no further test.
+    """
+    yield from _loose_parts(experiment)
+    for obstacle in experiment.obstacles:
+        yield from _containing(experiment, obstacle)
+
+
+def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
+    """No grasp holds some of the parts; nothing is known without grasps, or with tendons."""
+    cells = experiment.body.cells
+    count = len(experiment.body.nodes_m)
+    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
+    edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
+    _, labels = connected_components(edges, directed=False)
+    parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
+    grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
+    loose = (
+        ~np.isin(parts, np.concatenate(grasped_labels))
+        if grasped_labels
+        else np.zeros(len(parts), dtype=bool)
+    )
+    if loose.any() and not experiment.tendons:
+        data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
+        yield Hypothesis("mesh-parts", f"'{experiment.name}'", data=data, strength=float(count))
+
+
+def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
+    """Blame the normal of a plane with the whole body behind it, else the place of the obstacle."""
+    nodes_m = experiment.rigid_positions(experiment.t_s[:1])[
+        0, : len(experiment.body.nodes.points_m)
+    ]
+    rotations, translations_m = obstacle.poses.at(experiment.t_s[:1])
+    gaps_m = obstacle.shape.signed_distances_m((nodes_m - translations_m[0]) @ rotations[0])
+    deep_m = DEEP * float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
+    share = float((gaps_m < -deep_m).mean())
+    if share <= MOST_INSIDE:
+        return
+    reversible = isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
+    code = "obstacle-normal" if reversible else "obstacle-place"
+    data = {"obstacle": obstacle.name, "percent": 100 * share}
+    yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=100 * share)
+
+
+def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:
+    """Return likely errors in the placement of a body, or else in its obstacles and their loads."""
+    return tuple(placement_mistakes(experiment)) or tuple(obstacle_hypotheses(experiment))
+
+
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield likely errors in the obstacles of the fitted experiments and their loads."""
+    for transcription in solution.collocation.transcriptions:
+        yield from obstacle_hypotheses(transcription.experiment)
+
+
+CONTACT = Source(described=hypotheses, fitted=fit_hypotheses)
