@@ -51,7 +51,7 @@ def with_wrong_assumptions(
     `errors` are in the units of the assumptions; those of the air are shares of the forces of the air
     in the model, and an assumption that is absent is correct.
     """
-    body = _body(experiment, values, errors)
+    body = _body(experiment, errors)
     (grasp,) = experiment.grasps
     slower_clock = 1 - errors.get("time_scale", 0.0)
     poses = grasp.poses
@@ -122,17 +122,18 @@ def _lame(truth: Experiment, values: Mapping[str, float]) -> dict[str, float]:
     return others | {"mu_pa": mu, "lambda_pa": 2 * mu * poisson / (1 - 2 * poisson)}
 
 
-def _body(experiment: Experiment, values: Mapping[str, float], errors: Mapping[str, float]) -> Body:
+def _body(experiment: Experiment, errors: Mapping[str, float]) -> Body:
     old = experiment.body
     (grasp,) = experiment.grasps
     pivot_m = old.nodes_m[grasp.nodes].mean(axis=0)
     scale = 1 + errors.get("body_scale", 0.0)
     points_m = pivot_m + scale * (old.mesh.points_m - pivot_m) + _surface_errors_m(old, errors)
     # Held nodes that end before the body in the model does leave a compliant piece of material.
-    points_m[grasp.nodes] -= _gap_to_grip_m(old, grasp, errors)
+    points_m[grasp.nodes[grasp.nodes < len(points_m)]] -= _gap_to_grip_m(old, grasp, errors)
     mesh = TetMesh(points_m, old.mesh.tetrahedra)
     extra_stiffness = [errors.get(f"anisotropy {axis}", 0.0) for axis in AXES]
     body_options: dict[str, Any] = {"damping": _damping(old.parts[0].damping, errors)}
+    body_options |= {"element": old.element.name}
     if any(extra_stiffness):
         body_options |= {"material": anisotropic_law(extra_stiffness), "evaluator": "casadi"}
     more_drag = errors.get("air_drag", 0.0) - errors.get("added_mass", 0.0)

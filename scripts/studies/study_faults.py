@@ -4,24 +4,18 @@ each.
 A cylinder hangs from a swung hand, as in `coverage_twins`. The tracks are simulated with the scheme
 of the fit and have white noise. Each twin has one error of the recording, a random number of the
 stated size, and is identified with every option at its default: nuisance parameters, noise and
-covariance. The solve starts from the true values. In the rows "every effect" all default assumptions
-of the budget and all nuisance parameters are wrong at once, by random numbers with their standard
-deviations, and the table has the combined interval too. If the damping law is wrong too, the
-intervals of γ_r and γ_m need not contain the true values, because both are constants of the stated
-law.
+covariance. The solve starts from the true values. In `study_effects` all errors are drawn at once.
 
     python scripts study_faults [--twins 200] [--only "gravity 1°"] [--seed 0] [--workers 2]
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from assumed_twins import with_wrong_assumptions
 from coverage_twins import QUANTITIES, SCHEME, intervals_with_truth, reference, truth
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
@@ -31,21 +25,11 @@ from studies import markdown, run_in_processes
 from study_starts import TRUTH, parameters
 
 from collocation_sysid import Problem
-from collocation_sysid.errors import SimulationError
-from collocation_sysid.fem.body import Body
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
-from collocation_sysid.recording.nuisance import CALIBRATION_SCALE
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changed_residuals,
-    changes_of_assumptions,
-)
-from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.budget.variance_sources import VarianceSources, budget
 from collocation_sysid.statistics.curved_intervals import uncertainty_at
-from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
@@ -65,9 +49,6 @@ class FaultOutcome:
     converged: bool  # whether the solve converged
     # (6,): 1 if the statistical interval contains the truth, 0 if not, NaN without interval.
     contains_truth: Array
-    combined_contains_truth: Array  # (6,): as `contains_truth`, for the combined interval
-    # (6,): half widths of the combined intervals over the true values; NaN without interval.
-    half_widths: Array
     relative: Array  # (6,): standard errors over the true values; NaN without standard error
 
 
@@ -94,15 +75,10 @@ def run(fault: str, seed: Sequence[int]) -> FaultOutcome:
     truth.
     """
     rng = np.random.default_rng(seed)
-    recordings: TrueAndStated | None = None
-    while recordings is None:
-        # Some soft bodies with many errors collapse, and nobody would record them.
-        with suppress(SimulationError):
-            recordings = FAULTS[fault](exact_recording(), rng)
-    true_recording, described = recordings
+    true_recording, described = FAULTS[fault](exact_recording(), rng)
     tracks = true_recording.markers.positions_m
     tracks = tracks + true_recording.markers.sigma_m[:, None] * rng.standard_normal(tracks.shape)
-    return identified(with_markers(described, tracks), BUDGETS.get(fault))
+    return identified(with_markers(described, tracks))
 
 
 @cache
@@ -118,33 +94,14 @@ def positions_m() -> Array:
     return x.reshape(len(x), -1, 3)
 
 
-def identified(experiment: Experiment, left_out: Mapping[str, None] | None = None) -> FaultOutcome:
+def identified(experiment: Experiment) -> FaultOutcome:
     """Identify an experiment with default options, starting from the truth."""
     problem = Problem([experiment], parameters(np.array(list(TRUTH.values()))))
     solution = solve(problem, ReducedSpace(tolerance=1e-6, ladder=(1.0,)))
-    collocation, z = solution.collocation, solution.z
-    uncertainty = uncertainty_at(collocation, z)
-    changes = (
-        changed_residuals(collocation, z, [])
-        if left_out is None
-        else changes_of_assumptions(collocation, z, left_out)
-    )
-    fit = linearise_fit(collocation, z)
-    sources = VarianceSources.from_fit(
-        fit, changes, collocation.parameters, solution.q, uncertainty
-    )
-    lines = budget(sources, uncertainty, {}, problem.parameters)
-    true = truth()
-    combined = np.array(
-        [lines[name].combined95 if name in lines else (np.nan, np.nan) for name in QUANTITIES]
-    )
-    values = np.array([true[name] for name in QUANTITIES])
-    contained = (combined[:, 0] <= values) & (values <= combined[:, 1])
+    uncertainty = uncertainty_at(solution.collocation, solution.z)
     return FaultOutcome(
         solution.status.converged,
         np.array(intervals_with_truth(uncertainty)),
-        np.where(np.isnan(combined[:, 0]), np.nan, contained),
-        np.ptp(combined, axis=1) / 2 / values,
         relative_errors(uncertainty),
     )
 
@@ -265,71 +222,6 @@ def at_places(experiment: Experiment, places_m: Array) -> Experiment:
     return replace(experiment, markers=markers)
 
 
-def _errors(names: Sequence[str], rng: Generator) -> dict[str, float]:
-    errors = {}
-    for row in (row for row in ASSUMPTIONS if row.name in names):
-        for name in row.components:
-            error = (row.considered or 0.0) * rng.standard_normal()
-            # Coefficients of the air are not negative, and a negative share of either damping law
-            # would add energy where the body is stretched.
-            errors[name] = max(error, -0.99) if row.name in AIR else error
-            if row.name == "damping_law":
-                errors[name] = min(abs(error), 1.0)
-    return errors
-
-
-def true_values() -> dict[str, float]:
-    """Return E, ν and the damping constants of the twins."""
-    return {name: truth()[name] for name in ("young_pa", "poisson", *list(TRUTH)[2:])}
-
-
-def draw_every_error(names: Sequence[str]) -> Callable[..., TrueAndStated]:
-    """Return a fault that draws deviations from the named assumptions of a body with the default
-    damping law, and all nuisance parameters that are estimated or considered by default.
-    """
-
-    def fault(experiment: Experiment, rng: Generator) -> TrueAndStated:
-        described = replace(experiment, body=body_with_default_damping())
-        nuisance = described.nuisance
-        sizes = nuisance.hand_eye_m or 0.0, nuisance.hand_eye_rad or 0.0
-        held = displaced(tilted_gravity(described, rng), *sizes, rng)
-        moved = with_wrong_assumptions(held, true_values(), _errors(names, rng))
-        late_s = (nuisance.time_shift_s or 0.0) * rng.standard_normal()
-        seen_s = np.clip(described.t_s - late_s, 0.0, described.t_s[-1])
-        tracks_m = CubicSpline(described.t_s, moved.markers.positions_m)(seen_s)
-        pivot_m = tracks_m[0].mean(axis=0)
-        scale = 1 + (CALIBRATION_SCALE.considered or 0.0) * rng.standard_normal()
-        places_m = described.markers.predict_positions(described.body.nodes_m)
-        off_m = (nuisance.marker_offset_m or 0.0) * rng.standard_normal(places_m.shape)
-        return (
-            with_markers(described, pivot_m + scale * (tracks_m - pivot_m)),
-            at_places(described, places_m + off_m),
-        )
-
-    return fault
-
-
-@cache
-def body_with_default_damping() -> Body:
-    """Return the body of the twins with the default damping law."""
-    body = exact_recording().body
-    return Body(body.mesh, density_kg_m3=body.mass_kg / body.mesh.volume_m3)
-
-
-AIR = ("air_drag", "added_mass", "buoyancy")
-# All effects of the default budget but the damping law; the budget has what is drawn.
-WITHOUT_LAW = (
-    *("body_scale", "mass", "density_gradient", "stiffness_gradient", "anisotropy"),
-    *("stiffness_drift", "time_scale", *AIR, "surface", "grip_layer_m", "grasp_edge_m"),
-)
-EVERY = {
-    "every effect": (*WITHOUT_LAW, "damping_law"),
-    "every effect but the damping law": WITHOUT_LAW,
-}
-BUDGETS: dict[str, Mapping[str, None]] = {
-    name: {} if "damping_law" in names else {"damping_law": None} for name, names in EVERY.items()
-}
-
 FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "none": without_fault,
     "clock 2 ms late": late(0.002),
@@ -342,7 +234,6 @@ FAULTS: dict[str, Callable[[Experiment, Generator], TrueAndStated]] = {
     "marker positions 1 mm": misplaced,
     "marker positions unknown": unplaced,
 }
-FAULTS |= {fault: draw_every_error(names) for fault, names in EVERY.items()}
 
 
 # Table --------------------------------------------------------------------------------------------
@@ -350,22 +241,16 @@ FAULTS |= {fault: draw_every_error(names) for fault, names in EVERY.items()}
 
 HEADS = (
     "fault",
-    *(
-        f"{column} {kind}, %"
-        for kind in ("coverage", "combined coverage", "combined half width", "standard error")
-        for column in COLUMNS
-    ),
+    *(f"{column} {kind}, %" for kind in ("coverage", "standard error") for column in COLUMNS),
     "not converged",
 )
 
 
 def table_row(fault: str, outcomes: Sequence[FaultOutcome]) -> tuple[str, ...]:
-    """Return a row of the table: coverages, and median half widths and standard errors over the true
-    values.
-    """
+    """Return a row of the table: coverages, and median standard errors over the true values."""
     converged = [outcome for outcome in outcomes if outcome.converged]
-    contained = np.array([[*o.contains_truth, *o.combined_contains_truth] for o in converged])
-    widths = np.array([[*o.half_widths, *o.relative] for o in converged])
+    contained = np.array([o.contains_truth for o in converged])
+    widths = np.array([o.relative for o in converged])
     return (
         fault,
         *(_cell(each, np.mean, ".3g") for each in contained.T),

@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -83,23 +83,36 @@ def main() -> None:
     parser.add_argument("--across", type=int, default=2, help="tet10 elements across the thickness")
     parser.add_argument("--poisson", type=float, help="true Poisson's ratio of all twins")
     arguments = parser.parse_args()
-    answers = arguments.folder / "answers.jsonl"
-    known = read_answers(answers)
-    for seed in range(arguments.first, arguments.first + arguments.twins):
-        if seed in known:
-            continue
+
+    def answer(seed: int) -> dict[str, Any]:
         folder = arguments.folder / f"{seed:03d}"
         if not (folder / "problem.toml").exists():
             twin = draw(seed, arguments.exact, arguments.poisson)
             write_problem(twin, folder, seed, arguments.across)
-        known[seed] = solve(folder, seed)
-        answers.parent.mkdir(parents=True, exist_ok=True)
-        with answers.open("a", encoding="utf-8") as file:
+        return solve(folder, seed)
+
+    seeds = range(arguments.first, arguments.first + arguments.twins)
+    answer_all(arguments.folder / "answers.jsonl", seeds, answer)
+
+
+def answer_all(
+    path: Path, seeds: Sequence[int], answer: Callable[[int], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return the answers to the twins of all seeds: those of a file, and new ones, which are printed
+    and appended to the file. The table of all is printed last.
+    """
+    known = read_answers(path)
+    for seed in seeds:
+        if seed in known:
+            continue
+        known[seed] = answer(seed)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(known[seed]) + "\n")
         print(line(known[seed]), flush=True)
-    if known:
-        seeds = range(arguments.first, arguments.first + arguments.twins)
-        print(table([known[seed] for seed in seeds if seed in known]))
+    answers = [known[seed] for seed in seeds]
+    print(table(answers))
+    return answers
 
 
 def read_answers(path: Path) -> dict[int, dict[str, Any]]:
@@ -207,6 +220,19 @@ def _simulated(twin: Twin, divisions: tuple[int, int, int], t_s: np.ndarray) -> 
     return bar.simulate(t_s, motion, gravity, places)
 
 
+def mesh_of(twin: Twin, divisions: tuple[int, int, int]) -> cs.TetMesh:
+    """Return a mesh of the bar as its description states it, with so many boxes along the edges."""
+    box = cs.box_mesh((1.0, 1.0, LENGTH_M), divisions, (-0.5, -0.5, 0.0))
+    points_m = np.array(box.points_m)
+    points_m[:, :2] *= section_m(twin, points_m[:, 2] / LENGTH_M)
+    return cs.TetMesh(points_m, box.tetrahedra)
+
+
+def section_m(twin: Twin, along: np.ndarray) -> np.ndarray:
+    """Return the widths (n, 2) [m] of the cross-section at shares (n,) of the length."""
+    return (1 - np.outer(along, twin.taper)) * twin.width_m
+
+
 def write_problem(twin: Twin, folder: Path, seed: int, across: int = 2) -> None:
     """Simulate a twin, and write its problem folder and its truth."""
     began = time.process_time()
@@ -228,11 +254,7 @@ def write_problem(twin: Twin, folder: Path, seed: int, across: int = 2) -> None:
     _write_csv(
         folder / "poses.csv", heads, np.column_stack([pose_s, positions_m, rotations.as_quat()])
     )
-    box = cs.box_mesh((1.0, 1.0, LENGTH_M), (across, across, 5), (-0.5, -0.5, 0.0))
-    points_m = np.array(box.points_m)
-    shrink = 1 - np.outer(points_m[:, 2] / LENGTH_M, twin.taper)
-    points_m[:, :2] *= shrink * twin.width_m
-    mesh = cs.TetMesh(points_m, box.tetrahedra)
+    mesh = mesh_of(twin, (across, across, 5))
     mesh.write(folder / "bar.vtu")
     true_kg = twin.truth["density_kg_m3"] * mesh.volume_m3 * (1 + twin.errors["size"][0]) ** 3
     stated_kg = true_kg / (1 + twin.errors["mass"][0])
@@ -276,30 +298,43 @@ def _write_csv(path: Path, heads: Sequence[str], rows: np.ndarray) -> None:
 def solve(folder: Path, seed: int) -> dict[str, Any]:
     """Solve a saved twin, and compare the answer with the truth."""
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))["truth"]
-    began = time.process_time()
+    return compare(lambda: cs.Problem.read(folder / "problem.toml"), truth, seed)
+
+
+def compare(
+    problem: Callable[[], cs.Problem],
+    truth: Mapping[str, float],
+    seed: int,
+    names: Sequence[str] = tuple(CONSTANTS),
+) -> dict[str, Any]:
+    """Make and solve a problem, and return its verdict and its constants beside the truth.
+
+    A description that is refused, or a solve that fails, is an answer of a study too.
+    """
     answer: dict[str, Any] = {"seed": seed}
     try:
-        run = cs.run(cs.Problem.read(folder / "problem.toml"))
-    except Exception as error:  # a failure is an answer of the study too
+        described = problem()
+        began = time.process_time()
+        run = cs.run(described)
+    except cs.InputError as error:
+        return answer | {"verdict": "refused", "reasons": [str(error)], "constants": {}}
+    except Exception as error:
         return answer | {"verdict": "failed", "reasons": [repr(error)], "constants": {}}
     answer |= {"verdict": run.trust.verdict, "reasons": list(run.trust.reasons)}
-    answer["constants"] = {name: _constant(run, name, truth[name]) for name in CONSTANTS}
+    answer["constants"] = {name: _constant(run, name, truth[name]) for name in names}
+    elapsed = run.elapsed_s
+    answer |= {"search_s": elapsed.search, "checks_s": elapsed.checks}
     return answer | {"solve_cpu_s": time.process_time() - began}
 
 
 def _constant(run: Any, name: str, true: float) -> dict[str, Any]:
-    estimate = run.estimates[name]
     low, high = run.interval(name)
-    shares = {} if name not in run.budget else dict(run.budget[name].shares)
-    largest = sorted(shares.items(), key=lambda pair: -pair[1])[:4]
     return {
         "true": true,
-        "value": float(estimate.value),
+        "value": float(run.estimates[name].value),
         "interval": [float(low), float(high)],
-        "statistical": list(estimate.statistical95 or ()),
         "inside": bool(low <= true <= high),
         "half_width": float((high - low) / 2 / true),
-        "shares": {key: float(value) for key, value in largest},
     }
 
 
@@ -314,33 +349,36 @@ def line(answer: Mapping[str, Any]) -> str:
             c = answer["constants"][name]
             parts.append(
                 f"{symbol} {100 * (c['value'] / c['true'] - 1):+.1f} ± {100 * c['half_width']:.0f} %"
-                + "" * c["inside"]
                 + " OUTSIDE" * (not c["inside"])
             )
     return " | ".join(parts) + " | " + " // ".join(reason[:90] for reason in answer["reasons"])
 
 
 def table(answers: Sequence[Mapping[str, Any]]) -> str:
-    """Return verdicts, and coverage, error and half width of each constant, as Markdown."""
+    """Return verdicts, coverage, errors and half widths of each constant, and times, as Markdown."""
     verdicts = Counter(answer["verdict"] for answer in answers)
     rows = [
         f"{len(answers)} twins: " + ", ".join(f"{n} {v}" for v, n in verdicts.most_common()),
         "",
-        "| constant | inside | RMS error % | median half width % | 10 to 90 % of half widths |",
-        "|---|---|---|---|---|",
+        "| constant | inside | mean error % | RMS error % | median half width % "
+        "| 10 to 90 % of half widths |",
+        "|---|---|---|---|---|---|",
     ]
     for name, symbol in CONSTANTS.items():
         found = [a["constants"][name] for a in answers if name in a["constants"]]
         if not found:
             continue
         inside = sum(c["inside"] for c in found)
-        errors = np.array([c["value"] / c["true"] - 1 for c in found])
+        errors = 100 * np.array([c["value"] / c["true"] - 1 for c in found])
         widths = 100 * np.array([c["half_width"] for c in found])
-        low, high = np.quantile(widths, [0.1, 0.9])
+        low, median, high = np.nanquantile(widths, [0.1, 0.5, 0.9])
         rows.append(
-            f"| {symbol} | {inside} of {len(found)} | {100 * np.sqrt(np.mean(errors**2)):.1f} | "
-            f"{np.median(widths):.0f} | {low:.0f} to {high:.0f} |"
+            f"| {symbol} | {inside} of {len(found)} | {np.mean(errors):+.1f} | "
+            f"{np.sqrt(np.mean(errors**2)):.1f} | {median:.0f} | {low:.0f} to {high:.0f} |"
         )
+    for key, text in (("search_s", "search"), ("checks_s", "checks"), ("solve_cpu_s", "CPU time")):
+        if times := [a[key] for a in answers if key in a]:
+            rows.append(f"\n{text}: median {np.median(times):.1f} s, largest {max(times):.1f} s")
     return "\n".join(rows)
 
 

@@ -64,26 +64,18 @@ def test_a_twin_with_noisy_poses_is_identified_and_listed():
     line = study_faults.table_row("poses", [found])
     assert len(line) == len(study_faults.HEADS)
     assert line[0] == "poses"
-    assert float(line[19]) == pytest.approx(100 * found.relative[0], rel=0.05)
+    assert float(line[7]) == pytest.approx(100 * found.relative[0], rel=0.05)
     assert line[-1] == "0"
-
-
-def test_a_twin_with_every_effect_has_the_default_budget():
-    fault = "every effect but the damping law"
-    found = study_faults.run(fault, (0, *fault.encode(), 0))  # the first twin of the study
-    assert found.converged
-    assert found.combined_contains_truth.sum() >= 5
-    assert (found.half_widths > 1.96 * found.relative).all()
 
 
 def test_errors_of_surface_and_grip_move_the_nodes_by_their_size():
     experiment = study_faults.exact_recording()
     (grasp,), body = experiment.grasps, experiment.body
-    moved = _body(experiment, study_faults.true_values(), {"grasp_edge_m": 2e-3})
+    moved = _body(experiment, {"grasp_edge_m": 2e-3})
     shifts_m = moved.nodes_m - body.nodes_m
     assert np.linalg.norm(shifts_m[grasp.nodes], axis=1) == pytest.approx(2e-3)
     assert np.delete(shifts_m, grasp.nodes, axis=0) == pytest.approx(0)
-    swollen = _body(experiment, study_faults.true_values(), {"surface 1": 0.01})
+    swollen = _body(experiment, {"surface 1": 0.01})
     largest_m = np.linalg.norm(swollen.nodes_m - body.nodes_m, axis=1).max()
     assert 0.1 < largest_m / (0.01 * thickness_m(body)) < 5
 

@@ -17,6 +17,7 @@ FILES = [file for file in sorted(SCRIPTS.glob("*/*.py")) if file.parent.name != 
 # Command lines without the ending of the script's name.
 COMMANDS = (
     "study_contact --parts poked --twins 2",
+    "study_effects --twins 1",
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
     "study_starts --methods --starts 1 --factor 2",

@@ -1,0 +1,194 @@
+"""Verdicts and combined intervals for twins in which every effect of the budget is drawn at once.
+
+The bars, motions and constants are those of `study_independent_twins`. All default assumptions and
+all default nuisance parameters of a recording with markers are wrong by random numbers with their
+default standard deviations; only the damping law is the stated one, because γ_r and γ_m are
+constants of this law. The data are simulated with twice as many elements along each edge and with
+shorter time steps than the fit has, and extrapolated to infinitely small ones, so that the fit has
+errors of mesh and time steps too. It has tet10 elements, one across the thickness (81 nodes), 60
+samples, stated places of the markers and no guesses. `--divisions 2 2 4` has 225 nodes.
+
+Answers are appended to a file with one line of JSON per twin; twins that the file has are not solved
+again.
+
+    python scripts study_effects [--twins 100] [--first 0] [--divisions 1 1 4] [--file effects.jsonl]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from assumed_twins import SCHEME, with_wrong_assumptions
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from script_arguments import make_parser
+from study_faults import at_places, displaced, tilted_gravity
+from study_independent_twins import (
+    CONSTANTS,
+    LENGTH_M,
+    SAMPLE_S,
+    Twin,
+    answer_all,
+    compare,
+    draw,
+    hand,
+    mesh_of,
+    section_m,
+)
+
+import collocation_sysid as cs
+from collocation_sysid.errors import SimulationError
+from collocation_sysid.recording.nuisance import (
+    CALIBRATION_DISTORTION,
+    CALIBRATION_SCALE,
+    CLOCK_RATE,
+)
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
+
+Array = NDArray[np.float64]
+Divisions = tuple[int, int, int]
+SAMPLES = 60
+# The true motion goes on after the last sample, because of clocks that are late.
+SAMPLES_AFTER = 4
+POSE_STEP_S = SAMPLE_S / 2
+# Time steps per sample of the simulation with all effects; its error is extrapolated with twice as
+# many.
+SUBSTEPS = 2
+AIR = ("air_drag", "added_mass", "buoyancy")
+DRAWN = (
+    *("body_scale", "mass", "density_gradient", "stiffness_gradient", "anisotropy"),
+    *("stiffness_drift", "time_scale", *AIR, "surface", "grip_layer_m", "grasp_edge_m"),
+)
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    parser.add_argument("--twins", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument(
+        "--divisions", type=int, nargs=3, default=(1, 1, 4), help="boxes of the fit"
+    )
+    parser.add_argument("--file", type=Path, default=Path("effects.jsonl"))
+    arguments = parser.parse_args()
+    seeds = range(arguments.first, arguments.first + arguments.twins)
+    answer_all(arguments.file, seeds, partial(answer, divisions=tuple(arguments.divisions)))
+
+
+def answer(seed: int, divisions: Divisions) -> dict[str, Any]:
+    """Draw a twin, solve it, and compare the answer with the truth."""
+    twin = draw(seed, exact=True)
+    truth = constants(twin)
+    rng = np.random.default_rng((seed, 1))
+    return compare(partial(problem, twin, divisions, rng), truth, seed)
+
+
+def constants(twin: Twin) -> dict[str, float]:
+    """Return the true E, ν, γ_r and γ_m."""
+    return {name: twin.truth[name] for name in CONSTANTS}
+
+
+def problem(twin: Twin, divisions: Divisions, rng: np.random.Generator) -> cs.Problem:
+    """Return the problem of a recording with errors that are drawn."""
+    stated = recording(twin, divisions, samples=SAMPLES, step_s=SAMPLE_S)
+    tracks_m: Array | None = None
+    while tracks_m is None:
+        # Some soft bodies with many errors collapse, and nobody would record them.
+        with suppress(SimulationError):
+            tracks_m = recorded_m(twin, divisions, stated, rng)
+    noisy_m = tracks_m + twin.noise_m * rng.standard_normal(tracks_m.shape)
+    places_m = stated.markers.predict_positions(stated.body.nodes_m)
+    off_m = _size(stated.nuisance.marker_offset_m) * rng.standard_normal(places_m.shape)
+    described = at_places(cs.with_markers(stated, noisy_m), places_m + off_m)
+    return cs.Problem([described], {name: cs.Unknown() for name in CONSTANTS})
+
+
+def recording(
+    twin: Twin,
+    divisions: Divisions,
+    samples: int = SAMPLES + SAMPLES_AFTER,
+    step_s: float = SAMPLE_S,
+) -> cs.Experiment:
+    """Return the recording without errors, whose markers are not measured yet."""
+    body = cs.Body(
+        mesh_of(twin, divisions),
+        density_kg_m3=twin.truth["density_kg_m3"],
+        element="tet10",
+        rest_shape="stress_free",
+    )
+    unit = np.array(twin.marker_places)
+    places_m = np.column_stack(
+        [unit[:, :2] / 2 * section_m(twin, unit[:, 2]), LENGTH_M * unit[:, 2]]
+    )
+    t_s = step_s * np.arange(samples)
+    end_s = SAMPLE_S * (SAMPLES + SAMPLES_AFTER)
+    pose_s = POSE_STEP_S * np.arange(round(end_s / POSE_STEP_S) + 1)
+    rotations, positions_m = hand(twin, pose_s)
+    poses = cs.PoseSequence(pose_s, positions_m, rotations.as_quat())
+    grasp = cs.Grasp(np.flatnonzero(body.nodes_m[:, 2] < 1e-9), poses)
+    tracks_m = np.zeros((samples, len(places_m), 3))
+    markers = cs.Markers(t_s, tracks_m, twin.noise_m, places_m=places_m)
+    return cs.Experiment(body, t_s, [grasp], markers, name="swing")
+
+
+def recorded_m(
+    twin: Twin, divisions: Divisions, stated: cs.Experiment, rng: np.random.Generator
+) -> Array:
+    """Return the tracks (T, M, 3) [m] that cameras with errors record of a body with errors."""
+    refined = tuple(2 * count for count in divisions)
+    fine = _sampled(twin, refined, SUBSTEPS)
+    nuisance = stated.nuisance
+    hand_eye = _size(nuisance.hand_eye_m), _size(nuisance.hand_eye_rad)
+    held = displaced(tilted_gravity(fine, rng), *hand_eye, rng)
+    moved = with_wrong_assumptions(held, constants(twin), drawn_errors(DRAWN, stated.body, rng))
+    # The errors of elements and time steps decrease with the square of their lengths.
+    exact_m = exact_tracks_m(twin, fine)
+    of_steps_m = (
+        (exact_tracks_m(twin, _sampled(twin, refined, 2 * SUBSTEPS))[::2] - exact_m) * 4 / 3
+    )
+    of_mesh_m = (exact_m - exact_tracks_m(twin, _sampled(twin, divisions, SUBSTEPS))) / 3
+    true_m = moved.markers.positions_m + of_steps_m + of_mesh_m
+    rate = 1 - _size(CLOCK_RATE.considered) * rng.standard_normal()
+    late_s = _size(nuisance.time_shift_s) * rng.standard_normal()
+    seen_s = np.clip(rate * stated.t_s - late_s, 0.0, fine.t_s[-1])
+    seen_m = CubicSpline(fine.t_s, true_m)(seen_s)
+    pivot_m = seen_m[0].mean(axis=0)
+    away_m = seen_m - pivot_m
+    scale = 1 + _size(CALIBRATION_SCALE.considered) * rng.standard_normal()
+    distortion_1_m2 = _size(CALIBRATION_DISTORTION.considered) * rng.standard_normal()
+    squares_m2 = np.sum(away_m**2, axis=-1, keepdims=True)
+    return pivot_m + away_m * (scale + distortion_1_m2 * squares_m2)
+
+
+def _sampled(twin: Twin, divisions: Divisions, substeps: int) -> cs.Experiment:
+    """Return the longer recording with a sample for each time step."""
+    samples = (SAMPLES + SAMPLES_AFTER - 1) * substeps + 1
+    return recording(twin, divisions, samples=samples, step_s=SAMPLE_S / substeps)
+
+
+def exact_tracks_m(twin: Twin, experiment: cs.Experiment) -> Array:
+    """Return the tracks (T, M, 3) [m] without errors of the description."""
+    return cs.simulate(experiment, constants(twin), SCHEME, substeps=1).markers_m
+
+
+def drawn_errors(names: Sequence[str], body: cs.Body, rng: np.random.Generator) -> dict[str, float]:
+    """Draw errors of the named assumptions, for `with_wrong_assumptions`."""
+    errors = {}
+    for row in (row for row in ASSUMPTIONS if row.name in names):
+        for name in row.components:
+            error = _size(row.usual_considered(body.made, body.mesh_from)) * rng.standard_normal()
+            # Coefficients of the air are not negative.
+            errors[name] = max(error, -0.99) if row.name in AIR else error
+    return errors
+
+
+def _size(deviation: float | None) -> float:
+    return deviation or 0.0
+
+
+if __name__ == "__main__":
+    main()
