@@ -61,12 +61,7 @@ REASONS: dict[str, tuple[Made, str, str]] = {
     "rolling shutter": (lambda: wrong.rolling_shutter(0.0), "line[_ ]delay", "none explains it"),
     "mirrored mesh": (lambda: wrong.mirrored_mesh(True), "mirror image", "First compare laws"),
     "round rod meshed square": (
-        lambda: wrong.round_rod("square", has_wrench=False),
-        "section of the body is round",
-        "compare the laws first",
-    ),
-    "round rod meshed square, weighed in motion": (
-        lambda: wrong.round_rod("square", has_wrench=True),
+        lambda: wrong.round_rod("square"),
         "section of the body is round",
         "compare the laws first",
     ),
@@ -81,8 +76,7 @@ OPEN: dict[str, str] = {
     "slow motion": "no correction of the times by a factor is tested",
     "rolling shutter": "only a clock is tested by refits",
     "mirrored mesh": "the image of the mesh is not fitted again",
-    "round rod meshed square": "another frame, or a coarse mesh, comes first",
-    "round rod meshed square, weighed in motion": "the shape of a scan comes first",
+    "round rod meshed square": "the sensor comes first",
 }
 
 
@@ -111,7 +105,7 @@ def test_the_first_reason_is_right(name: str):
         lambda: wrong.ring_down(1.0),
         lambda: wrong.rolling_shutter(2e-5),
         lambda: wrong.mirrored_mesh(False),
-        lambda: wrong.round_rod("round", has_wrench=True),
+        lambda: wrong.round_rod("round"),
     ],
 )
 def test_the_right_description_is_good(made: Made):

@@ -207,26 +207,27 @@ def mirrored_mesh(is_mirrored: bool) -> cs.Problem:
     return _problem(replace(real, body=_bent(is_mirrored), markers=markers))
 
 
-def round_rod(section: str, has_wrench: bool) -> cs.Problem:
-    """A round rod of known density, meshed with a round or a square section of the same width."""
+def round_rod(section: str) -> cs.Problem:
+    """A round rod of known density with a sensor at its end, meshed with a round or a square section
+    of the same width.
+    """
     t_s = 0.02 * np.arange(21)
-    places_m = np.array([[0, 0, 0.1], [0.007, 0, 0.1], [0, 0.01, 0.05]])
-    sigma = 5e-3, 5e-4  # N, N m
+    places_m = np.array([[0, 0, 0.1], [0.007, 0, 0.1], [0, 0.009, 0.05]])
+    sigma = 1e-2, 1e-3  # N, N m
 
     def swung(section: str, loads: np.ndarray) -> cs.Experiment:
+        box = cs.box_mesh((0.02, 0.02, 0.1), (2, 2, 3))
+        mesh = cs.TetMesh(box.points_m - [0.01, 0.01, 0], box.tetrahedra)
         if section == "round":
-            mesh = cs.cylinder_mesh(0.01, 0.1, 1, 3)
-        else:
-            box = cs.box_mesh((0.02, 0.02, 0.1), (1, 1, 3))
-            mesh = cs.TetMesh(box.points_m - [0.01, 0.01, 0], box.tetrahedra)
-        body = cs.Body(mesh, element="tet10", density_kg_m3=1000.0)
-        wrench = cs.Wrench(t_s, loads, *sigma) if has_wrench else None
-        return _swung(body, t_s, places_m, wrench)
+            polygon = cs.cylinder_mesh(0.01, 0.1, 2, 3)
+            wider = np.sqrt(np.pi / 4 * mesh.volume_m3 / polygon.volume_m3)
+            mesh = cs.TetMesh(polygon.points_m * [wider, wider, 1], polygon.tetrahedra)
+        body = cs.Body(mesh, density_kg_m3=1000.0)
+        return _swung(body, t_s, places_m, wrench=cs.Wrench(t_s, loads, *sigma))
 
-    real = cs.simulate(swung("round", np.zeros((21, 6))), SOFT)
+    stiff = SOFT | {"young_pa": 2e5}
+    real = cs.simulate(swung("round", np.zeros((21, 6))), stiff)
     noise = rng()
     tracks_m = real.markers_m + 3e-4 * noise.normal(size=real.markers_m.shape)
-    loads = np.zeros((21, 6))
-    if has_wrench:
-        loads = real.wrenches[0] + noise.normal(size=(21, 6)) * np.repeat(sigma, 3)
+    loads = real.wrenches[0] + noise.normal(size=(21, 6)) * np.repeat(sigma, 3)
     return _problem(cs.with_markers(swung(section, loads), tracks_m))
