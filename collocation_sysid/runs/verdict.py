@@ -14,6 +14,7 @@ from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..model.schemes import as_scheme
 from ..problem import Problem
+from ..program.collocation import ExperimentIterate
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
 from ..recording.nuisance import TIME
@@ -90,37 +91,22 @@ def solution_concerns(
         yield Concern("solve/acceptable")
     if ENDED_BY_ASSOCIATION in solution.notes:
         yield Concern("solve/jump")
+    transcriptions = solution.collocation.transcriptions
+    unknowns = [each for part in solution.parts for each in _nuisance_concerns(part)]
     if uncertainty is not None:
-        experiments = [each.experiment for each in solution.collocation.transcriptions]
         misfits = fit_concerns(uncertainty, budgeted and budgeted.basis)
+        of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
         yield from as_specimen_concerns(
-            [*misfits, *parameter_concerns(uncertainty, solution.collocation.parameters)],
-            experiments,
+            [*misfits, *of_parameters, *unknowns], [each.experiment for each in transcriptions]
         )
-    elif solution.collocation.nq:
-        yield Concern("solve/no-error-bars", "doubtful")
+    else:
+        if solution.collocation.nq:
+            yield Concern("solve/no-error-bars", "doubtful")
+        yield from unknowns
     yield from allowance_concerns(solution)
     fitted_experiments = [each.experiment for each in solution.collocation.transcriptions]
     yield from (each.concern() for each in copied_measurements(fitted_experiments))
     yield from outlier_share_concerns(*_outlier_counts(solution))
-    for part in solution.parts:
-        nuisance = part.transcription.nuisance
-        low, high = nuisance.bounds(part.transcription.association.clock_samples)
-        # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
-        low = np.where(low == 0, -np.inf, low)
-        yield from nuisance_concerns(
-            nuisance.names,
-            part.phi,
-            low=low,
-            high=high,
-            is_specimen=part.transcription.experiment.specimen is not None,
-            rows=[entry.row for entry in nuisance.entries],
-            scales=nuisance.scales.tolist(),
-        )
-        for k in nuisance.indices_of_rows(TIME):
-            scale = float(nuisance.scales[k])
-            name = part.transcription.experiment.name
-            yield from clock_concerns(name, float(part.phi[k]) * scale, prior_s=scale)
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)
     yield from branch_concerns(solution.parts)
@@ -129,11 +115,12 @@ def solution_concerns(
     if not solution.collocation.nq:
         yield from _prediction_concerns(solution, rollouts)
     fitted = fit_misfits(solution)
+    static = [each.experiment.name for each in transcriptions if each.experiment.is_static]
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation):
             for feature in FEATURES:
                 yield from feature.simulation_concerns(name, rollout)
-        yield from _forward_concerns(name, rollout, fitted)
+        yield from _forward_concerns(name, rollout, fitted, is_static=name in static)
     collocation = solution.collocation
     for transcription in collocation.transcriptions:
         yield from rotation_step_concerns(
@@ -150,6 +137,26 @@ def solution_concerns(
                 added_ratio=motion.first_mode.numerical_damping_ratio,
                 period_error=motion.first_mode.period_error,
             )
+
+
+def _nuisance_concerns(part: ExperimentIterate) -> Iterator[Concern]:
+    nuisance = part.transcription.nuisance
+    experiment = part.transcription.experiment
+    low, high = nuisance.bounds(part.transcription.association.clock_samples)
+    # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
+    low = np.where(low == 0, -np.inf, low)
+    yield from nuisance_concerns(
+        nuisance.names,
+        part.phi,
+        low=low,
+        high=high,
+        is_specimen=experiment.specimen is not None,
+        rows=[entry.row for entry in nuisance.entries],
+        scales=nuisance.scales.tolist(),
+    )
+    for k in nuisance.indices_of_rows(TIME):
+        scale = float(nuisance.scales[k])
+        yield from clock_concerns(experiment.name, float(part.phi[k]) * scale, prior_s=scale)
 
 
 def _outlier_counts(solution: Solution) -> tuple[int, int]:
@@ -213,7 +220,10 @@ def _prediction_concerns(
 
 
 def _forward_concerns(
-    name: str, rollout: ForwardSimulation | str, fitted: Mapping[str, Sequence[InstrumentMisfit]]
+    name: str,
+    rollout: ForwardSimulation | str,
+    fitted: Mapping[str, Sequence[InstrumentMisfit]],
+    is_static: bool,
 ) -> Iterator[Concern]:
     """A simulation failed, or misses measurements by more than the noise and the fit."""
     if not isinstance(rollout, ForwardSimulation):
@@ -224,7 +234,9 @@ def _forward_concerns(
         for simulated in rollout.misfits:
             # The simulated surface may be near points of a camera that the fitted one is not.
             if simulated.what in of_fit:
-                yield from forward_simulation_concerns(name, simulated, of_fit[simulated.what])
+                yield from forward_simulation_concerns(
+                    name, simulated, of_fit[simulated.what], is_static=is_static
+                )
         return
     for label, deviation in (rollout.own_onsets or {}).items():
         yield from onset_concerns(name, label, deviation)

@@ -68,7 +68,7 @@ from .uncertainty import ErrorBasis, Uncertainty
 Verdict = Literal["good", "check", "doubtful"]
 
 # Codes of concerns about bounds from which others may follow.
-FIRST = "information/default-bound", "information/liquid"
+FIRST = "information/default-bound", "information/flat", "information/liquid"
 # Codes of hypotheses that stand for several, none of which is likely alone.
 OPEN_CAUSES = "several", "insufficient"
 # Share of the samples beyond Huber's threshold: "check".
@@ -95,6 +95,12 @@ ANISOTROPY_ADVICE = (
     "times one plus the anisotropy. A wrong material law, or a mesh of another width, has similar "
     "effects"
 )
+# Advice about an unknown of a specimen that is far from its prior, and about one that is so far that
+# no such error is as large.
+WIDENING = (
+    "check whether this value is possible, and if it is, widen its prior in the [[experiment]]"
+)
+HIDING = "it hides another error, such as a law that is too simple, or a wrong unit, area or kind of test"
 # Concerns about residuals that deviations within the budget may cause.
 WITHIN_BUDGET = "residuals/persist", "residuals/shared", "noise/larger"
 # Ratio of the steps that impacts need and the stated ones from which E is wrong by tens of percent: a
@@ -281,7 +287,8 @@ def parameter_concerns(
 
     Several parameters at stated bounds are one concern, "doubtful"; a single one is "check". Those
     at default bounds of `parameters`, if given, are another one, "check", and so are shares of
-    memory that grew to the largest one. Mode coefficients of fields do not count. That some
+    memory that grew to the largest one; one whose interval contains all that its bounds allow is
+    not determined in place of being at its bound. Mode coefficients of fields do not count. That some
     parameters are not determined contradicts nothing and is no concern: the table of the estimates
     shows it.
     """
@@ -304,12 +311,13 @@ def parameter_concerns(
     ]
     # Each recording alone may determine what they disagree on.
     is_open = not set(undetermined) & set(_disagreements(uncertainty))
-    several = len(bounded) > 1
-    code = "information/bounds" if several else "information/bound"
+    flat = [name for name in at_default if _is_flat(uncertainty, name, parameters)]
+    pressed = [name for name in at_default if name not in flat]
     return [
-        *concern_if(bool(at_default), False, code="information/default-bound", names=at_default),
+        *concern_if(bool(pressed), False, code="information/default-bound", names=pressed),
+        *concern_if(bool(flat), False, code="information/flat", names=flat),
         *concern_if(bool(liquid), False, code="information/liquid", names=liquid),
-        *concern_if(bool(bounded), several, code=code, names=bounded),
+        *concern_if(bool(bounded), len(bounded) > 1, code="information/bound", names=bounded),
         *concern_if(
             bool(undetermined) and len(undetermined) == len(estimates) and is_open,
             True,
@@ -317,6 +325,19 @@ def parameter_concerns(
             names=undetermined,
         ),
     ]
+
+
+def _is_flat(uncertainty: Uncertainty, name: str, parameters: Parameters | None) -> bool:
+    """Whether the 95 % interval of a parameter at its upper bound is longer than its bounds are
+    apart. At a lower bound a logarithm has no effect although the data may exclude larger values.
+    """
+    item = next(each for each in parameters.free if each.name == name) if parameters else None
+    if item is None or item.scale != "log":
+        return False
+    k = uncertainty.names.index(name)
+    reach = 2 * uncertainty.quantiles[k] * np.sqrt(uncertainty.complete_covariance[k, k])
+    is_upper = uncertainty.estimates[name].value > np.sqrt(item.lower * item.upper)
+    return bool(is_upper and reach > np.log(item.upper / item.lower))
 
 
 def numerical_concerns(
@@ -482,7 +503,9 @@ def nuisance_concerns(
             continue
         data: dict[str, object] = {"name": name, "deviations": deviation}
         code = "specimen/far" if is_specimen else "nuisance/far"
-        if rows and not is_specimen:
+        if is_specimen:
+            data["advice"] = HIDING if deviation > ABSURD else WIDENING
+        elif rows:
             size, unit = in_readable_unit(deviation * scales[k], rows[k].unit)
             data |= {"size": f"{size:.2g}{unit}"}
             code = "nuisance/large" if deviation * scales[k] > rows[k].largest else "nuisance/sized"
@@ -520,7 +543,7 @@ def largest_deviation(count: int) -> float:
 
 
 def forward_simulation_concerns(
-    name: str, simulated: InstrumentMisfit, fitted: InstrumentMisfit
+    name: str, simulated: InstrumentMisfit, fitted: InstrumentMisfit, *, is_static: bool = False
 ) -> list[Concern]:
     """Return one concern, as a list, if the forward simulation of a fitted experiment misses the
     measurements of an instrument by much more than the fit; else empty.
@@ -539,6 +562,9 @@ def forward_simulation_concerns(
         what=simulated.what,
         simulated=simulated.size_text,
         fitted=fitted.size_text,
+        why="its loads lead to other equilibria than the fitted ones: add loads between its samples"
+        if is_static
+        else "the time step is too long; raise transcription.substeps",
     )
 
 

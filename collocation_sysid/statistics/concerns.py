@@ -156,11 +156,13 @@ TOPICS: dict[str, Topic] = {
         remedy="Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion or a test that depends on it.",
         messages={
-            "bound": "{names} ended at its bound: widen the bound, or fix the parameter",
-            "bounds": "{names} ended at their bounds: widen the bounds, or fix the parameters",
+            "bound": "{names} ended at a stated bound: widen the bound, or fix the parameter",
             "default-bound": "{names} ended at a bound that the problem does not state: the best "
             "value may lie beyond it, and the other reasons may follow from this; state guess, "
             "lower and upper, or fix the parameter",
+            "flat": "the data do not determine {names}, which the search therefore left at a bound; the "
+            "other reasons may follow from this: fix the parameter, state its prior, or add a "
+            "recording that depends on it",
             "liquid": "the stress relaxes to zero, as that of a liquid: {names} grew without limit, "
             "so that the data determine the instantaneous modulus and the relaxation times, and no "
             "long-term modulus; record for longer if there is one",
@@ -226,13 +228,10 @@ TOPICS: dict[str, Topic] = {
             "limit": "{name} ended at the largest value allowed: check whether this value is "
             "possible, and if it is, widen its prior in the [[experiment]]",
             "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
-            "check whether this value is possible, and if it is, widen its prior in the "
-            "[[experiment]]",
-            "law": "the residuals are {factor:.2g} times as large as expected from sigma_pa: the "
-            "law {laws} may be too simple for {range}. First compare laws with "
-            "collocation-sysid compare-models FILE --materials {others}; then check sigma_pa, the "
-            "units of the columns, the kind of test, and whether the stresses are true ones "
-            '(stress = "true")',
+            "{advice}",
+            "law": "the residuals are {factor:.2g} times as large as expected from sigma_pa: "
+            "{advice}; then check sigma_pa, the units of the columns, the kind of test, and whether "
+            'the stresses are true ones (stress = "true")',
             "branches": "the residuals are {factor:.2g} times as large as expected from the stated "
             "noise: branches of the memory ({branches}) may be too few, or their times too far from "
             "those of the table. First add an [[object.prony]] about every decade of time or "
@@ -332,8 +331,7 @@ TOPICS: dict[str, Topic] = {
         messages={
             "failed": "the forward simulation of '{experiment}' failed: {why}",
             "misses": "the forward simulation of '{experiment}' deviates from {what} by "
-            "{simulated}, but the fit only by {fitted}: the time step is too long; raise "
-            "transcription.substeps",
+            "{simulated}, but the fit only by {fitted}: {why}",
             "predicted": "the prediction of '{experiment}' misses {what} by {size}, which is "
             "{sigmas:.3g} times {stated} and {times:.2g} times what noise and the fit of the other "
             "recordings explain{absorbed}: the model lacks an effect that this recording contains, "

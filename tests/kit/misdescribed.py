@@ -19,7 +19,7 @@ from kit import filmed
 
 UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 # Bodies that are simulated with their own mesh have none of the errors of real ones.
-SIMULATED = cs.UncertaintyOptions(assumptions="none")
+SIMULATED = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
 
 
 def rng() -> np.random.Generator:

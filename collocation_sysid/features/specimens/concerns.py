@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
+from ...errors import listed
 from ...fem.laws.damping_admissibility import STRAIN
 from ...recording.experiment import Experiment
 from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic
+from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import moduli_of, specimen_strains
 from ...statistics.concerns import Concern
+from ...statistics.thresholds import GROSS_MISFIT
 
 # Code of the concern about a specimen by that of the general concern with the same data.
 SPECIMEN_CODES: Mapping[str, str] = {
@@ -32,6 +35,13 @@ SPECIMEN_CODES: Mapping[str, str] = {
 COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "gent", "ogden-2")
 # Laws to compare for foams, whose volume changes.
 FOAM_LAWS = ("neo-hookean", "hyperfoam-1", "hyperfoam-2")
+# What to check of strips from a sheet with fibres.
+ANGLE = "the angle of the cut (cut_angle_deg) and the direction of the fibres"
+# Why a curve is no straight line below `STRAIN`.
+TOE = (
+    "the slope grows with the load, which no law does at such strains: at small loads faces or grips "
+    "do not touch everywhere. Leave out these rows with window_s, and let strain_zero be unknown"
+)
 # Percentage of the squared residuals from which on a sample is the cause, whatever the law.
 NEARLY_ALL = 75.0
 # Largest change of the logarithm of a volume, relative to that of the stretch, in rubber.
@@ -47,35 +57,43 @@ def as_specimen_concerns(
     The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
     too simple is the most frequent cause of the others, unless one sample makes nearly all of them;
     in its place "specimen/branches" about tables of moduli, at whose small strain all laws are linear,
-    and "noise/larger" where laws hardly differ, at strains below `STRAIN`.
+    and "noise/larger" at strains below `STRAIN`, where laws hardly differ, unless the slope grows
+    there. Specimens with fibres have their largest unknown first: a strip that was cut at another
+    angle is one of them. Beside large residuals a disagreement of the recordings says nothing.
 
     Parameters
     ----------
     concerns : iterable of Concern
-        Concerns from the residuals and the error bars of the fit.
+        Concerns from the residuals, the error bars and the unknowns of the fit.
     """
     if not experiments or any(each.specimen is None for each in experiments):
         return list(concerns)
     strains = [specimen_strains(each)[0] for each in experiments]
     keys = ["relative_sigma" if is_harmonic(strain) else "sigma_pa" for strain in strains]
-    data = {
+    has_fibres = any(part.axes is not None for each in experiments for part in each.body.parts)
+    data: dict[str, object] = {
         "stated": " and ".join(dict.fromkeys(keys)),
         "remedy": "compare laws with compare-models --materials",
-        **_law_data(experiments),
     }
     codes = dict(SPECIMEN_CODES)
+    advice = _law_advice(experiments)
+    if has_fibres:
+        advice = f"check {ANGLE}, and compare laws with compare-models --materials"
     if all(np.abs(strain).max() < 2 * RELAXED_STRAIN for strain in strains):
         codes["noise/larger"] = "specimen/branches"
         data["branches"] = max(len(p.prony) for each in experiments for p in each.body.parts)
         data["remedy"] = "add branches of the memory, [[object.prony]]"
     elif all(np.abs(strain).max() < STRAIN for strain in strains):
-        codes["noise/larger"] = "noise/larger"
+        if growing := [each.name for each in experiments if _slope_grows(each)]:
+            advice = f"in {listed(growing)} {TOE}"
+        else:
+            codes["noise/larger"] = "noise/larger"
         data["remedy"] = "measure the area and unloaded length"
     replaced = [
         replace(
             concern,
             code=codes.get(concern.code, concern.code),
-            data={**concern.data, **data, **_named(concern.data, experiments)},
+            data={"advice": advice, **concern.data, **data, **_named(concern.data, experiments)},
         )
         for concern in concerns
     ]
@@ -85,9 +103,40 @@ def as_specimen_concerns(
         if each.code == codes["residuals/outlier"] and each.data["percent"] > NEARLY_ALL
     ]
     large = [each for each in replaced if each.code == codes["noise/larger"]]
-    others = [each for each in replaced if each not in alone and each not in large]
+    unknowns = [each for each in replaced if each.code == "specimen/far"]
+    unknowns.sort(key=lambda each: -each.data["deviations"])
+    first: list[Concern] = []
+    if has_fibres:
+        first = [
+            replace(each, data={**each.data, "advice": f"it hides another error: check {ANGLE}"})
+            for each in unknowns
+            if each.grade == "doubtful"
+        ]
+        unknowns = unknowns[len(first) :]
+    elif any(each.grade == "doubtful" for each in unknowns):
+        large = [replace(each, grade="doubtful") for each in large]
+    others = [e for e in replaced if e.code not in (codes["noise/larger"], "specimen/far")]
+    if large:
+        others = [each for each in others if each.code != "residuals/recordings"]
+    others = [each for each in others if each not in alone]
     grave = any(each.grade == "doubtful" for each in large)
-    return [*(replace(e, grade="doubtful") if grave else e for e in alone), *large, *others]
+    alone = [replace(each, grade="doubtful") if grave else each for each in alone]
+    return [*alone, *first, *large, *others, *unknowns]
+
+
+def _slope_grows(experiment: Experiment) -> bool:
+    """Whether the slope of the stress grows with the strain by more than noise."""
+    strain = np.abs(specimen_strains(experiment)[0])
+    gauge = experiment.readings[0]
+    stress_pa = np.abs(gauge.measured_values[:, 0])
+    known = np.isfinite(stress_pa)
+    if known.sum() < 4 or not np.ptp(strain[known]) or is_unloading(strain):
+        return False
+    sigmas_pa = np.broadcast_to(gauge.sample_sigmas[:, 0], len(strain))[known]
+    powers = np.vander(strain[known] / strain[known].max(), 3) / sigmas_pa[:, None]
+    scaled = stress_pa[known] / sigmas_pa
+    curvature, *_ = np.linalg.lstsq(powers, scaled)[0]
+    return bool(curvature > GROSS_MISFIT * np.sqrt(np.linalg.pinv(powers.T @ powers)[0, 0]))
 
 
 def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:
@@ -119,16 +168,18 @@ def _place(t_s: Array, sample: int, moduli: Mapping[str, Array]) -> str:
     return f"{0.25 / quarter_s:.4g} Hz"
 
 
-def _law_data(experiments: Sequence[Experiment]) -> dict[str, object]:
-    laws = list(
-        dict.fromkeys(part.material.name for each in experiments for part in each.body.parts)
-    )
+def _law_advice(experiments: Sequence[Experiment]) -> str:
+    parts = [part for each in experiments for part in each.body.parts]
+    laws = list(dict.fromkeys(getattr(p.material, "matrix", p.material).name for p in parts))
     is_foam = any(law.startswith("hyperfoam-") for law in laws)
     is_foam |= any(_changes_volume(each) for each in experiments)
     compared = FOAM_LAWS if is_foam else COMPARED_LAWS
     richer = [law.replace(f"-{n}", f"-{n + 1}") for law in laws for n in (2, 3) if f"-{n}" in law]
     others = [*dict.fromkeys((*laws, *richer, *compared))]
-    return {"laws": laws, "range": " and ".join(_ranges(experiments)), "others": ",".join(others)}
+    return (
+        f"the law {listed(laws)} may be too simple for {' and '.join(_ranges(experiments))}. First "
+        f"compare laws with collocation-sysid compare-models FILE --materials {','.join(others)}"
+    )
 
 
 def _changes_volume(experiment: Experiment) -> bool:

@@ -380,7 +380,10 @@ def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) ->
     for gauge in experiment.readings[1:]:
         yield _mistake("specimen-placeholder", partial(_without_placeholder, name=gauge.name))
     yield from _other_kinds(experiment)
-    ratios = [other / _initial_slope(experiment) for other in other_slopes_pa]
+    # Strips from a sheet with fibres differ in their slopes by the angle at which they were cut.
+    has_fibres = any(part.axes is not None for part in experiment.body.parts)
+    others_pa = () if has_fibres else other_slopes_pa
+    ratios = [other / _initial_slope(experiment) for other in others_pa]
     for unit, factor in UNIT_FACTORS.items():
         decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
         if (decades > np.log(UNIT_LIKE)).any():
