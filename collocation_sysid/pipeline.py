@@ -255,7 +255,6 @@ def run(
                 say("testing possible causes of the misfit")
                 causes = find_misspecifications(answer.solution)
                 tested = cause_notes(answer.solution, causes)
-                causes = tuple(each for each in causes if not each.is_open)
                 answer = replace(answer, causes=causes, notes=(*answer.notes, *tested))
             if problem.uncertainty.numerical and answer.uncertainty is not None:
                 answer = refine(answer, report_progress=say, watch=watch)

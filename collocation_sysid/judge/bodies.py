@@ -11,8 +11,7 @@ step.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,9 +24,7 @@ from ..fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
 from ..fem.meshes.mesh import TetMesh
 from ..fem.rest_shape import UnderGravity
 from ..methods.solution import Solution
-from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
-from ..statistics.budget.consider_analysis import changed_residuals
 from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
 from ..statistics.budget.systematic_effects import (
@@ -37,21 +34,18 @@ from ..statistics.budget.systematic_effects import (
     shape_effect,
 )
 from ..statistics.hypothesis import Hypothesis
-from ..statistics.linearised import LinearisedFit, linearise_fit
+from ..statistics.linearised import linearise_fit
 from ..statistics.thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
 from .doubt import Correction, Doubt
+from .fit import linear_step, projected_gram
 
 AXES = "xyz"
-# Most hypotheses of a screening that are fitted again.
-MOST_REFITS = 5
-# The same of one kind.
-MOST_OF_A_KIND = 2
 # Distance of the nodes of a mirrored mesh from the mesh, over the largest extent, up to which they
 # are the same shape.
 SAME_SHAPE = 0.02
-# Smallest and largest error of a mesh over the change to half the edge lengths: with the order of
-# convergence n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
-MESH_AMPLITUDES = (0.5, 3.5)
+# Prior of the error of a mesh over the change to half the edge lengths: with the order of convergence
+# n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
+MESH_ERROR = (2.0, 1.0)
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
 
@@ -99,7 +93,13 @@ def with_laws(body: Body, material: Material | None, damping: DampingLaw | None)
     return body.with_parts(tuple(replace(part, **changed) for part in body.parts))
 
 
-def _likely_mistakes(body: Body) -> Iterator[Doubt]:
+def body_rows(experiment: Experiment) -> Iterator[Doubt]:
+    """Yield the rows of other laws and shapes of a body; none with obstacles, whose frames are nodes
+    of the body, or without a grasp.
+    """
+    body = experiment.body
+    if experiment.obstacles or experiment.specimen is not None or not experiment.body_grasps:
+        return
     materials = ("", *other_materials(body))
     dampings = ("", *other_dampings(body))
     for laws in [(m, d) for m in materials for d in dampings][1:]:
@@ -124,7 +124,7 @@ def _other_laws(material: str, damping: str) -> Doubt:
         return other and (other, {"material": material, "damping": damping})
 
     which = "/both" if material and damping else "" if material else "/damping"
-    return Doubt(f"law{which}", "1", effect=effect, correct=corrected, is_whole=True)
+    return Doubt(f"law{which}", "1", effect=effect, correct=corrected)
 
 
 def _other_width(axis: int) -> Doubt:
@@ -143,7 +143,9 @@ def _other_width(axis: int) -> Doubt:
         way = "narrow" if width > 0 else "wide"
         return other and (other, {"axis": AXES[axis], "percent": 100 * abs(width), "way": way})
 
-    return Doubt("mesh-width", "1", effect=effect, correct=corrected)
+    return Doubt(
+        "mesh-width", "1", corrected, effect=effect, axes=AXES[axis], mean=0.0, wide=WIDEST / 2
+    )
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:
@@ -173,67 +175,16 @@ def _of_other_section(experiment: Experiment, _: Array) -> Correction:
 
 
 SECTION = Doubt(
-    "mesh-section",
-    "1",
-    effect=lambda at, _: section_effect(at),
-    correct=_of_other_section,
-    is_whole=True,
+    "mesh-section", "1", effect=lambda at, _: section_effect(at), correct=_of_other_section
 )
-REST_SHAPE = Doubt("rest-shape", "1", _stress_free, effect=_scan_effect, axes="x y z")
+REST_SHAPE = Doubt(
+    "rest-shape", "1", _stress_free, effect=_scan_effect, axes="x y z", mean=0.0, wide=1.0
+)
 
 
 def _is_uniform(body: Body) -> bool:
     """Return whether the body has one part without a field, so that it can be made again."""
     return len(body.parts) == 1 and all(part.field is None for part in body.parts)
-
-
-def screened_bodies(
-    solution: Solution, experiment: Experiment, *, is_far: bool = False
-) -> Iterator[Hypothesis]:
-    """Yield hypotheses of other bodies, those first that decrease χ² most by one linear step, with
-    the experiment with the other body as `corrected`.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        The experiment that is changed.
-    is_far : bool
-        Whether the fit moved the body so far from its stated pose that a linear step from there says
-        little: other materials come first then, whatever it says.
-
-    Notes
-    -----
-    At most `MOST_OF_A_KIND` of each kind and `MOST_REFITS` in all are yielded; nothing that
-    decreases χ² by less than `LEAST_DECREASE`, and nothing with obstacles, whose frames are nodes
-    of the body, or without a grasp.
-    """
-    collocation = solution.collocation
-    if experiment.obstacles or experiment.specimen is not None or not experiment.body_grasps:
-        return
-    rows = [*_likely_mistakes(experiment.body)]
-    if not rows:
-        return
-    # Of the deviation only the effect counts here.
-    changes = [Deviation(row.name, row.unit, axes=row.axes, effect=row.effect) for row in rows]
-    columns = changed_residuals(collocation, solution.z, [(each, 1.0) for each in changes])
-    gram = projected_gram(linearise_fit(collocation, solution.z), columns.blocks)
-    found: list[tuple[float, Hypothesis]] = []
-    first = 1
-    for row, change in zip(rows, changes, strict=True):
-        own = range(first, first + len(change.components))
-        first = own.stop
-        decrease, amplitudes = linear_step(gram, own, np.ones(len(own)) if row.is_whole else None)
-        if is_far and row.name == "law":
-            decrease = np.inf
-        hypothesis = row.hypothesis(experiment, amplitudes)
-        if decrease >= LEAST_DECREASE and hypothesis is not None:
-            found.append((decrease, hypothesis))
-    found.sort(key=lambda each: -each[0])
-    count = Counter[str]()
-    for _, hypothesis in found:
-        if count[hypothesis.code] < MOST_OF_A_KIND and count.total() < MOST_REFITS:
-            count[hypothesis.code] += 1
-            yield hypothesis
 
 
 def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
@@ -250,11 +201,7 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
     except (InputError, SimulationError, np.linalg.LinAlgError):
         return
     gram = projected_gram(linearise_fit(collocation, solution.z), blocks)
-    least, most = MESH_AMPLITUDES
-    amplitude = min(most, float(linear_step(gram, [1])[1][0]))
-    if amplitude < least:
-        return
-    decrease, _ = linear_step(gram, [1], np.array([amplitude]))
+    decrease, (amplitude,) = linear_step(gram, [1], *MESH_ERROR)
     sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.measurement_count))
     if decrease > LEAST_DECREASE and sigmas > LEAST_SIGMAS:
         linear = any(body.element.name == "tet4" for body in bodies)
@@ -266,43 +213,6 @@ def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
         }
         corrected = LinearCorrection(1 - decrease / gram[0, 0])
         yield Hypothesis("mesh-coarse", of, data=data, corrected=corrected)
-
-
-def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
-    """Return the Gram matrix (1 + c, 1 + c) of the residuals of a fit and of c changes of them, less
-    what a step of its parameters explains.
-    """
-    free = ~fit.at_bound
-    stacked = []
-    slopes = []
-    for block, change in zip(fit.blocks, blocks, strict=True):
-        weight = (block.compute_root_weight() * block.is_measured)[..., None]
-        both = np.concatenate([block.residual[..., None], change * weight], axis=3)
-        stacked.append(both.reshape(-1, both.shape[-1]))
-        slopes.append(block.jacobian.reshape(len(stacked[-1]), block.jacobian.shape[-1]))
-    values = np.concatenate(stacked)
-    jacobian = np.concatenate(slopes)[:, free]
-    of_prior = np.zeros((len(fit.prior_residual), values.shape[1]))
-    of_prior[:, 0] = fit.prior_residual
-    values = np.concatenate([values, of_prior])
-    jacobian = np.concatenate([jacobian, np.diag(fit.prior_jacobian)[:, free]])
-    explained = np.linalg.lstsq(jacobian, values, rcond=1e-10)[0]
-    return (remaining := values - jacobian @ explained).T @ remaining
-
-
-def linear_step(
-    gram: Array, columns: Iterable[int], amplitudes: Array | None = None
-) -> tuple[float, Array]:
-    """Return the decrease of χ² by changes of the residuals, and their amplitudes, by default those
-    that decrease it most.
-
-    `gram` is the result of `projected_gram`, in which changes are `columns` from 1 on.
-    """
-    own = [*columns]
-    among = gram[np.ix_(own, own)]
-    if amplitudes is None:
-        amplitudes = -np.linalg.lstsq(among, gram[own, 0], rcond=1e-8)[0].astype(np.float64)
-    return float(-2 * amplitudes @ gram[own, 0] - amplitudes @ among @ amplitudes), amplitudes
 
 
 def mirrored_meshes(experiment: Experiment) -> Iterator[Doubt]:
@@ -322,20 +232,18 @@ def mirrored_meshes(experiment: Experiment) -> Iterator[Doubt]:
     middle_m = _middle_of_grasps_m(experiment)
     surface = points_m[np.unique(body.mesh.surface)]
     tree = KDTree(surface)
-    is_filmed = any(each.counts_pixels for each in experiment.measurements)
-    code = "mesh-mirrored/or-images" if is_filmed else "mesh-mirrored"
     for axis, factors in enumerate(np.ones((3, 3)) - 2 * np.eye(3)):
         away_m = tree.query(middle_m + factors * (surface - middle_m))[0]
         if away_m.max() >= SAME_SHAPE * size_m:
-            yield _mirrored(axis, factors, code)
+            yield _mirrored(axis, factors)
 
 
-def _mirrored(axis: int, factors: Array, code: str) -> Doubt:
+def _mirrored(axis: int, factors: Array) -> Doubt:
     def corrected(experiment: Experiment, _: Array) -> Correction:
         other = with_shape(experiment, factors)
         return other and (other, {"axis": AXES[axis]})
 
-    return Doubt(code, "1", correct=corrected, is_whole=True)
+    return Doubt("mesh-mirrored", "1", corrected)
 
 
 def _middle_of_grasps_m(experiment: Experiment) -> Array:

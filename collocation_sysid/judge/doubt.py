@@ -30,25 +30,35 @@ class Doubt:
     correct: Callable[[Experiment, Array], Correction]
     # ``effect(at, axis)``: linear change of the equations of motion by one unit along an axis.
     effect: Callable[[ExperimentAtAnswer, int], Effect | None] | None = None
+    # Or else changes of each block of the residuals by one unit, (…, axes) in σ.
+    changes: Sequence[Array] | None = None
     axes: str = ""  # names of the components of the size, separated by blanks
-    is_whole: bool = False  # whether the size is one, as of another law, and not estimated
+    # Prior of the size in a linear step; without a deviation, the mistake happens as a whole.
+    mean: float = 1.0
+    wide: float = 0.0
+    subject: str = ""  # what is described, as the beginning of the message
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """What tells the row from others of the same fit, if its size is estimated."""
+        return self.name, self.subject, self.axes
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the answer without the mistake is near the one with it."""
+        return self.effect is not None or self.wide > 0
 
     def hypothesis(self, experiment: Experiment, size: Array | None = None) -> Hypothesis | None:
         """Return the hypothesis of this mistake, with the experiment without it as `corrected`;
         None where it is impossible.
         """
-        correction = self.correct(experiment, np.ones(1) if size is None else size)
+        size = np.full(max(1, len(self.axes.split())), self.mean) if size is None else size
+        correction = self.correct(experiment, size)
         if correction is None:
             return None
         other, data = correction
-        of = f"'{experiment.name}'"
-        return Hypothesis(self.name, of, data=data, corrected=other, doubt=self)
-
-
-def corrected_hypotheses(rows: Iterable[Doubt], experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypotheses of those likely mistakes that are possible, each as a whole."""
-    found = (row.hypothesis(experiment) for row in rows)
-    return (each for each in found if each is not None)
+        of = self.subject or f"'{experiment.name}'"
+        return Hypothesis(self.name, of, data=data, corrected=other, doubt=self, size=size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +70,10 @@ class HypothesisTest:
     misfit_of: Callable[[Any], float | None]
     required_factor: float  # factor by which the misfit must decrease
     smallest_misfit: float = 0.0  # smallest meaningful misfit; smaller ones count as this
-    # If the misfit decreases from above this level to below it, any factor suffices.
-    noise_level: float = 0.0
 
     def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
         """Yield copies of those hypotheses, with their strength, whose correction decreases the
-        misfit by more than the required factor, or from above the noise to below it.
+        misfit by more than the required factor.
 
         The strength is the factor by which the misfit decreases, divided by the handicap. A
         hypothesis whose misfit cannot be computed (None) is omitted. The misfits are computed one
@@ -77,7 +85,7 @@ class HypothesisTest:
             if misfit is None:
                 continue
             strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
-            if strength > self.required_factor or misfit < self.noise_level < self.misfit:
+            if strength > self.required_factor:
                 yield replace(each, strength=strength, remaining=misfit)
 
 

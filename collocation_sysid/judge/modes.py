@@ -54,7 +54,6 @@ FRAME_CAUSES = (
     "markers-axes",
     "poses-inverted",
     "quaternion-order",
-    "rotation-inverted",
     "unlike",
 )
 
@@ -401,11 +400,6 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     shift = -np.einsum("tij,tj->ti", inverse, poses.translations_m)
     inverted = replace(poses, rotations=inverse, translations_m=shift)
     yield Hypothesis("poses-inverted", declared.name, corrected=inverted.with_first_motion())
-    yield Hypothesis(
-        "rotation-inverted",
-        declared.name,
-        corrected=replace(poses, rotations=inverse).with_first_motion(),
-    )
     quaternions = Rotation.from_matrix(poses.rotations).as_quat()
     # Signs are free; neighbours of one sign keep the reordered ones continuous.
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0

@@ -10,6 +10,7 @@ from ..problem import Problem
 from ..program.collocation import Collocation, ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.hypothesis import Hypothesis
+from .fit import Candidate, TestedFit
 
 
 def _nothing(*_: object) -> tuple[()]:
@@ -45,7 +46,11 @@ class Source:
     simulated : callable
         ``simulated(check)``: the same by comparison with a simulation, and notes.
     fitted : callable
-        ``fitted(solution)``: the same by the residuals of a fit.
+        ``fitted(solution)``: the same that the residuals of an inconsistent fit show.
+    candidates : callable
+        ``candidates(fit)``: those that may be corrected and fitted again.
+    consistent : callable
+        ``consistent(solution)``: those that a consistent fit does not exclude.
     """
 
     described: Callable[[Experiment], Iterable[Hypothesis]] = _nothing
@@ -54,3 +59,5 @@ class Source:
         (),
     )
     fitted: Callable[[Solution], Iterable[Hypothesis]] = _nothing
+    candidates: Callable[[TestedFit], Iterable[Candidate]] = _nothing
+    consistent: Callable[[Solution], Iterable[Hypothesis]] = _nothing

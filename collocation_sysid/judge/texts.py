@@ -7,8 +7,6 @@ from ..statistics.concerns import declare_messages
 MESSAGES = {
     "poses-inverted": "the markers move as if the poses were inverted: invert them; a pose must "
     "map the undeformed body to its current position",
-    "rotation-inverted": "the markers move as if the poses' rotations were inverted: transpose "
-    "the matrices or conjugate the quaternions, and leave the positions unchanged",
     "quaternion-order": "the markers move as if the quaternions were in another order: set "
     'grasp.quaternion = "{order}" or swap the columns',
     "length-unit": "{who} were {factor:g} times as large: {remedy}",
@@ -46,8 +44,6 @@ MESSAGES = {
     "{remedy}",
     "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare it "
     "with the real body",
-    "mesh-mirrored/or-images": "the images are flipped (u to the left, or v upwards), or the "
-    "mesh is a mirror image of the body, along its {axis} axis: compare both with the real body",
     "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "
     "({down}) of the mesh, not a stress-free one: state object.rest_shape",
     "several": "a correction of the description brings the residuals to the noise, but the data "
@@ -63,8 +59,6 @@ MESSAGES = {
     "markers-same": "the tracks of markers {first} and {second} are {by_mm:.2g} mm (RMS) apart, "
     "but these markers are at different places of the body: one track is a copy of the other; "
     "correct markers.labels, or omit one of them",
-    "markers-same/unplaced": "the tracks of markers {first} and {second} are {by_mm:.2g} mm "
-    "(RMS) apart: one track is a copy of the other; omit one of them",
     "sensor-sign": "its values fit with the opposite sign: multiply them by -1, or reverse the "
     "direction of the sensor in its description",
     "sensor-unit": "its values fit if multiplied by {factor:.4g}: check the unit of its columns",
@@ -119,8 +113,6 @@ MESSAGES = {
     "of test; if it is right, compare laws with compare-models --materials",
     "specimen-kind/likelier": "the curve fits better as that of another kind of test, with the "
     "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
-    "specimen-kind/open": "the curve does not show the kind of test: with the same law it fits "
-    "as well as {kinds}, instead of {stated} ({young}); make sure that the kind is right",
     "specimen-moduli": "its moduli fit if storage and loss modulus are exchanged: check which "
     "column is which",
     "specimen-gap": "its amounts of shear fit as the displacement over the distance before "
@@ -141,10 +133,6 @@ MESSAGES = {
     "state sensor_frame in the table of the wrench",
     "wrench-gain": "its {what} fit if multiplied by {factor:.3g}: check the calibration of the "
     "sensor, and the density or mass of the body",
-    "wrench-gain/section": "its {what} fit if multiplied by {factor:.3g}, as if the body had "
-    "{ratio:.3g} times its mass: probably the section of the body is {real}, and that of the "
-    "mesh is not and as wide, with the same density; mesh the section of the body, or check the "
-    "sensor",
     "wrench-point": "its torques refer to a point {by_mm:.3g} mm away from point_m: set point_m "
     "= {point}, with which they fit",
     "wrench-frame": 'it is expressed in the frame of the {other}: set frame = "{other}"',
@@ -186,8 +174,6 @@ MESSAGES = {
     "took the image",
     "camera-matrix/focal": "the points fit with focal lengths {factor:g} times as large: check "
     "fx and fy of camera.matrix, which are in pixels of these images",
-    "camera-matrix/size": "the points fit with camera.matrix multiplied by {factor:g}, except "
-    "for its last row: it is that of images of another size; state the matrix of these images",
     "camera-matrix/centre": "the points fit with the principal point {centre}, {how}: state cx "
     "and cy of camera.matrix from the upper left corner, cx along the columns",
     "camera-rays": "the points fit if the depths are distances along the rays: convert them to "

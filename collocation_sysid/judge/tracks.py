@@ -93,14 +93,14 @@ def same_tracks(experiment: Experiment) -> Iterator[Hypothesis]:
         rms_m = float(np.sqrt(np.nanmean(away_m**2)))
         if rms_m > SAME_TRACK * noise_m:
             continue
-        is_placed = bool(markers.located[i] and markers.located[j])
         places_m = markers.predict_positions(experiment.body.nodes_m)
         apart_m = float(np.linalg.norm(places_m[i] - places_m[j]))
-        if is_placed and apart_m < OTHER_PLACE * max(rms_m, noise_m):
+        is_placed = markers.located[i] and markers.located[j]
+        if not is_placed or apart_m < OTHER_PLACE * max(rms_m, noise_m):
             continue
-        code = "markers-same" if is_placed else "markers-same/unplaced"
         data = {"first": names[i], "second": names[j], "by_mm": 1e3 * rms_m}
-        yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=OTHER_PLACE)
+        of = f"'{experiment.name}'"
+        yield Hypothesis("markers-same", of, data=data, strength=OTHER_PLACE)
         return
 
 

@@ -35,16 +35,12 @@ class Hypothesis:
     # known.
     remaining: float | None = None
     doubt: Any = None  # row of which it is the mistake, whose name is the code
+    size: Any = None  # size of that mistake along the axes of the row
 
     @property
     def cause(self) -> str:
         """Short name of the mistake, such as "poses-inverted": the code up to the first slash."""
         return self.code.partition("/")[0]
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the data fit with the mistake as well as without, which contradicts nothing."""
-        return self.code.endswith("/open")
 
     @property
     def message(self) -> str:

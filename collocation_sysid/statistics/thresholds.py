@@ -189,9 +189,6 @@ ESTIMATED_LAGS = Threshold(
     "Standard deviations of an estimated time shift up to which the fit follows a lag by itself.",
     study="mistakes",
 )
-MIRRORED = Threshold(
-    2.0, "Discrepancy from which on mirror images of the mesh are fitted.", study="mistakes"
-)
 LINEAR = Threshold(
     2.0,
     "Factor by which a correction that is known to first order must decrease the misfit to be "
@@ -221,9 +218,8 @@ PARTIAL = Threshold(
 )
 FAR = Threshold(
     6.0,
-    "Error of gravity or of the pose in the grasp, in standard deviations, from which on a "
-    "linear step from the answer does not tell which law is right (8 and 31 in twins of another "
-    "law).",
+    "Error of gravity or of the pose in the grasp, in standard deviations, from which on mirror "
+    "images of the mesh and other directions of gravity are fitted.",
     study="mistakes",
 )
 REPRODUCED = Threshold(
@@ -273,44 +269,17 @@ UNCORRELATED = Threshold(
     "which they are noise.",
     study="mistakes",
 )
-PLAUSIBLE_NUISANCE = Threshold(
-    4.0,
-    "Largest nuisance parameter of a corrected fit, in standard deviations of its prior.",
-    study="mistakes",
-)
-DECISIVE = Threshold(
-    20.0,
-    "Decrease of χ² that no statistical fluctuation causes: a ratio of likelihoods of e^10.",
-    study="specimens",
-)
 LIKELIER = Threshold(
-    10.0,
-    "Decrease of χ², over that of one measurement, from which on one kind of test is likelier "
-    "than another: a ratio of likelihoods of e^5, which the wrong kind reaches in less than 1 "
-    "of 100 tests.",
-    study="specimens",
-)
-UNLIKELY = Threshold(
-    2.0,
-    "Standard deviations of χ² by which that of the stated kind must exceed its mean.",
-    study="specimens",
-)
-LEAST_KIND_CHANGE = Threshold(
-    0.2,
-    "Change of the logarithm of E from which on another kind of test is more than an error of "
-    "the gauge length: that of a dogbone between its grips is 10 % too long.",
-    study="specimens",
-)
-LIKELIER_FAR = Threshold(
     6.0,
-    "The same decrease as `LIKELIER` where the other kind changes E by `FAR_KIND_CHANGE`: a wrong "
-    "answer then costs more than a question. Right tests reach it in at most 2 of 100 cases.",
+    "Decrease of χ² from which on one kind of test is likelier than another, if E changes by "
+    "`KIND_CHANGE`: a wrong answer then costs more than a question. Right tests reach it in at most "
+    "2 of 100 cases.",
     study="specimens",
 )
-FAR_KIND_CHANGE = Threshold(
+KIND_CHANGE = Threshold(
     0.4,
-    "Change of the logarithm of E, a factor of 1.5, from which on another kind of test needs less "
-    "evidence, and the fit of the stated kind need not be unlikely.",
+    "Change of the logarithm of E, a factor of 1.5, from which on another kind of test is named "
+    "although the stated one fits.",
     study="specimens",
 )
 DENSITY_DEVIATION = Threshold(

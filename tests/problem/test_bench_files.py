@@ -20,8 +20,8 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import ElementNodes
 from collocation_sysid.fem.meshes.selection import Face
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
-from collocation_sysid.judge.engine import _unloading
 from collocation_sysid.judge.modes import find_misspecifications_by_modes
+from collocation_sysid.judge.motion import _unloading
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate

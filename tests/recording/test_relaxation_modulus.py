@@ -8,7 +8,6 @@ from kit.problem_files import run_command
 
 import collocation_sysid as cs
 from collocation_sysid.features.measurements import prediction_error, stated_sigmas
-from collocation_sysid.features.specimens.doubts import find_specimen_misspecifications
 from collocation_sysid.recording.specimen_files import specimen_strains
 from collocation_sysid.result.pictures.stress_strain import relaxation_picture
 
@@ -135,15 +134,3 @@ def test_a_simulated_file_has_times_and_modulus(tmp_path):
     header, *rows = (tmp_path / "made" / "relax.csv").read_text().splitlines()
     assert header == "t_s,modulus_pa"
     assert len(rows) == len(T_S)
-
-
-@pytest.mark.long
-def test_a_modulus_can_be_mistaken_for_that_of_shear_only():
-    noise_pa = 20.0 * np.random.default_rng(0).normal(size=len(T_S))
-    specimen = cs.Specimen.relaxation(T_S, MODULUS_PA + noise_pa, 20.0)
-    unknown = {"young_pa": cs.Unknown(), "poisson": 0.45}
-    unknown |= {"b.share": cs.Unknown(), "b.tau_s": cs.Unknown()}
-    experiment = specimen.experiment("linear", "relax", prony=("b",))
-    found = find_specimen_misspecifications(cs.solve(cs.Problem([experiment], unknown)))
-    (kinds,) = [each for each in found if each.cause == "specimen-kind"]
-    assert [each.split()[0] for each in kinds.data["kinds"]] == ["simple-shear"]

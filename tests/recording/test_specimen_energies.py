@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import collocation_sysid as cs
-from collocation_sysid.features.specimens.doubts import _hypotheses
+from collocation_sysid.features.specimens.doubts import likely_mistakes
 from collocation_sysid.recording.homogeneous_deformation import DEFORMATIONS
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 from collocation_sysid.recording.specimen_stretches import isochoric_stretches
@@ -163,4 +163,6 @@ def test_shear_over_the_undeformed_gap_is_named():
     pull = cs.Specimen("uniaxial", stretch - 1, pull_pa + noise_pa[1], sigma_pa=10.0)
     run = fit("ogden-1", [shear, pull], ["mu_1_pa", "alpha_1"])
     assert "specimen-gap" in [cause.cause for cause in run.causes]
-    assert sum(each.cause == "specimen-gap" for each in _hypotheses(shear.experiment(), ())) == 1
+    stated = shear.experiment()
+    gaps = [row for row in likely_mistakes(stated, ()) if row.name == "specimen-gap"]
+    assert sum(row.hypothesis(stated) is not None for row in gaps) == 1

@@ -294,7 +294,7 @@ def test_the_search_for_causes_is_bounded_by_the_time_of_the_fit(monkeypatch, rn
     assert find_misspecifications(solution)[0].cause == "marker-slip"
     assert len(sweeps) > 1
     assert max(sweeps) <= max(15, solution.iterations) + 2  # simulations count when they are done
-    assert sum(sweeps) <= 3 * max(15, solution.iterations) + 2
+    assert sum(sweeps) <= max(3 * 15, solution.iterations) + 2
 
 
 @pytest.mark.parametrize("filled", ["last", "zeros", None])

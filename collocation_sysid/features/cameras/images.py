@@ -320,9 +320,6 @@ class _ImageComparison:
             zoomed = np.array(image.camera.matrix)
             zoomed[[0, 1], [0, 1]] *= factor
             yield self._hypothesis("camera-matrix/focal", image.with_matrix(zoomed), factor=factor)
-            resized = np.array(image.camera.matrix)
-            resized[:2] *= factor
-            yield self._hypothesis("camera-matrix/size", image.with_matrix(resized), factor=factor)
         matrix = image.camera.require_matrix()
         centres = {
             "counted from the opposite corner of the image": size - matrix[:2, 2],

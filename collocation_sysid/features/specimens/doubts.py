@@ -1,4 +1,4 @@
-"""Misspecification hypotheses for homogeneous specimens: refits with a common mistake corrected.
+"""Likely mistakes in the description of homogeneous specimens.
 
 Mistakes in a table that show without a fit are in `recording.specimen_checks`. The others leave a
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
@@ -8,11 +8,7 @@ nuisance parameters, so that a wrong area does not explain all. A correction kee
 unless the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
-mistake is therefore named only if the corrected description explains the data, see `_is_explained`.
-
-A flexible law also fits the curve of another kind of test, with other constants. If all specimens
-are of one kind and fit, the other kinds are therefore compared by their likelihood, see
-`_kinds_in_doubt`.
+mistake is therefore named only if its correction leaves noise.
 """
 
 from __future__ import annotations
@@ -28,16 +24,15 @@ from ...common.array_types import Array
 from ...common.display import readable_stress
 from ...errors import InputError, SimulationError, listed
 from ...fem.laws.moduli import engineering_constants
-from ...judge.doubt import Correction, Doubt, HypothesisTest
+from ...judge.doubt import Correction, Doubt
+from ...judge.fit import Candidate, TestedFit, has_trend, scaled_residuals, thinned
 from ...judge.source import Source
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
-from ...program.custom_sensor_residual import CustomSensorResidual
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
 from ...recording.homogeneous_deformation import DEFORMATIONS, HomogeneousDeformation
-from ...recording.markers import Markers
 from ...recording.specimen import (
     LATERAL_NAME,
     MODULUS_TESTS,
@@ -51,32 +46,15 @@ from ...recording.specimen import (
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
 from ...statistics.hypothesis import Hypothesis
-from ...statistics.thresholds import (
-    BETTER,
-    CERTAIN,
-    DECISIVE,
-    FAR_KIND_CHANGE,
-    LEAST_KIND_CHANGE,
-    LIKELIER,
-    LIKELIER_FAR,
-    MISFIT,
-    NOISE_LEVEL,
-    PLAUSIBLE_NUISANCE,
-    UNCORRELATED,
-    UNIT_LIKE,
-    UNLIKELY,
-)
+from ...statistics.thresholds import KIND_CHANGE, LIKELIER, UNIT_LIKE
 
 # Fewest samples of a specimen whose curve distinguishes hypotheses.
 FEWEST_SAMPLES = 4
-# Most iterations of one refit, and its tolerance: a misfit is needed, not an estimate.
-MOST_ITERATIONS = 15
+# Samples of each specimen, and most iterations, of the fits that screen the mistakes, and of those
+# that compare kinds of test; their tolerance: a misfit is needed, not an estimate.
+SCREENING = (8, 15)
+COMPARING = (60, 30)
 TOLERANCE = 1e-2
-# Samples of each specimen that are refitted.
-REFITTED_SAMPLES = 8
-# Samples of each specimen, and most iterations, of the fit that decides.
-DECIDING_SAMPLES = 60
-DECIDING_ITERATIONS = 30
 # Units that stresses are confused in: name of the factor that corrects the file.
 UNIT_FACTORS = {"kPa": 1e-3, "MPa": 1e3}
 # Factors on the stress of a specimen, or their inverses, that correct its area or load, by the mistake.
@@ -91,8 +69,6 @@ LOAD_FACTORS = {
 }
 # Largest change of a ratio of initial slopes by nonlinear laws and zeros of the strain.
 SLOPE_RANGE = 1.5
-# Causes that show with any law.
-EVIDENT = ("specimen-unit", "specimen-placeholder")
 # Kinds of test that each kind is confused with, besides that of compression without free sides.
 CONFUSED_TESTS = {
     "uniaxial": ("planar", "equibiaxial", "simple-shear"),
@@ -107,62 +83,34 @@ DECREASE = 6.0
 PERCENT_STRAIN = 1.0
 
 
-def find_specimen_misspecifications(solution: Solution) -> list[Hypothesis]:
-    """Return hypotheses of what is described wrongly of the specimens of a fit; empty without
-    specimens, after a search that did not converge, or if refits fail; where the specimens fit,
-    only the kinds of test in doubt.
-
-    The specimens with the largest misfit are tested first; a nearly certain hypothesis (`CERTAIN`)
-    about one ends the search, after all those about it, several of which may explain its data. A
-    hypothesis is returned only if the corrected description explains the data (`_is_explained`). A
-    wrong unit and a column of zeros need no explanation: the initial slopes of the tests, or the
-    zeros, show it with any law.
-
-    Parameters
-    ----------
-    solution : Solution
-        The fit. Its recordings without specimens are not refitted.
-    """
-    fitted = [part for part in solution.parts if part.transcription.experiment.specimen is not None]
-    if any(part.transcription.body.memory.oscillates for part in fitted):
-        # A table of complex moduli has neither strains nor samples that could be left out.
-        return [h for part in fitted for h in exchanged_moduli(part.transcription.experiment)]
-    if not fitted or not solution.status.converged:
-        return []
-    stated_misfit = _misfit(fitted)
-    if stated_misfit <= NOISE_LEVEL:
-        return _kinds_in_doubt(solution)
-    fitted.sort(key=lambda part: -_misfit([part]))
-    originals = [part.transcription.experiment for part in fitted]
-    experiments = [_thinned(each, most_samples=REFITTED_SAMPLES) for each in originals]
-
-    def misfit_of(corrected: Experiment) -> float | None:
-        """Return the misfit of all specimens with one of them corrected; None without a fit."""
-        chosen = [corrected if e.name == corrected.name else e for e in experiments]
-        refit = _refit(solution, chosen, iterations=MOST_ITERATIONS)
-        return None if refit is None else _misfit(refit.parts)
-
-    misfit = misfit_of(experiments[0])
-    if misfit is None:
-        return []
-    hypotheses: list[Hypothesis] = []
-    test = HypothesisTest(
-        misfit, misfit_of, required_factor=BETTER, smallest_misfit=1.0, noise_level=NOISE_LEVEL
-    )
-    slopes_pa = [_initial_slope(each) for each in experiments]
-    for index, experiment in enumerate(experiments):
+def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
+    """Yield the likely mistakes of all specimens that decrease the misfit of a few samples of each."""
+    solution = fit.whole
+    originals = [part.transcription.experiment for part in fit.solution.parts]
+    if any(each.specimen is None or each.body.memory.oscillates for each in originals):
+        return
+    few = [thinned(each, SCREENING[0]) for each in originals]
+    stated = _refit(solution, few, SCREENING)
+    if stated is None:
+        return
+    slopes_pa = [_initial_slope(each) for each in few]
+    for index, experiment in enumerate(few):
         if len(experiment.t_s) < FEWEST_SAMPLES:
             continue
-        other_slopes_pa = slopes_pa[:index] + slopes_pa[index + 1 :]
-        for hypothesis in test.accepted(_hypotheses(experiment, other_slopes_pa)):
-            if hypothesis.cause not in EVIDENT and not _is_explained(
-                solution, originals, index=index, tested=hypothesis, stated_misfit=stated_misfit
-            ):
+        for row in likely_mistakes(experiment, slopes_pa[:index] + slopes_pa[index + 1 :]):
+            tried, whole = row.hypothesis(experiment), row.hypothesis(originals[index])
+            if tried is None or whole is None:
                 continue
-            hypotheses.append(hypothesis)
-        if any(each.strength > CERTAIN for each in hypotheses):
-            break
-    return hypotheses
+            refit = _refit(solution, [*few[:index], tried.corrected, *few[index + 1 :]], SCREENING)
+            if refit is not None:
+                yield _square_sum(refit.parts) / max(_square_sum(stated.parts), 1e-300), whole
+
+
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield exchanged moduli of harmonic tests."""
+    for transcription in solution.collocation.transcriptions:
+        if transcription.experiment.specimen is not None:
+            yield from exchanged_moduli(transcription.experiment)
 
 
 def exchanged_moduli(experiment: Experiment) -> Iterator[Hypothesis]:
@@ -194,61 +142,49 @@ def _largest_decrease(values: Array, sigmas: Array) -> float:
     return float((decrease / sigmas[is_known]).max(initial=0.0))
 
 
-def _kinds_in_doubt(solution: Solution) -> list[Hypothesis]:
-    """Return one hypothesis, as a list, about the kind of test of specimens that fit: that another
-    kind is likelier, or that others fit as well; empty if the data exclude all others
-    (`LIKELIER`), and unless all recordings are specimens of one kind.
+def likelier_kinds(solution: Solution) -> list[Hypothesis]:
+    """Return the hypothesis, as a list, that specimens which fit are of another kind of test, with
+    which they fit far better; empty unless all recordings are specimens of one kind. A flexible law
+    fits the curve of another kind too, with other constants.
     """
     experiments = [part.transcription.experiment for part in solution.parts]
     kinds = {each.specimen.test if each.specimen else "" for each in experiments}
     if len(kinds) != 1 or "" in kinds or max(len(e.t_s) for e in experiments) < FEWEST_SAMPLES:
         return []
-    chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
+    if any(each.body.memory.oscillates for each in experiments) or not solution.status.converged:
+        return []
+    chosen = [thinned(each, COMPARING[0]) for each in experiments]
     corrections: dict[str, list[Experiment]] = {}
     for each in chosen:
         for row in _other_kinds(each):
             if hypothesis := row.hypothesis(each):
                 corrections.setdefault(hypothesis.data["test"], []).append(hypothesis.corrected)
-    stated = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
-    if stated is None:
-        return []
+    stated = _refit(solution, chosen, COMPARING)
     refits = {
         test: refit
         for test, corrected in corrections.items()
-        if len(corrected) == len(chosen)
-        and (refit := _refit(solution, corrected, iterations=DECIDING_ITERATIONS))
+        if len(corrected) == len(chosen) and (refit := _refit(solution, corrected, COMPARING))
     }
-    count = sum(len(row) for part in stated.parts for row in _residuals(part))
-    stated_loss = _square_sum(stated.parts)
-    loss = {test: _square_sum(each.parts) for test, each in refits.items()}
-    unit = max(1.0, min([stated_loss, *loss.values()]) / max(1, count - stated.collocation.nq))
-    gains = {test: (stated_loss - value) / unit for test, value in loss.items()}
-    best = max(gains.values(), default=-np.inf)
-    if best <= -LIKELIER:
+    if stated is None or not refits:
         return []
-    possible = [test for test in gains if gains[test] > best - LIKELIER]
-    possible.sort(key=lambda test: -gains[test])
+    losses = {test: _square_sum(each.parts) for test, each in refits.items()}
+    likeliest = min(losses, key=losses.__getitem__)
+    best, stated_loss = refits[likeliest], _square_sum(stated.parts)
+    change = abs(np.log(_young_pa(best) / _young_pa(stated)))
+    # The stress in unloading is not that of the law. Where the law is wrong too, correlated residuals
+    # remain, and χ² does not tell the kinds apart.
+    has_unloading = any(is_unloading(specimen_strains(each)[0]) for each in experiments)
+    is_likelier = stated_loss - losses[likeliest] >= LIKELIER and change > KIND_CHANGE
+    if not is_likelier or has_unloading or any(map(has_trend, best.parts)):
+        return []
     data = {
         "stated": kinds.pop(),
         "young": _young_text(stated),
-        "kinds": [f"{test} ({_young_text(refits[test])})" for test in possible],
+        "kinds": [f"{likeliest} ({_young_text(best)})"],
     }
     of = listed([f"'{each.name}'" for each in experiments])
-    # Where the law is wrong too, correlated residuals remain, and χ² does not tell the kinds apart.
-    is_noise = not any(
-        _is_correlated(row) for p in refits[possible[0]].parts for row in _residuals(p)
-    )
-    freedom = max(1, count - stated.collocation.nq)
-    is_unlikely = stated_loss > freedom + UNLIKELY * np.sqrt(2 * freedom)
-    change = abs(np.log(_young_pa(refits[possible[0]]) / _young_pa(stated)))
-    # The stress in unloading is not that of the law.
-    has_unloading = any(is_unloading(specimen_strains(each)[0]) for each in experiments)
-    is_likelier = is_noise and (
-        (best >= LIKELIER and is_unlikely and change > LEAST_KIND_CHANGE)
-        or (best >= LIKELIER_FAR and change > FAR_KIND_CHANGE and not has_unloading)
-    )
-    code = "specimen-kind/likelier" if is_likelier else "specimen-kind/open"
-    return [Hypothesis(code, of, data=data, strength=np.sqrt(stated_loss / min(loss.values())))]
+    strength = float(np.sqrt(stated_loss / losses[likeliest]))
+    return [Hypothesis("specimen-kind/likelier", of, data=data, strength=strength)]
 
 
 def _young_pa(solution: Solution) -> float:
@@ -264,69 +200,15 @@ def _young_text(solution: Solution) -> str:
 
 
 def _refit(
-    solution: Solution, experiments: Sequence[Experiment], iterations: int
+    solution: Solution, experiments: Sequence[Experiment], effort: tuple[int, int]
 ) -> Solution | None:
     """Return the fit from a solution's parameters; None on failure."""
-    method = ReducedSpace(max_iterations=iterations, tolerance=TOLERANCE)
+    method = ReducedSpace(max_iterations=effort[1], tolerance=TOLERANCE)
     try:
         refit = method(replace(solution.collocation, experiments=tuple(experiments)))
     except (InputError, SimulationError):
         return None
     return refit.unless_interrupted()
-
-
-def _is_explained(
-    solution: Solution,
-    experiments: Sequence[Experiment],
-    index: int,
-    tested: Hypothesis,
-    stated_misfit: float,
-) -> bool:
-    """Residuals below `MISFIT` σ, uncorrelated, plausible nuisances, and `DECISIVE` less χ²."""
-    chosen = [_thinned(each, most_samples=DECIDING_SAMPLES) for each in experiments]
-    corrected = tested.doubt and tested.doubt.hypothesis(chosen[index])
-    if not corrected:
-        return False
-    chosen[index] = corrected.corrected
-    refit = _refit(solution, chosen, iterations=DECIDING_ITERATIONS)
-    if refit is None:
-        return False
-    residuals = [row for part in refit.parts for row in _residuals(part)]
-    count = sum(len(row) for row in residuals)
-    freedom = max(1, count - refit.collocation.nq)
-    squares = sum(float(np.sum(row**2)) for row in residuals)
-    phi = np.concatenate([part.phi for part in refit.parts])
-    decrease = count * stated_misfit**2 - squares - float(phi @ phi)
-    return bool(
-        np.sqrt(squares / freedom) <= MISFIT
-        and not any(_is_correlated(row) for row in residuals)
-        and np.abs(phi).max(initial=0.0) <= PLAUSIBLE_NUISANCE
-        and decrease >= DECISIVE
-    )
-
-
-def _is_correlated(residuals: Array) -> bool:
-    """Return whether consecutive residuals (n,) are more alike than noise."""
-    squares = float(np.sum(residuals**2))
-    products = float(np.sum(residuals[1:] * residuals[:-1]))
-    return products > UNCORRELATED / np.sqrt(max(1, len(residuals))) * squares
-
-
-def _thinned(experiment: Experiment, most_samples: int) -> Experiment:
-    count = len(experiment.t_s)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, most_samples)).astype(int))
-    readings = [
-        replace(
-            gauge,
-            t_s=gauge.sample_times_s[chosen],
-            values=gauge.measured_values[chosen],
-            sigma_ratios=None if gauge.sigma_ratios is None else gauge.sigma_ratios[chosen],
-        )
-        for gauge in experiment.readings
-        if np.isfinite(gauge.measured_values[chosen]).any()
-    ]
-    markers = Markers.none(experiment.t_s[chosen])
-    return replace(experiment, t_s=experiment.t_s[chosen], readings=readings, markers=markers)
 
 
 def _initial_slope(experiment: Experiment) -> float:
@@ -342,32 +224,10 @@ def _initial_slope(experiment: Experiment) -> float:
     return slope / (ratio if np.isfinite(ratio) else 1.0)
 
 
-def _misfit(parts: Sequence[ExperimentIterate]) -> float:
-    count = sum(len(residuals) for part in parts for residuals in _residuals(part))
-    return float(np.sqrt(_square_sum(parts) / max(1, count)))
-
-
 def _square_sum(parts: Sequence[ExperimentIterate]) -> float:
     """Return χ²: the sum of the squares of residuals and nuisance parameters."""
-    rows = [row for part in parts for row in (part.phi, *_residuals(part))]
-    return sum(float(np.sum(row**2)) for row in rows)
-
-
-def _residuals(part: ExperimentIterate) -> list[Array]:
-    """Return residuals (n,) over σ for each component of each sensor, without NaN."""
-    rows: list[Array] = []
-    for sensor in part.transcription.residuals_of(CustomSensorResidual):
-        motion = part.motion_for(sensor.observable)
-        predicted = sensor.numbers(sensor.predict_motion(motion, part.phi))
-        residuals = (predicted - sensor.sensor.measured_values) / sensor.sensor.sample_sigmas
-        rows += [row[np.isfinite(row)] for row in residuals.T]
-    return rows
-
-
-def _hypotheses(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Hypothesis]:
-    for row in likely_mistakes(experiment, other_slopes_pa):
-        if hypothesis := row.hypothesis(experiment):
-            yield hypothesis
+    residuals = (np.nansum(r**2) for part in parts for _, r in scaled_residuals(part))
+    return float(sum(residuals) + sum(float(part.phi @ part.phi) for part in parts))
 
 
 def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Doubt]:
@@ -407,7 +267,7 @@ def _other_kinds(experiment: Experiment) -> Iterator[Doubt]:
 
 
 def _mistake(name: str, corrected: Callable[[Experiment], Correction]) -> Doubt:
-    return Doubt(name, "1", lambda at, _: corrected(at), is_whole=True)
+    return Doubt(name, "1", lambda at, _: corrected(at))
 
 
 def _of_engineering_stress(experiment: Experiment) -> Correction:
@@ -517,7 +377,11 @@ def area_ratios(deformation: HomogeneousDeformation, strain: Array) -> Array | N
 
 def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
     readings = [
-        replace(gauge, values=gauge.measured_values * factors[:, None])
+        replace(
+            gauge,
+            values=gauge.measured_values * factors[:, None],
+            sigma=gauge.sigma * max(1.0, float(np.median(np.abs(factors)))),
+        )
         if gauge.unit == STRESS_UNIT and len(gauge.sample_times_s) == len(factors)
         else gauge
         for gauge in experiment.readings
@@ -559,4 +423,4 @@ def _compressed(experiment: Experiment, is_widening: bool) -> Correction:
     return _strained(replace(reversed_stress, readings=readings), -1.0), {}
 
 
-SPECIMENS = Source(fitted=find_specimen_misspecifications)
+SPECIMENS = Source(fitted=fit_hypotheses, candidates=specimen_candidates, consistent=likelier_kinds)

@@ -21,6 +21,7 @@ from ...common.array_types import Array
 from ...errors import InputError, SimulationError
 from ...judge.contradictions import load_sign_hypotheses
 from ...judge.doubt import Doubt, HypothesisTest
+from ...judge.fit import Candidate, TestedFit
 from ...judge.sensors import measurement_mistake
 from ...judge.source import SimulatedCheck, Source
 from ...methods.reduced_space import ReducedSpace
@@ -36,7 +37,6 @@ from ...recording.measured_wrench import Wrench
 from ...recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ...recording.poses import Frame
 from ...statistics.axes import with_other_axes
-from ...statistics.budget.shape_error import other_section
 from ...statistics.hypothesis import Hypothesis, rank
 from ...statistics.thresholds import BETTER, FITTED, NOISE_LEVEL, ONE_OF_MANY
 from .at_guess import wrench_deviations
@@ -87,29 +87,23 @@ LARGEST_TARE = 3.0
 SAME_GAIN = 0.05
 # Error of the reference point that gives no concern [m].
 SAME_POINT_M = 0.005
-# Relative difference up to which a gain is the ratio of the areas of a square and a round section:
-# the accuracy of gains, which a fit with a wrong body distorts.
-LIKE_SECTION = 0.1
 
 
-def wrench_causes(solution: Solution) -> list[Hypothesis]:
-    """Return hypotheses about wrongly described wrenches after a fit; empty if all wrenches fit
-    (`NOISE_LEVEL`), or if no experiment has markers.
-
-    The experiments with markers are fitted again, to their markers alone.
+def wrench_candidates(fit: TestedFit) -> Iterator[Candidate]:
+    """Yield likely mistakes of the wrenches of a recording with markers that the fit misses, by the
+    prediction of a fit to the markers alone.
     """
-    if not any(map(_misses, solution.parts)):
-        return []
-    with_markers = [
-        s for s in solution.collocation.transcriptions if s.experiment.markers.sample_count
-    ]
-    estimated = {part.transcription.experiment.name: part for part in solution.parts}
-    parts = _from_markers(
-        solution.collocation, with_markers, method=ReducedSpace(max_iterations=MOST_SWEEPS)
-    )
-    return _of_parts(
-        [_with_tools(part, estimated[part.transcription.experiment.name]) for part in parts]
-    )
+    transcription = fit.part.transcription
+    if not transcription.experiment.markers.sample_count or not _misses(fit.part):
+        return
+    method = ReducedSpace(max_iterations=MOST_SWEEPS)
+    for part in _from_markers(fit.solution.collocation, [transcription], method=method):
+        of_markers = _with_tools(part, fit.part)
+        for sensor in transcription.residuals_of(WrenchResidual):
+            compared = _OneSensor(of_markers, sensor, forced=of_markers.reactions)
+            for each in rank(compared.accepted()):
+                if (each.remaining or 0.0) < MARKERS_MISFIT:
+                    yield each.strength**-2, each
 
 
 def wrench_mistakes(collocation: Collocation) -> tuple[list[Hypothesis], list[str]]:
@@ -213,12 +207,15 @@ class _OneSensor:
 
     def causes(self) -> Iterator[Hypothesis]:
         """Yield what improves the fit far enough, else a large tare."""
-        accepted: list[Hypothesis] = []
+        yield from self.accepted() or self._large_tare()
+
+    def accepted(self) -> list[Hypothesis]:
+        """Return what improves the fit far enough."""
         misfit = self.misfit(self.declared)
-        if misfit > NOISE_LEVEL:
-            test = HypothesisTest(misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0)
-            accepted = list(test.accepted(self._hypotheses()))
-        yield from accepted or self._large_tare()
+        if misfit <= NOISE_LEVEL:
+            return []
+        test = HypothesisTest(misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0)
+        return list(test.accepted(self._hypotheses()))
 
     def _large_tare(self) -> Iterator[Hypothesis]:
         """Yield a mean difference beyond `LARGEST_TARE` σ of the tare's prior."""
@@ -342,20 +339,19 @@ class _OneSensor:
             for unit, factor in units.items() if wrench.measured_components[columns].any() else ():
                 without = _multiplied(wrench, columns, factor=factor)
                 yield mistake("wrench-unit", without, what=what, unit=unit, factor=factor)
-        body = self.part.transcription.body
-        section = None if body.has_declared_mass else other_section(body.mesh, body.mesh.points_m)
         for what, columns in (
             ("forces and torques", BOTH),
             ("forces", FORCES),
             ("torques", TORQUES),
         ):
             factor = self._gain(columns)
-            if factor > 0 and abs(factor - 1) > SAME_GAIN:
+            known = [
+                1.0,
+                *(each for _, units, own in UNITS if own == columns for each in units.values()),
+            ]
+            if factor > 0 and all(abs(factor / each - 1) > SAME_GAIN for each in known):
                 data: dict[str, Any] = {"what": what, "factor": factor}
                 code = "wrench-gain"
-                if section and abs(factor * section.volume_ratio - 1) < LIKE_SECTION:
-                    code += "/section"
-                    data |= {"ratio": section.volume_ratio, "real": section.name}
                 without = _multiplied(wrench, columns, factor=factor)
                 yield mistake(code, without, handicap=FITTED, **data)
         shift_m = self._point_shift_m()
@@ -442,16 +438,12 @@ def simulated_hypotheses(check: SimulatedCheck) -> tuple[Sequence[Hypothesis], S
     return rank(hypotheses), notes
 
 
-def fit_hypotheses(solution: Solution) -> list[Hypothesis]:
-    """Return likely errors of wrenches, by the residuals of a fit and by the signs of loads."""
-    return [
-        *wrench_causes(solution),
-        *(
-            hypothesis
-            for transcription in solution.collocation.transcriptions
-            for hypothesis in load_sign_hypotheses(transcription.experiment)
-        ),
-    ]
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield loads of a wrong sign."""
+    for transcription in solution.collocation.transcriptions:
+        yield from load_sign_hypotheses(transcription.experiment)
 
 
-WRENCHES = Source(simulated=simulated_hypotheses, fitted=fit_hypotheses)
+WRENCHES = Source(
+    simulated=simulated_hypotheses, fitted=fit_hypotheses, candidates=wrench_candidates
+)

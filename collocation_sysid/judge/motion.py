@@ -1,0 +1,234 @@
+"""Rows of likely mistakes about a motion: clock, slip, grasp, gravity, unloading, and the mesh and
+laws of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ..common.array_types import Array
+from ..common.time_dependence import at_times
+from ..errors import InputError
+from ..methods.solution import Solution
+from ..program.modes.modal_prediction import DeclaredMotion
+from ..recording.experiment import Experiment
+from ..recording.grasp import Grasp
+from ..recording.hysteresis import branch_differences, loading_branch, unloading_difference
+from ..recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
+from ..recording.poses import PoseSequence
+from ..statistics.hypothesis import Hypothesis
+from ..statistics.thresholds import ESTIMATED_LAGS, FAR, SLIP
+from .bodies import body_rows, mirrored_meshes
+from .doubt import Correction, Doubt, clock_hypothesis
+from .fit import Candidate, TestedFit
+from .modes import ModalComparison, gravity_hypotheses
+from .sensors import sensor_rows
+
+# Most samples of a loading branch that is fitted.
+MOST_SAMPLES = 100
+# Deviation of a clock in the linear step [s].
+WIDE_LAG_S = 0.1
+# Deviation of the thickness of a layer in the linear step, over the extent of the body.
+WIDE_LAYER = 0.5
+# Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
+BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
+# Share of χ² that remains of which linear steps come before mirrored meshes.
+UNMEASURED = 0.9
+# Fewest samples before and after a slip.
+SHORTEST = 4
+
+
+def motion_rows(fit: TestedFit) -> Iterator[Doubt]:
+    """Yield the rows of a motion that have a linear step."""
+    yield from sensor_rows(fit)
+    if not fit.experiment.is_static:
+        yield from _clock(fit)
+    yield from _layers(fit)
+    yield from body_rows(fit.experiment)
+
+
+def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
+    """Yield the likely mistakes of a motion without a linear step, by a criterion of their own: a
+    slip by the step in the residuals, softer unloading, which the measured forces show, and mirrored
+    meshes and the direction of gravity if the fit moved the body far from its stated pose.
+    """
+    experiment = fit.experiment
+    yield from _slip(fit)
+    if unloading := _unloading(fit.whole).hypothesis(experiment):
+        yield 0.0, replace(unloading, subject="")
+    rows = fit.part.transcription.nuisance.indices_of_rows(*BODY_ROWS)
+    if np.abs(fit.part.phi[rows]).max(initial=0.0) < FAR:
+        return
+    for row in mirrored_meshes(experiment):
+        if found := row.hypothesis(experiment):
+            yield UNMEASURED, found
+    stated = ModalComparison.from_experiment(experiment, fit.whole.parameters)
+    others = [] if stated is None else [*gravity_hypotheses(stated.declared)]
+    if stated is not None and others:
+        misfits_m = [stated.misfit_m(each.corrected) for each in others]
+        nearest = others[int(np.argmin(misfits_m))]
+        other = replace(experiment, gravity_m_s2=nearest.corrected.gravity_m_s2)
+        share = (min(misfits_m) / stated.misfit_m(stated.declared)) ** 2
+        yield share, replace(nearest, corrected=other)
+
+
+def _clock(fit: TestedFit) -> Iterator[Doubt]:
+    """Yield the row of poses that are late or early; its column is the rate of all predictions."""
+    prior_s = fit.experiment.nuisance.sigma(TIME) or 0.0
+    rates = {
+        each: [np.gradient(values, each.sample_times_s, axis=0) / each.sample_sigmas]
+        for each, values in fit.predictions.items()
+        if len(values) > 1
+    }
+
+    def correct(experiment: Experiment, size: Array) -> Correction:
+        lag_s = -float(size[0])
+        if abs(lag_s) <= ESTIMATED_LAGS * prior_s:
+            return None
+        other = with_pose_lag(experiment, lag_s)
+        return other and (other, {**clock_hypothesis("", lag_s, None).data})
+
+    changes = fit.blocks_of(rates, 1)
+    yield Doubt("clock", "s", correct, changes=changes, mean=0.0, wide=WIDE_LAG_S)
+
+
+def _layers(fit: TestedFit) -> Iterator[Doubt]:
+    """Yield the row of grasps that hold one layer more or less, by the effect of their edge."""
+    size_m = float(np.ptp(fit.experiment.body.nodes_m, axis=0).max())
+
+    def correct(experiment: Experiment, size: Array) -> Correction:
+        return _other_layer(experiment, deeper=bool(size[0] < 0))
+
+    yield Doubt(
+        "grasp-layer",
+        "m",
+        correct,
+        effect=lambda at, _: at.effect_of_grips,
+        mean=0.0,
+        wide=WIDE_LAYER * size_m,
+    )
+
+
+def _other_layer(experiment: Experiment, deeper: bool) -> Correction:
+    """Return None for grasps of less than three nodes, or of all."""
+    cells = experiment.body.cells
+    n = len(experiment.body.nodes_m)
+    grasps = []
+    for grasp in experiment.grasps:
+        is_grasped = np.isin(np.arange(n), grasp.nodes)
+        # The layer that touches what is held, or of what is held that which touches the rest.
+        is_shifted = is_grasped if deeper else ~is_grasped
+        grown = np.zeros(n, dtype=bool)
+        grown[cells[is_shifted[cells].any(axis=1)]] = True
+        nodes = np.flatnonzero(grown if deeper else is_grasped & ~grown)
+        if len(nodes) < 3 or len(nodes) > n - 1:
+            return None
+        grasps.append(replace(grasp, nodes=nodes))
+    try:
+        other = replace(experiment, grasps=grasps)
+    except InputError:
+        return None
+    return other, {"deep": "more" if deeper else "fewer"}
+
+
+def _unloading(solution: Solution) -> Doubt:
+    """Return the row of a material that unloads below its loading curve on a bench; without it only
+    the loading branch is fitted. The message has the differences of all fitted experiments.
+    """
+
+    def corrected(experiment: Experiment, _: Array) -> Correction:
+        branch = loading_branch(experiment, MOST_SAMPLES)
+        if branch is None or (unloading_difference(experiment) or 0.0) >= 0.0:
+            return None
+        fitted = [each.experiment for each in solution.collocation.transcriptions]
+        return branch, {"sizes": branch_differences(each for each in fitted if not each.specimen)}
+
+    return Doubt("hysteresis", "1", corrected)
+
+
+def _slip(fit: TestedFit) -> Iterator[Candidate]:
+    """Yield a marker of whose residuals two means explain `SLIP` times more than one."""
+    experiment, markers = fit.experiment, fit.experiment.markers
+    if len(markers.names) < 2 or not markers.sample_count:
+        return
+    fitted_m = fit.solution.readings_m[0]
+    residual = np.where(markers.is_measured, fitted_m - markers.positions_m, np.nan)
+    described = DeclaredMotion.from_experiment(experiment)
+    if described is not None:
+        residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
+    clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
+    m = int(np.argmax([ratio for ratio, _ in clearest]))
+    if clearest[m][0] < SLIP:
+        return
+    tracks = np.array(markers.positions_m)
+    tracks[:, m] = np.nan
+    squares = np.nansum(residual**2, axis=(0, 2))
+    data = {"marker": markers.names[m], "t_s": experiment.t_s[clearest[m][1]]}
+    other = replace(experiment, markers=replace(markers, positions_m=tracks))
+    found = Hypothesis("marker-slip", f"'{experiment.name}'", data=data, corrected=other)
+    yield 1 - squares[m] / squares.sum(), found
+
+
+def _largest_step(residual: Array) -> tuple[float, int]:
+    """Return how much better two means explain residuals (T, 3) than one, and where they change."""
+    present = np.flatnonzero(np.isfinite(residual[:, 0]))
+    if len(present) < 2 * SHORTEST:
+        return 1.0, 0
+    x = residual[present]
+    total = np.cumsum(x, axis=0)[:-1]
+    count = np.arange(1, len(x))[:, None]
+    before = total / count
+    after = (x.sum(axis=0) - total) / (len(x) - count)
+    gain = np.sum(count * before**2 + (len(x) - count) * after**2, axis=1)
+    k = SHORTEST - 1 + int(np.argmax(gain[SHORTEST - 1 : len(x) - SHORTEST]))
+    one = np.sum((x - x.mean(axis=0)) ** 2)
+    two = np.sum(x**2) - gain[k]
+    return float(np.sqrt(one / max(two, 1e-30))), int(present[k + 1])
+
+
+def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:
+    """Return the experiment with its poses `lag_s` [s] later (negative: earlier); None if fewer
+    than three samples remain, or the result is no valid experiment. Samples after the last delayed
+    pose are left out.
+    """
+    t_s = experiment.t_s
+    is_covered = t_s <= t_s[-1] + min(lag_s, 0.0) + 1e-9
+    if is_covered.sum() < 3:
+        return None
+    markers = experiment.markers
+    try:
+        return replace(
+            experiment,
+            t_s=t_s[is_covered],
+            grasps=[
+                replace(g, poses=_delayed_poses(g, t_s, lag_s=lag_s)) for g in experiment.grasps
+            ],
+            markers=at_times(markers, is_covered),
+        )
+    except InputError:
+        return None
+
+
+def _delayed_poses(grasp: Grasp, t_s: Array, lag_s: float) -> PoseSequence:
+    """Return the poses of a grasp, `lag_s` later [s]; a single pose is unchanged.
+
+    If they are later, the first pose is repeated at the first of the times `t_s` (or its own), so
+    that the grasp rests until it begins to move.
+    """
+    poses = grasp.poses
+    if len(poses.t_s) < 2:
+        return poses
+    times = poses.t_s + lag_s
+    first = slice(0, 1)
+    if lag_s <= 0:
+        return replace(poses, t_s=times)
+    # Before its first pose the grasp rests there.
+    return replace(
+        poses,
+        t_s=np.r_[min(t_s[0], poses.t_s[0]), times],
+        positions_m=np.concatenate([poses.positions_m[first], poses.positions_m]),
+        quaternions_xyzw=np.concatenate([poses.quaternions_xyzw[first], poses.quaternions_xyzw]),
+    )
