@@ -24,6 +24,7 @@ from ..fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
 from ..fem.meshes.mesh import TetMesh
 from ..fem.rest_shape import UnderGravity
 from ..methods.solution import Solution
+from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
@@ -46,6 +47,8 @@ SAME_SHAPE = 0.02
 # Prior of the error of a mesh over the change to half the edge lengths: with the order of convergence
 # n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
 MESH_ERROR = (2.0, 1.0)
+# Relative change of the length of an edge below which no law is told from another.
+LEAST_STRAIN = 0.05
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
 
@@ -93,14 +96,23 @@ def with_laws(body: Body, material: Material | None, damping: DampingLaw | None)
     return body.with_parts(tuple(replace(part, **changed) for part in body.parts))
 
 
-def body_rows(experiment: Experiment) -> Iterator[Doubt]:
-    """Yield the rows of other laws and shapes of a body; none with obstacles, whose frames are nodes
-    of the body, or without a grasp.
+def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
+    """Yield the rows of other laws and shapes of the body of a fitted experiment; none with
+    obstacles, whose frames are nodes of the body, or without a grasp. Other materials only if edges
+    of the mesh change by `LEAST_STRAIN`.
     """
+    experiment = part.transcription.experiment
     body = experiment.body
     if experiment.obstacles or experiment.specimen is not None or not experiment.body_grasps:
         return
-    materials = ("", *other_materials(body))
+    corners = np.triu_indices(4, 1)
+    ends = [body.cells[:, each].ravel() for each in corners]
+    rest_m, moved_m = (
+        np.linalg.norm(each[..., ends[0], :] - each[..., ends[1], :], axis=-1)
+        for each in (body.nodes_m, part.x.reshape(len(part.x), -1, 3))
+    )
+    is_strained = np.abs(moved_m / rest_m - 1).max() > LEAST_STRAIN
+    materials = ("", *(other_materials(body) if is_strained else ()))
     dampings = ("", *other_dampings(body))
     for laws in [(m, d) for m in materials for d in dampings][1:]:
         yield _other_laws(*laws)

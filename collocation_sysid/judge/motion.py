@@ -47,7 +47,7 @@ def motion_rows(fit: TestedFit) -> Iterator[Doubt]:
     if not fit.experiment.is_static:
         yield from _clock(fit)
     yield from _layers(fit)
-    yield from body_rows(fit.experiment)
+    yield from body_rows(fit.part)
 
 
 def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:

@@ -14,6 +14,7 @@ from collocation_sysid import Problem, Unknown
 from collocation_sysid.fem.laws.materials import DAMPINGS
 from collocation_sysid.judge.bodies import (
     LinearCorrection,
+    body_rows,
     mirrored_meshes,
     with_body,
     with_laws,
@@ -144,6 +145,15 @@ def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
     refits = _Refits(solution, [experiment])
     refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
     assert refits.fit(changed) is not None
+
+
+def test_no_other_material_is_suggested_for_small_strains():
+    solution = solve(Problem([measured(hung_cube(8))], GUESS, substeps=1), "reduced-space")
+    (part,) = solution.parts
+    rest_m = np.tile(part.transcription.body.nodes_m.ravel(), (len(part.x), 1))
+    for stretch, is_suggested in ((1.04, False), (1.06, True)):
+        rows = body_rows(replace(part, x=stretch * rest_m))
+        assert any(row.name in ("law", "law/both") for row in rows) == is_suggested
 
 
 @pytest.mark.slow
