@@ -13,6 +13,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
+from ..fem.laws.constants import is_damping
 from ..methods.reduced_search import UNLIMITED
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
@@ -311,8 +312,11 @@ class _Refits:
         )
         try:
             changed = replace(collocation, experiments=experiments)
-            if is_near:
-                changed = changed.with_parameters(changed.parameters.with_estimates(self.answer))
+            start = self.answer if is_near else {}
+            if not is_near and experiments[0].specimen is None:
+                # A large mistake makes the damping of a motion wrong, and all constants of a specimen.
+                start = {n: value for n, value in self.answer.items() if not is_damping(n)}
+            changed = changed.with_parameters(changed.parameters.with_estimates(start))
             solution = method(associated_at_guess(changed))
         except (InputError, SimulationError):
             return None

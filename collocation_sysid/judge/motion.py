@@ -35,6 +35,8 @@ WIDE_LAG_S = 0.1
 WIDE_LAYER = 0.5
 # Nuisance parameters of the body in its grasp, which turn and shift it to hide other mistakes.
 BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
+# Factors by which films of phones are slower than the motion.
+SLOW_MOTIONS = (4.0, 8.0)
 # Share of χ² that remains of which linear steps come before mirrored meshes.
 UNMEASURED = 0.9
 # Fewest samples before and after a slip.
@@ -59,12 +61,12 @@ def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
     yield from _slip(fit)
     if unloading := _unloading(fit.whole).hypothesis(experiment):
         yield 0.0, replace(unloading, subject="")
+    for row in (*_slow_motions(experiment), *mirrored_meshes(experiment)):
+        if found := row.hypothesis(experiment):
+            yield UNMEASURED, found
     rows = fit.part.transcription.nuisance.indices_of_rows(*BODY_ROWS)
     if np.abs(fit.part.phi[rows]).max(initial=0.0) < FAR:
         return
-    for row in mirrored_meshes(experiment):
-        if found := row.hypothesis(experiment):
-            yield UNMEASURED, found
     stated = ModalComparison.from_experiment(experiment, fit.whole.parameters)
     others = [] if stated is None else [*gravity_hypotheses(stated.declared)]
     if stated is not None and others:
@@ -93,6 +95,28 @@ def _clock(fit: TestedFit) -> Iterator[Doubt]:
 
     changes = fit.blocks_of(rates, 1)
     yield Doubt("clock", "s", correct, changes=changes, mean=0.0, wide=WIDE_LAG_S)
+
+
+def _slow_motions(experiment: Experiment) -> Iterator[Doubt]:
+    """Yield the rows of markers with the times of a film that is slower than the motion, where no
+    moving grasp contradicts these times.
+    """
+    moves = any(np.ptp(each.poses.positions_m, axis=0).any() for each in experiment.grasps)
+    if experiment.is_static or moves or not experiment.markers.sample_count:
+        return
+    for factor in SLOW_MOTIONS:
+
+        def correct(experiment: Experiment, _: Array, factor: float = factor) -> Correction:
+            t_s, markers = experiment.t_s, experiment.markers
+            real_s = t_s[0] + (t_s - t_s[0]) / factor
+            own_s = t_s[0] + (markers.t_s - t_s[0]) / factor
+            try:
+                other = replace(experiment, t_s=real_s, markers=replace(markers, t_s=own_s))
+            except InputError:
+                return None
+            return other, {"factor": factor}
+
+        yield Doubt("clock/slow", "1", correct)
 
 
 def _layers(fit: TestedFit) -> Iterator[Doubt]:

@@ -18,6 +18,8 @@ MESSAGES = {
     "camera-frame": "the markers fit after one rigid motion of all of them: cameras and robot "
     "use different world frames; set markers.template_m and template_window_s",
     "frames": "{fault}",
+    "clock/slow": "the times of the markers seem {factor:g} times too long, as those of a slow-motion "
+    "film: divide t_s of the markers by {factor:g}",
     "clock": "the markers' clock is {when} by about {by_ms:.3g} ms relative to that of the "
     "poses: {do} t_s of the poses, or estimate it with nuisance.time_shift",
     "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep} than stated: "
@@ -115,8 +117,6 @@ MESSAGES = {
     "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
     "specimen-moduli": "its moduli fit if storage and loss modulus are exchanged: check which "
     "column is which",
-    "specimen-gap": "its amounts of shear fit as the displacement over the distance before "
-    "axial_stretch: divide them by axial_stretch, or state the distance after it as length_m",
     "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
     "without it: leave the column out if this was not measured",
     "specimen-area": "its stresses agree with those of the other specimens if they are "

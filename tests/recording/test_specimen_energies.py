@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import collocation_sysid as cs
-from collocation_sysid.features.specimens.doubts import likely_mistakes
 from collocation_sysid.recording.homogeneous_deformation import DEFORMATIONS
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
 from collocation_sysid.recording.specimen_stretches import isochoric_stretches
@@ -146,23 +145,3 @@ def test_both_kinds_are_fitted_without_a_guess():
         low, high = run.interval(name)
         assert low < truth < high
     assert len(run.solution.history) < 20
-
-
-@pytest.mark.long
-def test_shear_over_the_undeformed_gap_is_named():
-    rng = np.random.default_rng(4)
-    gamma = np.linspace(0.05, 0.8, 20)
-    shear_pa = simulated("ogden-1", OGDEN, "simple-shear", gamma, axial_stretch=0.7)
-    stretch = np.linspace(1.05, 1.4, 20)
-    pull_pa = simulated("ogden-1", OGDEN, "uniaxial", stretch - 1)
-    noise_pa = 10 * rng.normal(size=(2, 20))
-    # The file has the displacement over the distance before the stretch.
-    shear = cs.Specimen(
-        "simple-shear", 0.7 * gamma, shear_pa + noise_pa[0], sigma_pa=10.0, axial_stretch=0.7
-    )
-    pull = cs.Specimen("uniaxial", stretch - 1, pull_pa + noise_pa[1], sigma_pa=10.0)
-    run = fit("ogden-1", [shear, pull], ["mu_1_pa", "alpha_1"])
-    assert "specimen-gap" in [cause.cause for cause in run.causes]
-    stated = shear.experiment()
-    gaps = [row for row in likely_mistakes(stated, ()) if row.name == "specimen-gap"]
-    assert sum(row.hypothesis(stated) is not None for row in gaps) == 1

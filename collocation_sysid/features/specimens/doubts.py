@@ -235,7 +235,6 @@ def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) ->
     yield _mistake("specimen-true-stress", _of_engineering_stress)
     for code, is_widening in (("", False), ("/widening", True)):
         yield _mistake(f"specimen-compression{code}", partial(_compressed, is_widening=is_widening))
-    yield _mistake("specimen-gap", _of_undeformed_gap)
     yield _mistake("specimen-percent", _of_ratios)
     for gauge in experiment.readings[1:]:
         yield _mistake("specimen-placeholder", partial(_without_placeholder, name=gauge.name))
@@ -338,22 +337,6 @@ def _of_another_kind(experiment: Experiment, test: str) -> Correction:
         for gauge in experiment.readings
     ]
     return replace(other, readings=readings, nuisance=experiment.nuisance), {"test": test}
-
-
-def _of_undeformed_gap(experiment: Experiment) -> Correction:
-    """Return shear amounts over the distance before the stretch."""
-    deformation = experiment.specimen
-    assert deformation is not None
-    if not deformation.held:
-        return None
-
-    def corrected(grasp: Grasp) -> Grasp:
-        if int(grasp.nodes[0]) not in deformation.displaced_nodes():
-            return grasp
-        shifts_m = grasp.poses.positions_m / [deformation.scale, 1.0, 1.0]
-        return replace(grasp, poses=replace(grasp.poses, positions_m=shifts_m))
-
-    return replace(experiment, grasps=[corrected(grasp) for grasp in experiment.grasps]), {}
 
 
 def _without_placeholder(experiment: Experiment, name: str) -> Correction:
