@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from .methods.starts.continuation import Continuation
     from .model.parameters import FieldCoefficients, Parameter, Parameters, Tied, Unknown
     from .model.schemes import Scheme, Stencil
-    from .pipeline import Run, run, solve
+    from .pipeline import Run, run
     from .problem import Problem, RolloutOptions, UncertaintyOptions
     from .program.collocation import Collocation
     from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
@@ -85,6 +85,7 @@ if TYPE_CHECKING:
         place_markers,
     )
     from .runs.numerical_error import refine
+    from .runs.solving import solve
     from .statistics.budget.systematic_effects import Assumptions
 
     __version__: str

@@ -5,7 +5,7 @@ errors.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -29,12 +29,11 @@ from .methods.starts.initial_trajectories import simulate_trajectories
 from .model.schemes import as_scheme
 from .problem import Problem
 from .program.collocation import Collocation
-from .recording.deviation import in_readable_unit
 from .recording.impact_steps import IMPACT_NOTE
 from .runs.check.cost import require_memory
 from .runs.expected_precision import with_measurements
-from .runs.forward_simulation import simulate_experiments, step_error
-from .runs.mesh_resolution import estimate_mesh_error
+from .runs.forward_simulation import simulate_experiments, step_changes, step_error
+from .runs.mesh_resolution import mesh_changes
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
@@ -46,35 +45,13 @@ from .runs.solving import (
     with_workers,
 )
 from .runs.warm_start import WarmStart
-from .statistics.assessment import (
-    WITHIN_BUDGET,
-    fit_concerns,
-    impact_step_concerns,
-    rotation_step_concerns,
-)
-from .statistics.budget.consider_analysis import (
-    ResidualChanges,
-    changes_of_assumptions,
-    prescribes_no_motion,
-)
-from .statistics.budget.discretisation_error import MOST_SUBSTEPS
-from .statistics.budget.systematic_effects import ASSUMPTIONS, DEVIATIONS
-from .statistics.budget.variance_sources import VarianceSources
-from .statistics.curved_intervals import with_curved_intervals
+from .statistics.assessment import impact_step_concerns, rotation_step_concerns
+from .statistics.budget.discretisation_error import MESH_ORDER, MOST_SUBSTEPS, extrapolated
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
-from .statistics.probes.budgeted_residuals import (
-    budgeted_residuals,
-    is_significant_beside_budget,
-    with_budget,
-)
-from .statistics.probes.deep import deep_probes, routine_probes_with_steps
-from .statistics.probes.profile_likelihood import Profile, profile_of_solution
-from .statistics.probes.relaxed_assumptions import Probe, SolvedFit, probed_changes
-from .statistics.probes.routine import is_alarming, probed_deviations
+from .statistics.profile_likelihood import Profile, profile_of_solution
 from .statistics.residuals.diagnostics import diagnose_markers
-from .statistics.thresholds import NOISE
-from .statistics.uncertainty import Uncertainty, uncertainty_from_fit
+from .statistics.uncertainty import uncertainty_from_fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes a while to import
@@ -175,7 +152,6 @@ def run(
     start: str | Path | WarmStart | None = None,
     seek_causes: bool = True,
     scheduler: str | None = None,
-    probe: bool = False,
 ) -> Run:
     """Solve a problem, simulate every experiment with the answer, and estimate uncertainties.
 
@@ -190,8 +166,6 @@ def run(
         Called with a text at the beginning of each step after the solve.
     seek_causes : bool
         Whether to test hypotheses about the cause of a misfit, see `find_misspecifications`.
-    probe : bool
-        Whether to refit subsets of the data and to relax each assumption, see `deep_probes`.
 
     Returns
     -------
@@ -223,38 +197,31 @@ def run(
     limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else np.inf
     with time_limit(max(0.0, limit_s - (searched_s - began_s))):
         try:
-            answer, fit = _checked(problem, answer.solution, say=say)
+            answer, fit, steps = _checked(problem, answer.solution, say=say)
             missing = (
                 "the steps after the error bars were skipped: a finer time step, and causes "
                 "of the misfit"
             )
             if problem.substeps == "auto":
-                answer, fit = _fine_enough(
-                    answer, fit, solver=solver, watch=watch, say=say, scheduler=scheduler
+                answer, fit, steps = _fine_enough(
+                    answer, fit, steps, solver=solver, watch=watch, say=say, scheduler=scheduler
                 )
             answer = _with_problem_notes(answer)
             if answer.uncertainty is not None and fit is not None:
-                changes = _changes(answer, say)
-                sources = _sources(answer, fit, known=answer.uncertainty, changes=changes)
-                answer = replace(answer, systematic_effects=sources)
-                answer = _with_curved_intervals(answer, fit)
-                if not problem.uncertainty.numerical:
-                    answer = _with_mesh_error(answer, fit, say=say)
-                answer = replace(answer, profiles=profile_likelihoods(answer, fit, say=say))
-                answer = replace(answer, notes=(*answer.notes, *_ruler_notes(problem, sources)))
+                profiles = profile_likelihoods(answer, fit, say=say)
+                answer = _with_posterior(answer, fit, steps, say=say)
+                answer = replace(answer, profiles=profiles)
                 answer = _with_added_measurements(answer, say)
-                solved_fit = _solved_fit(answer, fit, changes)
-                answer = replace(answer, probes=_probes(solved_fit, say=say, deep=probe))
-                answer = _with_budgeted_residuals(answer, solved_fit)
                 answer = _with_offset_notes(answer, fit)
             if answer.solution.status is Status.INTERRUPTED:
                 return timed(answer)
-            if seek_causes and answer.budgeted is None:
+            if seek_causes:
                 from .judge.engine import cause_notes, find_misspecifications
 
-                say("testing possible causes of the misfit")
-                causes = find_misspecifications(answer.solution)
-                tested = cause_notes(answer.solution, causes)
+                if not answer.is_consistent:
+                    say("testing possible causes of the misfit")
+                causes = find_misspecifications(answer.solution, answer.is_consistent)
+                tested = () if answer.is_consistent else cause_notes(answer.solution, causes)
                 answer = replace(answer, causes=causes, notes=(*answer.notes, *tested))
             if problem.uncertainty.numerical and answer.uncertainty is not None:
                 answer = refine(answer, report_progress=say, watch=watch)
@@ -299,28 +266,40 @@ def _with_problem_notes(answer: Run) -> Run:
     return replace(answer, notes=(*coarse, *impacts, *tests, *answer.notes))
 
 
-def _with_curved_intervals(answer: Run, fit: LinearisedFit) -> Run:
-    solution, known = answer.solution, answer.uncertainty
-    assert known is not None
-    combined = {name: each.combined_std_error for name, each in answer.estimates.items()}
-    curved = with_curved_intervals(known, fit, solution.collocation, solution.z, combined)
-    if curved is known:
-        return answer
-    answer = replace(answer, uncertainty=curved)
-    error = step_error(
-        answer.problem, solution, fit=fit, rollouts=answer.rollouts, estimates=answer.optimum
+def _with_posterior(
+    answer: Run, fit: LinearisedFit, steps: Sequence[Array] | None, say: Log
+) -> Run:
+    """Replace the statistical uncertainty of the solution by the posterior with all effects."""
+    from .judge.augmented_fit import augmented_fit, suspects
+    from .statistics.budget.effect_estimates import effect_concerns
+
+    problem, solution = answer.problem, answer.solution
+    discretisation: dict[str, Sequence[Array]] = {}
+    if steps is not None:
+        order = as_scheme(problem.scheme).order
+        discretisation["time_step"] = [extrapolated(each[..., None], order) for each in steps]
+    rows = _row_count(solution)
+    by_mesh = None
+    notes = answer.notes
+    if not problem.uncertainty.numerical:
+        say("estimating the error of the mesh")
+        with counted_phase(StepUnit.TIME_STEP, rows):
+            changes, by_mesh, note = mesh_changes(problem, solution, fit)
+        notes = (*notes, note) if note else notes
+        if by_mesh is not None:
+            discretisation["mesh"] = [extrapolated(each, MESH_ORDER) for each in changes]
+    say("computing the effects of assumptions")
+    # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
+    with counted_phase(StepUnit.TIME_STEP, 2 * rows):
+        posterior = augmented_fit(problem, solution, fit, discretisation)
+    judged = replace(
+        answer, notes=notes, uncertainty=posterior.uncertainty, posterior=posterior, by_mesh=by_mesh
     )
-    return replace(answer, refinement=error)
-
-
-def _with_mesh_error(answer: Run, fit: LinearisedFit, say: Log) -> Run:
-    say("estimating the error of the mesh")
-    with counted_phase(StepUnit.TIME_STEP, _row_count(answer.solution)):
-        refinement, note = estimate_mesh_error(
-            answer.problem, answer.solution, fit, answer.optimum, known=answer.refinement
-        )
-    notes = (*answer.notes, note) if note else answer.notes
-    return replace(answer, refinement=refinement, notes=notes)
+    if not effect_concerns(judged.effects):
+        return judged
+    with counted_phase(StepUnit.TIME_STEP, rows):
+        others = suspects(solution, posterior, problem.assumed_deviations)
+    return replace(judged, suspects=others)
 
 
 def _with_added_measurements(answer: Run, say: Log) -> Run:
@@ -353,12 +332,17 @@ def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:
     return replace(answer, notes=(*answer.notes, *offsets))
 
 
-def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, LinearisedFit | None]:
-    """The fit is None if the solution did not converge or cannot be linearised."""
+Checked = tuple[Run, LinearisedFit | None, Sequence[Array] | None]
+
+
+def _checked(problem: Problem, solution: Solution, say: Log) -> Checked:
+    """Return the answer with its statistical uncertainty, the linearised fit, and `step_changes`; the
+    fit is None if the solution did not converge or cannot be linearised.
+    """
     say("checking the result by a forward simulation")
     rollouts = simulate_experiments(problem, solution)
     if not solution.status.converged:
-        return Run(problem, solution, rollouts=rollouts, uncertainty=None), None
+        return Run(problem, solution, rollouts=rollouts, uncertainty=None), None, None
     say("computing the error bars")
     rows = _row_count(solution)
     try:
@@ -368,18 +352,22 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
         with counted_phase(StepUnit.TIME_STEP, rows):
             fit, noises = with_pose_noise(own, solution.collocation, z=solution.z)
     except SimulationError as error:
-        return Run(
-            problem,
-            solution,
-            rollouts=rollouts,
-            uncertainty=None,
-            notes=(f"no error bars: {error}",),
-        ), None
+        return (
+            Run(
+                problem,
+                solution,
+                rollouts=rollouts,
+                uncertainty=None,
+                notes=(f"no error bars: {error}",),
+            ),
+            None,
+            None,
+        )
     answer = Run(
         problem, solution, rollouts, uncertainty=None, fit=own, diagnoses=diagnose_markers(fit)
     )
     if not solution.collocation.nq:
-        return answer, fit
+        return answer, fit, None
     parameters = solution.collocation.parameters
     try:
         uncertainty = uncertainty_from_fit(
@@ -388,117 +376,11 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> tuple[Run, Linea
     except InputError as error:
         raise error.located(problem.path) from error
     answer = replace(answer, uncertainty=uncertainty, notes=tuple(n.describe() for n in noises))
-    error = step_error(problem, solution, fit=fit, rollouts=rollouts, estimates=answer.optimum)
-    return replace(answer, refinement=error), fit
-
-
-def _changes(answer: Run, say: Log) -> ResidualChanges:
-    say("computing the effects of assumptions")
-    solution = answer.solution
-    deviations = _evaluated_deviations(answer.problem)
-    # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
-    with counted_phase(StepUnit.TIME_STEP, 2 * _row_count(solution)):
-        return changes_of_assumptions(solution.collocation, solution.z, deviations=deviations)
+    return answer, fit, step_changes(problem, solution, rollouts)
 
 
 def _row_count(solution: Solution) -> int:
     return sum(s.grid_times - s.dynamics.first_row for s in solution.collocation.transcriptions)
-
-
-def _sources(
-    answer: Run, fit: LinearisedFit, known: Uncertainty, changes: ResidualChanges
-) -> VarianceSources:
-    """Deviations of None have no effect."""
-    solution = answer.solution
-    problem = answer.problem
-    return VarianceSources.from_fit(
-        fit,
-        changes,
-        parameters=solution.collocation.parameters,
-        q=solution.q,
-        uncertainty=known,
-        deviations=problem.assumed_deviations,
-        evaluated=_evaluated_deviations(problem),
-        means=problem.uncertainty.assumptions.means,
-        has_rulers=prescribes_no_motion(solution.collocation),
-    )
-
-
-def _ruler_notes(problem: Problem, sources: VarianceSources) -> Iterator[str]:
-    for name, (value, error) in sources.rulers.items():
-        row = DEVIATIONS[name.partition(" ")[0]]
-        deviation = problem.assumed_deviations[row.name] or 0.0
-        (size, unit), (spread, _), (prior, _) = (
-            in_readable_unit(deviation * each, row.unit) for each in (value, error, 1.0)
-        )
-        yield (
-            f"the data determine the {row.label} better than its deviation of {prior:.2g}{unit} "
-            f"in the budget: {size:+.2g} ± {spread:.1g}{unit}; the estimates are corrected for it"
-        )
-
-
-def _evaluated_deviations(problem: Problem) -> dict[str, float | None]:
-    """Return deviations of the budget and the probes, and one unit of alternatives unless exact."""
-    deviations = probed_deviations(problem.assumed_deviations)
-    stated = vars(problem.uncertainty.assumptions)
-    unstated = (row.name for row in ASSUMPTIONS if row.alternative and stated[row.name] is None)
-    return deviations | {name: 1.0 for name in unstated if deviations[name] is None}
-
-
-def _solved_fit(answer: Run, fit: LinearisedFit, changes: ResidualChanges) -> SolvedFit:
-    deviations = _evaluated_deviations(answer.problem)
-    collocation, z = answer.solution.collocation, answer.solution.z
-    return SolvedFit(
-        collocation=collocation,
-        z=z,
-        fit=fit,
-        error_model=answer.problem.uncertainty,
-        statistical=answer.optimum,
-        budget=answer.budget,
-        deviations=deviations,
-        changes=probed_changes(collocation, z, deviations=deviations, changes=changes),
-    )
-
-
-def _with_budgeted_residuals(answer: Run, solved_fit: SolvedFit) -> Run:
-    """Take back concerns and probes if deviations within the budget explain all residuals."""
-    assert answer.uncertainty is not None
-    concerns = {each.code for each in fit_concerns(answer.uncertainty)} & {*WITHIN_BUDGET}
-    is_contradicted = concerns or any(p.routine and is_alarming(p) for p in answer.probes)
-    if not is_contradicted or answer.problem.uncertainty.noise == "estimated":
-        return answer
-    granted = answer.problem.assumed_deviations
-    relaxed = with_budget(solved_fit, granted)
-    budgeted = budgeted_residuals(solved_fit, relaxed)
-    if budgeted is None:
-        return answer
-    left = {each.code for each in fit_concerns(answer.uncertainty, budgeted.basis)}
-    if left & {*WITHIN_BUDGET}:
-        return answer
-    may_be_mesh = answer.uncertainty.level.pooled <= NOISE**2 and any(
-        each.experiment.obstacles for each in answer.solution.collocation.transcriptions
-    )
-    probes = tuple(
-        replace(probe, sentences=())
-        if probe.routine
-        and is_alarming(probe)
-        and (
-            may_be_mesh
-            or not is_significant_beside_budget(solved_fit, granted, relaxed, probe.name)
-        )
-        else probe
-        for probe in answer.probes
-    )
-    notes = (*answer.notes, budgeted.describe())
-    return replace(answer, budgeted=budgeted, probes=probes, notes=notes)
-
-
-def _probes(solved_fit: SolvedFit, say: Log, deep: bool) -> tuple[Probe, ...]:
-    """Return the routine probes; those of subsets and of every assumption if `deep`."""
-    if not deep:
-        return routine_probes_with_steps(solved_fit)
-    say("refitting parts of the data, and with assumptions relaxed")
-    return deep_probes(solved_fit)
 
 
 def profile_likelihoods(answer: Run, fit: LinearisedFit, say: Log) -> dict[str, Profile]:
@@ -524,30 +406,33 @@ def profile_likelihoods(answer: Run, fit: LinearisedFit, say: Log) -> dict[str, 
 def _fine_enough(
     coarse: Run,
     fit: LinearisedFit | None,
+    steps: Sequence[Array] | None,
     solver: Method,
     watch: Watch | None,
     say: Log,
     scheduler: str | None,
-) -> tuple[Run, LinearisedFit | None]:
+) -> Checked:
     """A parameter at a bound starts from its guess again: coarse steps may have driven it there."""
-    if coarse.refinement is None or fit is None:
-        return coarse, fit
+    if steps is None or fit is None or coarse.uncertainty is None:
+        return coarse, fit, steps
     first = coarse.solution
+    known = {**coarse.uncertainty.estimates, **coarse.uncertainty.derived}
+    error = step_error(coarse.problem, first, fit, steps, known)
     problem = coarse.problem
     before = first.collocation.substeps
-    factor = coarse.refinement.suggested_substeps(coarse.optimum, as_scheme(problem.scheme).order)
+    factor = error.suggested_substeps(known, as_scheme(problem.scheme).order)
     substeps = min(before * factor, MOST_SUBSTEPS)
-    steps = "one time step" if before == 1 else f"{before} time steps"
-    worst, many = coarse.refinement.largest_correction(coarse.optimum)
+    number = "one time step" if before == 1 else f"{before} time steps"
+    worst, many = error.largest_correction(known)
     why = (
-        f"with {steps} per sample, the estimated time-step error of {worst} is {many:.2g} "
+        f"with {number} per sample, the estimated time-step error of {worst} is {many:.2g} "
         "standard errors"
     )
     if fit.at_bound[: fit.shared_count].all():
         substeps = MOST_SUBSTEPS
-        why = f"with {steps} per sample, every parameter ends at a bound"
+        why = f"with {number} per sample, every parameter ends at a bound"
     if substeps <= before:
-        return coarse, fit
+        return coarse, fit, steps
     say(f"solving again with {substeps} steps per sample")
     again = replace(first.collocation, substeps=substeps)
     p, _ = first.collocation.unpack(first.z)
@@ -561,7 +446,7 @@ def _fine_enough(
         failure = str(error)
     if failure is not None:
         note = f"{why}; the solve with {substeps} steps per sample failed: {failure}"
-        return replace(coarse, notes=(note, *coarse.notes)), fit
+        return replace(coarse, notes=(note, *coarse.notes)), fit, steps
     most = ", the largest number that is chosen automatically" if substeps == MOST_SUBSTEPS else ""
     reason = f"{why}; therefore the problem was solved again with {substeps} steps per sample{most}"
     return _checked(problem, finer.after(first, reason), say=say)

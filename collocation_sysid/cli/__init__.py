@@ -191,8 +191,10 @@ def _likely_cause(error: BaseException | None) -> str:
     """Return the likely cause of an `ImplausibleMarkersError`, or of an error that one caused, as an
     addition to its message; empty if none is known.
     """
+    seen: set[int] = set()  # an error that is raised again may be its own cause
     while error is not None and not isinstance(error, ImplausibleMarkersError):
-        error = error.__cause__
+        seen.add(id(error))
+        error = None if id(error.__cause__) in seen else error.__cause__
     if error is None:
         return ""
     from ..judge.modes import find_misspecifications_by_modes

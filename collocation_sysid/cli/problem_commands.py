@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -66,14 +65,13 @@ def solve(
     ] = False,
     strict: Annotated[bool, option("Exit code 1 if the verdict is doubtful.")] = False,
     details: Annotated[
-        bool,
-        option("Show everything: statistical parts, corrections, notes, probes, residuals, times."),
+        bool, option("Show everything: statistical parts, corrections, notes, residuals, times.")
     ] = False,
     budget: Annotated[
-        bool, option("Show the contributions to the variance of each estimate.")
-    ] = False,
-    probe: Annotated[
-        bool, option("Deeper check: refit subsets of the data, and relax each assumption.")
+        bool,
+        option(
+            "Show the contributions to the variance of each estimate, and the effects of the budget."
+        ),
     ] = False,
     pictures: Annotated[
         bool, option("Draw pictures into the run folder; the command plot can draw them later.")
@@ -113,7 +111,6 @@ def solve(
                     log=progress.say,
                     start=start,
                     scheduler=scheduler,
-                    probe=probe,
                 )
             except KeyboardInterrupt:
                 raise interruption_exit(
@@ -154,8 +151,7 @@ def solve(
     else:
         if details and result.elapsed_s.pictures is not None:
             print_result(f"pictures drawn in {result.elapsed_s.pictures:.1f} s")
-        again = shlex.join(["collocation-sysid", *sys.argv[1:]])
-        print_result(f"next: {next_step(result, folder, again)}")
+        print_result(f"next: {next_step(result, folder)}")
     status = finished.solution.status
     if drawn is None or status is Status.INTERRUPTED or finished.omitted_checks:
         raise typer.Exit(EXIT_INTERRUPTED)

@@ -155,8 +155,7 @@ def _key_table(name: str) -> Table:
 def _word_table(word: str) -> Table:
     from ..fem.laws.constants import KNOWN, constants_with_symbol, unit_of
     from ..recording.nuisance import nuisances_called
-    from ..statistics.budget.systematic_effects import ASSUMPTIONS
-    from ..statistics.budget.variance_sources import source_label
+    from ..statistics.budget.systematic_effects import DEVIATIONS, source_label
     from ..statistics.remedies import REMEDIES
 
     constants = [word] if word in KNOWN else constants_with_symbol(word)
@@ -170,7 +169,8 @@ def _word_table(word: str) -> Table:
     ]
     sources = {
         component: (each.name, each.description)
-        for each in ASSUMPTIONS
+        for each in DEVIATIONS.values()
+        if each.remedy
         for component in (each.name, *each.components)
     }
     sources |= {

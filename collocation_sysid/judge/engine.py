@@ -65,16 +65,23 @@ TESTED = {
 }
 
 
-def find_misspecifications(solution: Solution) -> tuple[Hypothesis, ...]:
+def find_misspecifications(
+    solution: Solution, is_noise: bool | None = None
+) -> tuple[Hypothesis, ...]:
     """Return likely mistakes in the description of a solved problem, likeliest first, with the factor
     by which the misfit decreases without them as `strength`; empty for a consistent fit.
+
+    Parameters
+    ----------
+    is_noise : bool, optional
+        Whether the posterior of the fit is consistent; by default the residuals decide.
 
     Notes
     -----
     What the data show by themselves comes first: nothing is fitted again if it is nearly certain
     (`CERTAIN`).
     """
-    if is_consistent(solution):
+    if is_consistent(solution) if is_noise is None else is_noise:
         return rank(each for source in SOURCES for each in source.consistent(solution))
     found = [each for source in SOURCES for each in source.fitted(solution)]
     for part in solution.parts:

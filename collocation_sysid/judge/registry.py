@@ -8,7 +8,6 @@ from ..features.image_tracks.doubts import IMAGE_TRACKS
 from ..features.outlines.doubts import OUTLINES
 from ..features.specimens.doubts import SPECIMENS
 from ..features.wrenches.doubts import WRENCHES
-from . import texts  # noqa: F401, declares the messages
 from .source import Source
 
 SOURCES: tuple[Source, ...] = (WRENCHES, CONTACT, CAMERAS, IMAGE_TRACKS, OUTLINES, SPECIMENS)

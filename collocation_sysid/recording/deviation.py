@@ -1,16 +1,15 @@
 """Deviation: one way in which reality may deviate from the description of a recording.
 
 A row of the tables `nuisance.KINDS` and `systematic_effects.ASSUMPTIONS` declares a deviation once:
-name, unit, priors, effect and texts. What is done with it follows from the row (`Deviation.modes`):
-it is estimated with a prior (`Nuisance`), considered in the uncertainty budget (`Assumptions`), or
-tested in every solve by one linear step (`probes`).
+name, unit, priors, effect and texts. It is estimated with a prior (`Nuisance`), or an effect of the
+uncertainty budget (`Assumptions`), whose posterior follows from one linear step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -34,7 +33,6 @@ Component = Literal[
 ModelPart = Literal[
     "reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth", "stiffness"
 ]
-Mode = Literal["estimate", "consider", "test"]
 # Readable units: factor and text by SI unit.
 READABLE_UNITS = {
     "m": (1e3, " mm"),
@@ -43,11 +41,6 @@ READABLE_UNITS = {
     "kg": (1e3, " g"),
 }
 READABLE_UNITS |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
-
-
-# Standard deviation of the prior of a test's amplitude, in deviations of the budget: it must not
-# shrink towards the assumption that it tests, and stay bounded where the data say nothing.
-WIDENING = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +60,8 @@ class Deviation:
 
     A recording has one value for each component (marker, grasp, …) and axis; values are independent
     and have normal priors with mean zero. A deviation is estimated with the prior `sigma` of the
-    experiment's `Nuisance`, or else considered in the uncertainty budget with the deviation
-    `considered` of `Assumptions`; with a `widening` it is also tested in every solve.
+    experiment's `Nuisance`, or else an effect of the uncertainty budget with the deviation
+    `considered` of `Assumptions`.
 
     Custom deviations state what they do to a marker's predicted position (`reading`), to its time
     (`clock`) or to the stiffness of the body (`stiffness`), and go into `Nuisance(own=[…])`.
@@ -90,13 +83,9 @@ class Deviation:
         only where a problem states a deviation.
     by_origin : mapping of str to float
         Deviations in place of `considered`, by `Body.made` or `Body.mesh_from`.
-    widening : float or None
-        Standard deviation of the prior in the test of every solve, over that of the budget; None
-        without such a test.
-    tested : float or None
-        Deviation in that test if the budget has none.
-    assumed : str
-        What is assumed without it, as a clause, for messages.
+    wide : float or None
+        Standard deviation with which it is sought where the residuals contradict the description, of
+        a deviation that the budget does not contain.
     remedy : str
         What to measure or state in order to reduce it, as an imperative phrase without full stop.
     of : str
@@ -107,27 +96,14 @@ class Deviation:
     effect : callable, optional
         ``effect(at, index)``, the linear change of the equations of motion (`systematic_effects.
         Effect`) by one unit along the axis with this index, for an experiment `at` the answer; None
-        where it has none. A deviation with such an effect is considered and tested, not estimated.
+        where it has none. A deviation with such an effect is never estimated.
     of_specimens : bool
         Whether `effect` concerns homogeneous specimens too, which have neither a mesh nor grips.
     is_one_sided : bool
         Whether it is never negative, so that a known mean may be stated.
-    is_ruler : bool
-        Whether it is estimated by one linear step, instead of considered, where the data determine
-        it much better than the budget does, see `budget.variance_sources`.
-    is_limited : bool
-        Whether data that determine it much better than the budget does limit its size, without
-        being corrected for it, because errors of the mesh resemble it.
     redefines : tuple of str
-        Constants, without a region, that another answer would define differently. Their intervals
-        do not contain the effect; the values under the alternative are reported instead.
-    alternative : str
-        Condition under which the description is wrong by one unit, with the placeholder
-        "component", for a deviation whose alternative is reported. It is also evaluated if the
-        budget does not contain the deviation, unless that is stated to be exact.
-    proportional_to : callable, optional
-        Whether the forces as described and those of the alternative are proportional to a constant,
-        by name, see `budget.variance_sources.rescaled`.
+        Constants, without a region, that the deviation would define differently: they are those of
+        the stated definition.
     key : str
         Key of [experiment.nuisance] in the problem file.
     reference : float or None
@@ -177,20 +153,14 @@ class Deviation:
     _: KW_ONLY
     considered: float | None = None
     by_origin: Mapping[str, float] = field(default_factory=dict, hash=False)
-    widening: float | None = None
-    tested: float | None = None
-    assumed: str = ""
+    wide: float | None = None
     remedy: str = ""
     of: Component = "recording"
     axes: str = ""
     effect: Callable[..., Any] | None = None
     of_specimens: bool = False
     is_one_sided: bool = False
-    is_ruler: bool = False
-    is_limited: bool = False
     redefines: tuple[str, ...] = ()
-    alternative: str = ""
-    proportional_to: Callable[[str], bool] | None = None
     key: str = ""
     reference: float | None = None
     changes: tuple[ModelPart, ...] = ("reading",)
@@ -215,14 +185,6 @@ class Deviation:
             which = " of {which}" * (self.of == "marker")
             axis = ", {axis}" * bool(self.axes)
             vars(self)["label"] = self.name.replace("_", " ") + which + axis
-
-    @property
-    def modes(self) -> tuple[Mode, ...]:
-        """What can be done with the deviation: estimate it, consider it in the uncertainty budget,
-        test it in every solve.
-        """
-        is_possible = {"estimate": not self.effect, "consider": True, "test": self.widening}
-        return tuple(mode for mode in get_args(Mode) if is_possible[mode])
 
     @property
     def components(self) -> tuple[str, ...]:

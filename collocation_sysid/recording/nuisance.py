@@ -19,7 +19,7 @@ from ..common.field_descriptions import FieldOfRow, sentence, with_fields
 from ..common.validated_classes import validate_as
 from ..common.validated_types import Finite
 from ..errors import InputError, listed
-from .deviation import WIDENING, Deviation, RecordingQuantities
+from .deviation import Deviation, RecordingQuantities
 
 DEGREE = float(np.pi / 180)
 # Reach of parameters on which predictions depend linearly, which need no trust region [σ].
@@ -32,8 +32,6 @@ SAMPLES_A_STEP = 2.0
 CAMERA_SHIFT_A_STEP_M = 0.02
 FILM_A_RULER = "film a ruler where the body moves"
 CALIBRATE_A_POSE = "film a calibration board whose pose in the frame of the gripper is known"
-# Frame rates are stated as 30 where they are 29.97, and vary by a percent in videos of phones.
-WIDENING_OF_FRAME_RATES = 100.0
 # Reach of errors of ordinary cameras [σ]: larger steps save a quarter of the iterations.
 IMAGE_REACH = 3.0
 # Scope of parameters that recordings share, as a pattern and in words for messages.
@@ -170,7 +168,6 @@ CALIBRATION_SCALE = Deviation(
     sigma=None,
     key="calibration_scale",
     considered=2e-3,
-    is_ruler=True,
     remedy=FILM_A_RULER,
     label="scale of the cameras",
     sentence="scale error of the cameras: {signed}",
@@ -211,8 +208,6 @@ CLOCK_RATE = Deviation(
     sigma=None,
     key="clock_rate",
     considered=1e-4,
-    widening=WIDENING,
-    assumed="the clocks of cameras and robot run at the same rate",
     remedy="trigger robot and cameras by one clock",
     changes=("clock",),
     applies=lambda experiment: _is_motion(experiment) and _has_markers(experiment),
@@ -344,7 +339,6 @@ OBSTACLE_TILT = Deviation(
     changes=("grasps",),
     by="length",
     considered=0.2 * DEGREE,
-    is_limited=True,
     applies=lambda experiment: any(each.shape.has_tilt for each in experiment.obstacles),
     applies_to=_has_tilt,
     label="tilt of {which}, {axis}",
@@ -441,8 +435,6 @@ TEMPERATURE = Deviation(
     "1/K",
     key="stiffness_per_kelvin",
     considered=5e-3,
-    widening=WIDENING,
-    assumed="the stiffness does not depend on the temperature",
     remedy="record at one temperature, or estimate it from recordings at several",
     applies=lambda e: e.temperature_difference_k is not None and not e.body.has_memory,
     label="change of the stiffness per kelvin",
@@ -664,9 +656,7 @@ IMAGE_FOCAL = _image_error(
     "1",
     key="image_focal",
     applies=_has_image_cameras,
-    tested=5e-3,
-    widening=WIDENING,
-    assumed="the focal lengths of the cameras are those of the calibration",
+    considered=1e-2,
     remedy="calibrate the camera with the focus and zoom of the recording",
     by="worst",
     label="error of the focal length of {which}",
@@ -679,9 +669,7 @@ IMAGE_CENTRE = _image_error(
     key="image_centre",
     axes="u v",
     applies=_has_image_cameras,
-    tested=2.0,
-    widening=WIDENING,
-    assumed="the principal points of the cameras are those of the calibration",
+    considered=2.0,
     remedy="calibrate the camera with images of the same size and crop as the video",
     by="length",
     label="error of the principal point, {axis}, of {which}",
@@ -693,9 +681,7 @@ IMAGE_TIME = _image_error(
     "s",
     key="image_time",
     applies=_is_filmed_motion,
-    tested=5e-3,
-    widening=WIDENING,
-    assumed="the clocks of cameras and gripper agree",
+    considered=5e-3,
     remedy="state clock_sigma_s, so that the delay is estimated, or trigger both by one signal",
     by="worst",
     label="delay of {which}",
@@ -708,8 +694,6 @@ IMAGE_CLOCK_RATE = _image_error(
     key="image_clock_rate",
     applies=_is_filmed_motion,
     considered=1e-4,
-    widening=WIDENING_OF_FRAME_RATES,
-    assumed="the stated frame rates of the cameras are right",
     remedy="use the times of the images in the video, or film a clock",
     by="worst",
     label="error of the frame rate of {which}",
@@ -722,8 +706,6 @@ IMAGE_LINE_DELAY = _image_error(
     key="image_line_delay",
     applies=_is_filmed_motion,
     considered=1e-5,
-    widening=WIDENING,
-    assumed="the rows of an image are exposed as stated (line_delay_s)",
     remedy="state line_delay_s: the exposure of one row after the other by a rolling shutter takes 10 "
     "to 30 microseconds per row of a phone",
     by="worst",
@@ -738,8 +720,6 @@ IMAGE_DRIFT = _image_error(
     applies=_is_filmed_motion,
     reach=UNLIMITED_REACH,
     considered=0.2,
-    widening=WIDENING,
-    assumed="trackers follow their points without drift",
     remedy="compare each image with the first one in the tracker, or use tags, which do not drift",
     by="worst",
     label="drift of {which}",

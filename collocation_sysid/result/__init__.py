@@ -4,7 +4,7 @@ Files: `run_record` writes a run folder, `replay` reads one back, `run_writers` 
 frames and replaces folders safely, `run_refinement` adds measured discretisation errors to a run
 folder, and `synthesis` writes simulated recordings.
 
-Text: `run_sections` describes a run, `probe_sections` its probes, and `check_sections` the findings
+Text: `run_sections` describes a run, and `check_sections` the findings
 of a check; `report` turns such sections into an HTML page or Markdown, `picture_captions` adds the
 pictures, and `solve_progress` shows a solve while it runs.
 

@@ -28,11 +28,13 @@ from ..statistics.budget.discretisation_error import (
     Refinement,
     RefinementLevel,
 )
-from ..statistics.budget.variance_sources import MESH
-from ..statistics.budget.variance_sources import NUMERICAL as DISCRETISATION
+from ..statistics.budget.systematic_effects import DISCRETISATION
 from ..statistics.estimates import Estimate
 from .replay import damaged_run_refused
 from .run_record import REFINEMENT_FILE
+
+# Source of variance that a refinement measures.
+REFINED = "step and mesh"
 
 
 def refine_run(
@@ -152,7 +154,7 @@ def with_refinement(before: Result, refinement: Refinement, parameters: Paramete
         for name, shares in before.budget.items()
     }
     uncertainties = {name: each.combined_std_error for name, each in after.estimates.items()}
-    others = [each for each in before.trust.concerns if each.code not in (*NUMERICAL, MESH_ERROR)]
+    others = [each for each in before.trust.concerns if each.code not in (NUMERICAL, MESH_ERROR)]
     concerns = (*others, *numerical_concerns(optimum, uncertainties, refinement=refinement))
     return replace(after, budget=budget, trust=Assessment.from_concerns(concerns))
 
@@ -194,12 +196,11 @@ def _updated_shares(
     ratio = (before.combined_std_error / after.combined_std_error) ** 2
     # Standard errors are relative to their values, see `IntervalCoordinate`.
     ratio *= (after.value / before.value) ** 2 if before.value else 1.0
-    others = {
-        name: share * ratio for name, share in shares.items() if name not in (DISCRETISATION, MESH)
-    }
+    replaced = {REFINED, *(row.name for row in DISCRETISATION)}
+    others = {name: share * ratio for name, share in shares.items() if name not in replaced}
     total = max(1.0, sum(others.values()))
     corrected = {name: share / total for name, share in others.items()}
-    corrected[DISCRETISATION] = 1.0 - sum(corrected.values())
+    corrected[REFINED] = 1.0 - sum(corrected.values())
     return dict(sorted(corrected.items(), key=lambda item: -item[1]))
 
 

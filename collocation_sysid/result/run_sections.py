@@ -35,21 +35,15 @@ from ..common.serialisation import content
 from ..errors import listed
 from ..features.measurement_results import SimulatedExperiment
 from ..fem.laws.constants import symbol_of, unit_of
-from ..judge import texts  # noqa: F401, declares messages of stored runs
+from ..judge.posterior import main_sources
 from ..recording.deviation import in_readable_unit
 from ..runs.result_content import Elapsed, Result
 from ..statistics.assessment import Assessment
-from ..statistics.budget.variance_sources import main_sources, source_label
+from ..statistics.budget.effect_estimates import effect_row
+from ..statistics.budget.systematic_effects import source_label
 from ..statistics.concerns import Concern, topics_of
 from ..statistics.remedies import remedy_for
-from .alternative_sentences import alternative_sentences, origin_sentences
 from .picture_captions import captioned_pictures
-from .probe_sections import (
-    DEEPER_CHECK_ADVICE,
-    STIFFNESS_NAMES,
-    is_deeper_check_worthwhile,
-    probe_section,
-)
 from .replay import LARGEST_NUMBER, damaged_run_refused, read_arrays
 
 VERDICT_MEANINGS = {
@@ -69,17 +63,22 @@ SHOWN_SOURCES = 3
 SHOWN_REMEDIES = ("platen_slip",)
 # Smallest share of a variance that is shown.
 SMALLEST_SHOWN_SHARE = 0.01
+# Moduli of which the most important is the first.
+STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
+# Smallest relative correction of an estimate that is stated.
+SMALLEST_CORRECTION = 0.005
+# Posterior over prior deviation of an effect from which on the data do not see it.
+UNSEEN = 0.95
 # Ratio of combined to statistical standard uncertainty beyond which the sources are named.
 SYSTEMATIC_RATIO = 1.5
 
 
 def estimate_sections(result: Result) -> list[Shown]:
-    """Return the verdict, the command that explains its remedies if there is a concern, the advice
-    of a deeper check where that is worthwhile, and the table of parameters with their intervals,
-    each as a part without title.
+    """Return the verdict, the command that explains its remedies if there is a concern, and the
+    table of parameters with their intervals, each as a part without title.
     """
     sections = [verdict_section(result.trust), *remedy_command(result.trust.concerns)]
-    sections += [*_deeper_check_advice(result), parameter_section(result)]
+    sections += [parameter_section(result)]
     return [*flattened_parts(sections)]
 
 
@@ -108,12 +107,10 @@ def run_report(run: str | Path) -> TitledParts:
             _cards(result),
             *flattened_parts([outcome_section(result)]),
             *pictures[:1],
-            TitledParts(
-                "What to do", (*remedy_lines(result.trust.concerns), *_deeper_check_advice(result))
-            ),
+            TitledParts("What to do", (*remedy_lines(result.trust.concerns),)),
             parameter_section(result),
             TitledParts("Error bars", tuple(_error_bars(result))),
-            probe_section(result),
+            TitledParts("Effects", (effects_table(result),) if result.effects else ()),
             fit_section(result),
             notes_section(result),
             *_marker_place_sections(result),
@@ -165,10 +162,6 @@ def verdict_section(
     return TitledParts("", tuple(lines), style=f"verdict {verdict}")
 
 
-def _deeper_check_advice(result: Result) -> list[Line]:
-    return [Line(DEEPER_CHECK_ADVICE, "quiet")] if is_deeper_check_worthwhile(result) else []
-
-
 def remedy_command(concerns: Iterable[Concern]) -> list[Line]:
     """Return the command that explains the remedies of some concerns; empty without concerns."""
     pages = dict.fromkeys(topic.page for topic in topics_of(concerns).values())
@@ -197,33 +190,14 @@ def parameter_section(result: Result) -> TitledParts:
     if "mesh" in result.discretisation_kinds:
         parts.append(refinement_table(result))
     elif corrected := [
-        f"{symbol_of(name)} {_percent(error.extrapolated / optimum - 1)}"
-        for name, error in result.numerical_errors.items()
-        if (optimum := values[name].optimum)
-        and values[name].statistical95 is not None
-        and error.step is not None
-    ]:
-        parts.append(f"corrected for the estimated time-step error: {', '.join(corrected)}")
-    if estimated := [
-        f"{symbol_of(name)} {_percent(-error.estimated_mesh / abs(optimum))}"
-        for name, error in result.numerical_errors.items()
-        if error.estimated_mesh is not None and (optimum := values[name].optimum)
-    ]:
-        parts.append(
-            "estimated difference from a mesh with half the edge lengths, which the intervals "
-            f"contain: {', '.join(estimated)}"
-        )
-    if known := [
-        f"{symbol_of(name)} {_percent(each.known_correction / each.value)}"
+        f"{symbol_of(name)} {_percent(each.value / each.optimum - 1)}"
         for name, each in values.items()
-        if each.known_correction and each.value
+        if each.optimum and abs(each.value / each.optimum - 1) >= SMALLEST_CORRECTION
     ]:
-        parts.append(f"corrected for effects of known size: {', '.join(known)}")
+        parts.append(f"corrected for the effects below: {', '.join(corrected)}")
     parts += [each.statement() for each in result.combinations]
     parts += _undetermined_sentence(result)
-    parts += alternative_sentences(result)
     parts += _largest_contributions(result)
-    parts += origin_sentences(result)
     return TitledParts("Parameters", (*parts, *result.basis))
 
 
@@ -257,10 +231,10 @@ def _undetermined_sentence(result: Result) -> list[str]:
 def _coverage_sentence(result: Result) -> str:
     moving = any(not each.static for each in result.fit.experiments.values())
     meshed = any(each.test is None for each in result.fit.experiments.values())
-    kinds = ("step", "mesh") if moving else ("mesh",) if meshed else ()
+    kinds = ("step", "mesh") if moving and meshed else ("mesh",) if meshed else ()
     known = set(result.discretisation_kinds)
-    if any(e.estimated_mesh is not None for e in result.numerical_errors.values()):
-        known.add("mesh")
+    names = {each.name for each in result.effects}
+    known |= {kind for kind, name in (("step", "time_step"), ("mesh", "mesh")) if name in names}
     covered = [f"the {kind} error" for kind in kinds if kind in known]
     missing = [f"the {kind} error" for kind in kinds if kind not in known]
     parts = listed(["noise", *covered, "systematic effects"])
@@ -306,6 +280,31 @@ def budget_table(result: Result) -> Table:
         for s in shown
     ]
     return Table("", ("% of the variance", *map(symbol_of, lines)), rows=tuple(rows))
+
+
+def effects_table(result: Result) -> Table:
+    """Return the table of the effects of the budget: what is expected of each, what the data say, and
+    by how many standard deviations both differ; those that the data do not see are left out.
+    """
+    rows = []
+    for each in result.effects:
+        if each.std_error > UNSEEN * each.deviation and abs(each.surprise) < 1.0:
+            continue
+        unit = effect_row(each.name).unit
+        mean, prior, value, error = (
+            in_readable_unit(size, unit)[0]
+            for size in (each.mean, each.deviation, each.value, each.std_error)
+        )
+        rows.append(
+            (
+                f"{source_label(each.name)} {in_readable_unit(1.0, unit)[1].strip()}".rstrip(),
+                f"{mean:.2g} ± {prior:.2g}",
+                f"{value:+.2g} ± {error:.2g}",
+                f"{each.surprise:+.1f}",
+            )
+        )
+    heads = ("effect", "expected", "with the data", "standard deviations")
+    return Table("", heads, rows=tuple(rows))
 
 
 def estimate_row(result: Result, name: str) -> tuple[str, ...]:

@@ -22,21 +22,13 @@ from ..fem.laws.constants import (
     without_region,
 )
 from ..runs.result_content import Result
-from ..statistics.budget.variance_sources import source_label
+from ..statistics.budget.systematic_effects import source_label
 from ..statistics.combinations import WIDE, precision_text
 from ..statistics.hypothesis import NO_CAUSE
-from .alternative_sentences import alternative_sentences
-from .probe_sections import (
-    STIFFNESS_NAMES,
-    is_another_effect,
-    is_deeper_check_worthwhile,
-    is_first_to_correct,
-    is_routine,
-    probe_lines,
-    probe_section,
-)
 from .run_sections import (
+    STIFFNESS_NAMES,
     budget_table,
+    effects_table,
     estimate_row,
     estimate_sections,
     fit_section,
@@ -71,33 +63,29 @@ def run_summary(
         The run folder, which the last line names; no such line by default.
     details : bool
         Whether everything that the report has in words and tables follows: statistical and
-        systematic parts, corrections, notes, probes, residuals, and times.
+        systematic parts, corrections, notes, residuals, and times.
     budget : bool
-        Whether to add the complete table of contributions to each variance, if there is a budget.
+        Whether to add the complete tables of contributions to each variance and of effects, if there
+        is a budget.
     """
-    tables = [budget_table(result)] if budget and result.budget else []
+    tables = [budget_table(result), effects_table(result)] if budget and result.budget else []
     written = [] if folder is None else [f"written to {folder}"]
     return [*(_details(result) if details else _brief(result)), *tables, *written]
 
 
-def next_step(result: Result, folder: Path, solve_command: str) -> str:
+def next_step(result: Result, folder: Path) -> str:
     """Return the command that makes most sense after a solve, with its purpose.
 
     Parameters
     ----------
     result : Result
         Content of ``result.json``.
-    solve_command : str
-        The command with which it was solved.
     """
     program = "collocation-sysid"
     run = shlex.quote(str(folder))
-    if result.converged and is_deeper_check_worthwhile(result):
-        return f"{solve_command} --probe (refits parts of the data and relaxes each assumption)"
     refinable = _has_mesh(result) and result.budget and result.provenance.problem_file is not None
     if result.trust.verdict == "good" and refinable and "mesh" not in (result.discretisation_kinds):
-        errors = result.numerical_errors.values()
-        is_estimated = any(error.estimated_mesh is not None for error in errors)
+        is_estimated = any(each.name == "mesh" for each in result.effects)
         in_intervals = "contain as an estimate" if is_estimated else "do not contain"
         return (
             f"{program} refine {run} (measures the mesh error, which the intervals {in_intervals})"
@@ -107,13 +95,6 @@ def next_step(result: Result, folder: Path, solve_command: str) -> str:
 
 def _brief(result: Result) -> list[Shown]:
     outcome = [] if result.converged else [outcome_section(result)]
-    probes = probe_lines(result)
-    is_found = any(probe.sentences for probe in result.probes)
-    # A mistake of the description or the search is corrected before an assumption is relaxed, and an
-    # effect without a name is nothing to act on beside a good answer.
-    is_nothing = is_another_effect(result) and result.trust.verdict == "good"
-    if is_routine(result) and (not is_found or is_nothing or is_first_to_correct(result)):
-        probes = []
     sections = (*outcome, verdict_section(result.trust, max_reasons=SHOWN_REASONS))
     return [
         *flattened_parts(sections),
@@ -122,10 +103,8 @@ def _brief(result: Result) -> list[Shown]:
         *(Line(note, "quiet") for note in result.notes if note.startswith(NO_CAUSE)),
         *_estimates(result),
         *_limit(result),
-        *alternative_sentences(result),
         *_basis(result),
         *_fit(result),
-        *probes,
     ]
 
 
@@ -141,7 +120,6 @@ def _details(result: Result) -> list[Shown]:
         *estimate_sections(result),
         fit_section(result),
         notes_section(result),
-        probe_section(result),
     )
     ended = [f"residuals: {each.sentence}" for each in result.residuals]
     return [*flattened_parts(sections), *ended]

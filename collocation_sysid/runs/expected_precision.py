@@ -32,12 +32,7 @@ from ..recording.poses import PoseSequence
 from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import moduli_of, specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
-from ..statistics.budget.consider_analysis import (
-    UNWEIGHTED,
-    changes_of_assumptions,
-    prescribes_no_motion,
-)
-from ..statistics.budget.variance_sources import VarianceSources
+from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions
 from ..statistics.combinations import (
     WIDE,
     Combination,
@@ -51,6 +46,8 @@ from ..statistics.linearised import LinearisedFit, linearise_fit
 from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 from .coarse_start import sample_distance
 
+# Errors of measurements that were not made.
+EXACT_NOISE = ErrorModel("given", "independent")
 # Noise of an added instrument over its largest value.
 NOISE = 0.01
 # Tests that are tried beside those that were made.
@@ -113,22 +110,20 @@ def expected_precision(
     SimulationError
         If the equations of motion are singular.
     """
+    from ..judge.augmented_fit import is_learnt
+    from ..judge.posterior import Effects, Posterior
+
     fit, known = exact or _exact_fit(collocation, z)
     parameters = collocation.parameters
     q = z[: collocation.nq]
     changes = changes_of_assumptions(collocation, z, deviations)
-    sources = VarianceSources.from_fit(
-        fit,
-        changes,
-        parameters,
-        q,
-        known,
-        deviations=deviations,
-        has_rulers=prescribes_no_motion(collocation),
+    effects = Effects.from_changes(changes, deviations, {}, {})
+    posterior = Posterior.from_fit(
+        fit, effects, parameters, q, EXACT_NOISE, is_learnt=is_learnt(collocation)
     )
     sizes = relative_derivatives(parameters, q)
-    of_noise = known.complete_covariance
-    covariance = sources.combine_covariance(known.names, of_noise, sizes, np.zeros(len(q)))
+    of_noise = posterior.uncertainty.complete_covariance
+    covariance = posterior.combine_covariance(of_noise, sizes)
     kept = [k for k in parameters.scalar_coordinates if not fit.at_bound[k]]
     names = tuple(known.names[k] for k in kept)
     values = parameters.values(q)
@@ -138,7 +133,7 @@ def expected_precision(
         of_noise[np.ix_(kept, kept)],
         covariance[np.ix_(kept, kept)],
         {
-            name: (sources.derivatives[name] / sizes)[kept] / value
+            name: (posterior.derivatives[name] / sizes)[kept] / value
             for name, value in fit.derived.values.items()
             if value
         },
@@ -150,9 +145,8 @@ def _exact_fit(collocation: Collocation, z: Array) -> tuple[LinearisedFit, Uncer
     fit = linearise_fit(replace(collocation, huber=UNWEIGHTED), z)
     exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
     fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
-    noise = ErrorModel("given", "independent")
     q = z[: collocation.nq]
-    return fit, uncertainty_from_fit(fit, collocation.parameters, q, noise)
+    return fit, uncertainty_from_fit(fit, collocation.parameters, q, EXACT_NOISE)
 
 
 def expected_deviations(collocation: Collocation, z: Array) -> dict[str, float]:
@@ -242,8 +236,7 @@ def with_measurements(
         return ()
     found: list[list[Fix]] = [[] for _ in combinations]
     few = {n: s if n in dominant else None for n, s in deviations.items()}
-    # Rulers that the data determine may reduce the effects of other assumptions.
-    has_bound = bool(dominant) and not prescribes_no_motion(collocation)
+    has_bound = bool(dominant)
     distance = min(sample_distance(each.experiment) for each in collocation.transcriptions)
     some, z = _with_some_samples(collocation, z, distance)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -279,32 +279,19 @@ def fitted_nuisance(experiment: Experiment, solution: Solution) -> tuple[Transcr
     return transcription, alone.parameters_from(ReducedSpace()(alone).unless_interrupted().z)
 
 
-def step_error(
-    problem: Problem,
-    solution: Solution,
-    fit: LinearisedFit,
-    rollouts: Mapping[str, ForwardSimulation | str],
-    estimates: Mapping[str, Estimate],
-) -> Refinement | None:
-    """Return the effect of the time step on every parameter and modulus, to first order.
+def step_changes(
+    problem: Problem, solution: Solution, rollouts: Mapping[str, ForwardSimulation | str]
+) -> list[Array] | None:
+    """Return the changes (T, M, 3) of the residuals with half the time step, of each block of a fit,
+    from the forward simulations, which have finer steps.
 
-    A Gauss–Newton step is taken towards the forward simulations, which have finer steps.
+    None if a simulation is missing or no finer, if all is static, and with obstacles in a motion:
+    impacts within a step are not of first order, and oscillate in the forward simulation.
 
     Parameters
     ----------
-    fit : LinearisedFit
-        The measurements linearised at the solution.
     rollouts : mapping of experiment name to ForwardSimulation or str
         Forward simulations, or why there is none.
-    estimates : mapping of name to Estimate
-        Estimates at the solution, with their statistical intervals.
-
-    Returns
-    -------
-    Refinement or None
-        None if a simulation is missing or no finer, if all is static, and with obstacles in a
-        motion: impacts within a step are not of first order, and oscillate in the forward
-        simulation.
     """
     differences: list[Array] = []
     collocation = solution.collocation
@@ -317,17 +304,37 @@ def step_error(
         if not isinstance(rollout, ForwardSimulation) or share is None:
             return None
         differences += residual_changes(part, rollout.trajectory, share)
-    change = change_in_observations(fit, differences)[: collocation.nq]
+    return differences
+
+
+def step_error(
+    problem: Problem,
+    solution: Solution,
+    fit: LinearisedFit,
+    changes: Sequence[Array],
+    estimates: Mapping[str, Estimate],
+) -> Refinement:
+    """Return the effect of the time step on every parameter and modulus, to first order.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        The measurements linearised at the solution.
+    changes : sequence of (T, M, 3) arrays
+        Result of `step_changes`.
+    estimates : mapping of name to Estimate
+        Estimates at the solution, with their statistical intervals.
+    """
+    collocation = solution.collocation
+    change = change_in_observations(fit, changes)[: collocation.nq]
     q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
-    linear = problem.parameters.linear_names
-    order = as_scheme(problem.scheme).order
     return Refinement(
         discretisation_errors(
             estimates,
             [parameter_values(collocation, q)],
             by_mesh=[],
-            step_order=order,
-            linear=linear,
+            step_order=as_scheme(problem.scheme).order,
+            linear=problem.parameters.linear_names,
         )
     )
 

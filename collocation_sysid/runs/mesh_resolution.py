@@ -7,10 +7,11 @@ contain the same warning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from ..common.array_types import Array
 from ..common.display import LARGEST_CHANGE
 from ..errors import InputError, SimulationError
 from ..fem.body import Body
@@ -18,10 +19,9 @@ from ..fem.laws.constants import YOUNG, without_region
 from ..fem.laws.moduli import ELASTIC
 from ..methods.solution import Solution
 from ..problem import Problem
-from ..statistics.budget.discretisation_error import Refinement, with_estimated_mesh
-from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_change
+from ..statistics.budget.discretisation_error import Refinement, estimate_changes
+from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
 from ..statistics.concerns import Concern
-from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
 from .check.body import LINEAR, bending_concerns, slenderness
 
@@ -33,62 +33,45 @@ MESH_ERROR = "mesh/error"
 LARGEST_STEP = 2.0
 # Moduli of which a larger change shows that the estimate to first order does not hold.
 CHECKED_MODULI = (YOUNG.name, "mu_pa")
-# Lowest order of convergence of the elements.
-LEAST_ORDERS = {LINEAR: 0.5}
 
 
-def estimate_mesh_error(
-    problem: Problem,
-    solution: Solution,
-    fit: LinearisedFit,
-    estimates: Mapping[str, Estimate],
-    known: Refinement | None,
-) -> tuple[Refinement | None, str]:
-    """Return the discretisation errors with the effect of the mesh on every estimate, to first
-    order, and a note why it is unknown, or "".
+def mesh_changes(
+    problem: Problem, solution: Solution, fit: LinearisedFit
+) -> tuple[Sequence[Array], dict[str, float] | None, str]:
+    """Return the changes (T, M, 3, 1) of the residuals of each block of a fit, to first order, on a
+    mesh with elements of half the size, those of the estimates over their values, by name, and a
+    note why they are unknown, or "".
 
-    The errors are those that are known already for recordings that are declared to be simulated,
-    for specimens without a mesh, and where the effect cannot be computed.
+    Empty and None for recordings that are declared to be simulated, for specimens without a mesh,
+    and where the effect cannot be computed.
 
     Parameters
     ----------
     fit : LinearisedFit
         The measurements linearised at the solution.
-    estimates : mapping of str to Estimate
-        Estimates at the solution, with their statistical intervals.
-    known : Refinement or None
-        Errors of the step.
     """
     collocation = solution.collocation
     fitted = [each.experiment for each in collocation.transcriptions]
     bodies = list(dict.fromkeys(each.body for each in fitted if each.specimen is None))
     if not bodies or problem.is_declared_simulated:
-        return known, ""
+        return (), None, ""
     nodes = max(len(body.nodes.points_m) for body in bodies)
     if nodes > LARGEST_NODE_COUNT:
         reason = f"a body has {nodes:,} nodes, more than {LARGEST_NODE_COUNT:,}"
-        return known, _unknown_note(reason)
+        return (), None, _unknown_note(reason)
     try:
-        change = mesh_change(collocation, solution.z, fit)
+        changes = mesh_residual_changes(collocation, solution.z)
     except (InputError, SimulationError, np.linalg.LinAlgError) as error:
-        return known, _unknown_note(str(error))
-    values = parameter_values(collocation, solution.q + change)
+        return (), None, _unknown_note(str(error))
+    change = estimate_changes(fit, changes)[: collocation.nq, 0]
     before = parameter_values(collocation, solution.q)
+    values = parameter_values(collocation, solution.q + change)
     modulus = next(_modulus_beyond_first_order(before, values), "")
     if modulus:
         reason = f"to first order, {modulus} would change by more than half"
-        return known, _unknown_note(reason)
-    linear = collocation.parameters.linear_names
-    is_linear = np.array([item.name in linear for item in collocation.parameters.free], dtype=bool)
-    change = np.where(is_linear, change, np.clip(change, -LARGEST_STEP, LARGEST_STEP))
-    q = np.clip(solution.q + change, *collocation.parameters.bounds_q)
-    return with_estimated_mesh(
-        known,
-        estimates,
-        parameter_values(collocation, q),
-        least_order=min(LEAST_ORDERS.get(body.element.name, 1.0) for body in bodies),
-        linear=linear,
-    ), ""
+        return (), None, _unknown_note(reason)
+    shares = {name: (values[name] - value) / abs(value) for name, value in before.items() if value}
+    return changes, shares, ""
 
 
 def _unknown_note(reason: str) -> str:
@@ -106,7 +89,9 @@ def _modulus_beyond_first_order(
                 yield name
 
 
-def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) -> list[Concern]:
+def mesh_resolution_concerns(
+    problem: Problem, refinement: Refinement | None, by_mesh: Mapping[str, float] | None
+) -> list[Concern]:
     """Return a "check" concern for each body whose mesh is too coarse for its bending: of linear
     tetrahedra, and of other elements where the error of the mesh could not be estimated.
 
@@ -116,43 +101,42 @@ def mesh_resolution_concerns(problem: Problem, refinement: Refinement | None) ->
     Parameters
     ----------
     refinement : Refinement or None
-        Discretisation errors of the estimates.
+        Measured discretisation errors of the estimates.
+    by_mesh : mapping of str to float or None
+        Changes of the estimates over their values by elements of half the size; None if unknown.
     """
     levels = () if refinement is None else refinement.levels
     if problem.is_declared_simulated or any(level.refined == MESH for level in levels):
         return []
-    few = [each for each in _coarse_mesh_concerns(problem) if _is_reason(each, refinement)]
-    return [*_large_error_concerns(problem, refinement), *few]
+    few = [each for each in _coarse_mesh_concerns(problem) if _is_reason(each, by_mesh)]
+    return [*_large_error_concerns(problem, by_mesh or {}), *few]
 
 
-def _is_reason(few: Concern, refinement: Refinement | None) -> bool:
+def _is_reason(few: Concern, by_mesh: Mapping[str, float] | None) -> bool:
     """Return whether too few elements are a reason of the verdict, and not a note."""
-    known = () if refinement is None else refinement.errors.values()
-    is_estimated = any(error.estimated_mesh is not None for error in known)
-    return few.data["element"] == LINEAR or (refinement is not None and not is_estimated)
+    return few.data["element"] == LINEAR or by_mesh is None
 
 
-def _large_error_concerns(problem: Problem, refinement: Refinement | None) -> Iterator[Concern]:
+def _large_error_concerns(problem: Problem, by_mesh: Mapping[str, float]) -> Iterator[Concern]:
     """Constants on a linear scale may be near zero, and λ changes without limit near ν = ½."""
-    if refinement is None:
-        return
     bodies = dict.fromkeys(e.body for e in problem.experiments if e.specimen is None)
     elastic = set().union(*map(_elastic_names, bodies))
     linear = problem.parameters.linear_names
     judged = {item.name for item in problem.parameters.free if item.name not in linear}
     changes = {
-        name: error.estimated_mesh / abs(error.extrapolated)
-        for name, error in refinement.errors.items()
-        if error.estimated_mesh is not None and error.extrapolated
+        name: abs(change)
+        for name, change in by_mesh.items()
         if without_region(name) == YOUNG.name
         or (name in judged and without_region(name) in elastic)
     }
-    name = max(changes, key=lambda each: abs(changes[each]), default="")
-    if name and abs(changes[name]) > LARGEST_CHANGE:
+    name = max(changes, key=changes.__getitem__, default="")
+    if name and changes[name] > LARGEST_CHANGE:
         yield Concern(MESH_ERROR, "check", data={"name": name})
 
 
-def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None) -> list[str]:
+def mesh_resolution_notes(
+    problem: Problem, by_mesh: Mapping[str, float] | None = None
+) -> list[str]:
     """Return the same sentences as notes where they are no concerns: for recordings that are
     declared to be simulated, and for other elements with a known error of the mesh.
     """
@@ -160,7 +144,7 @@ def mesh_resolution_notes(problem: Problem, refinement: Refinement | None = None
     return [
         concern.message
         for concern in _coarse_mesh_concerns(problem)
-        if is_simulated or not _is_reason(concern, refinement)
+        if is_simulated or not _is_reason(concern, by_mesh)
     ]
 
 

@@ -22,7 +22,7 @@ from ..features.measurement_results import (
     SimulatedExperiment,
 )
 from ..features.measurements import prediction_error, stated_sigmas
-from ..fem.laws.constants import GAMMA_R
+from ..fem.laws.constants import GAMMA_R, YOUNG
 from ..methods.solution import pooled_wrench_rms
 from ..methods.starts.start import ScanSummary
 from ..model.contact.summary import friction_summaries
@@ -46,6 +46,11 @@ from .result_content import (
     UncertaintyResult,
 )
 from .solved_problem import SolvedProblem
+
+# Relative change of E over the anisotropy along an axis from which on E is the modulus along it.
+ALONG = 0.7
+# Smallest relative change of E that is reported.
+LEAST_CHANGE = 0.01
 
 
 def build_result(answer: SolvedProblem) -> Result:
@@ -75,10 +80,8 @@ def build_result(answer: SolvedProblem) -> Result:
         derived={name: values[name] for name in answer.derived},
         basis=tuple(_reference_sentences(answer, scale)),
         budget={name: line.shares for name, line in answer.budget.items()},
-        alternatives=answer.alternatives,
-        origin_answers=answer.origin_answers,
+        effects=answer.effects,
         scale=scale,
-        probes=answer.probes,
         places=answer.places,
         nuisance=_nuisance(answer),
         fields={name: _field_result(field) for name, field in answer.fields.items()},
@@ -148,8 +151,33 @@ def _reference_sentences(answer: SolvedProblem, scale: ScaleReference | None) ->
             "moduli are inversely proportional to the stated area_m2, of which no fit shows an error (a "
             "round section has 0.785 times the area of a square one of the same width)"
         )
-    if sentence := answer.modulus_axis_sentence():
+    if sentence := _modulus_axis_sentence(answer):
         yield sentence
+
+
+def _modulus_axis_sentence(answer: SolvedProblem) -> str:
+    """Return a sentence on the axis of the mesh along which Young's modulus is measured, as in
+    bending; "" if there is none, or if the deviation of the anisotropy changes E by less than
+    `LEAST_CHANGE`.
+    """
+    known = answer.estimates.get(YOUNG.name)
+    anisotropy = answer.problem.assumed_deviations["anisotropy"]
+    if answer.posterior is None or not anisotropy or known is None or not known.value:
+        return ""
+    by_q = answer.posterior.derivatives[YOUNG.name] / known.value / anisotropy
+    names, columns = answer.posterior.sources
+    by_axis = {
+        name.partition(" ")[2]: float(by_q @ way)
+        for name, way in zip(names, columns.T, strict=True)
+        if name.startswith("anisotropy")
+    }
+    axis = max(by_axis, key=lambda each: by_axis[each], default="")
+    if not axis or by_axis[axis] < ALONG or by_axis[axis] * anisotropy < LEAST_CHANGE:
+        return ""
+    return (
+        f"E is mainly the modulus along the {axis} axis of the mesh: if the body is 10 % stiffer "
+        f"along it than across it, E is {by_axis[axis]:.0%} of this larger than across it"
+    )
 
 
 def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
@@ -158,7 +186,7 @@ def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
         return None
     reported = [k for k, name in enumerate(known.names) if name in known.estimates]
     both = np.ix_(reported, reported)
-    is_combined = answer.systematic_effects is not None
+    is_combined = answer.posterior is not None
     return copy_fields(
         UncertaintyResult,
         known,

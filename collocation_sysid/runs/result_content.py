@@ -18,12 +18,11 @@ from ..fem.spatial_field import FieldResolution
 from ..methods.solution import Iteration, Timing
 from ..methods.starts.start import ScanSummary
 from ..statistics.assessment import Assessment
-from ..statistics.budget.alternatives import Alternative, OriginAnswer
 from ..statistics.budget.combined_intervals import ReportedEstimate
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
+from ..statistics.budget.effect_estimates import EffectEstimate
 from ..statistics.combinations import Combination, Direction
-from ..statistics.probes.profile_likelihood import Profile
-from ..statistics.probes.relaxed_assumptions import Probe
+from ..statistics.profile_likelihood import Profile
 from ..statistics.remedies import remedy_for
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import ScaleReference
@@ -222,7 +221,7 @@ class Elapsed:
     # From the problem to the optimum: finding a start, and every search that led to the answer,
     # also with finer steps.
     search: float = 0.0
-    checks: float = 0.0  # forward simulations, uncertainties, budget, probes and likely causes
+    checks: float = 0.0  # forward simulations, uncertainties, budget and likely causes
     # Drawing and writing the pictures; None if they have not been drawn.
     pictures: float | None = None
 
@@ -253,15 +252,11 @@ class Result:
     budget : mapping of name to mapping of source to float
         Share of each source in the variance of each estimate, largest first; empty without error
         bars.
-    alternatives : tuple of Alternative
-        Estimates under other assumptions, whose effect the intervals do not contain.
-    origin_answers : tuple of OriginAnswer
-        Intervals for each answer to the open questions how the body was made and where its mesh
-        comes from.
+    effects : tuple of EffectEstimate
+        Prior and posterior of each effect of the budget, the most surprising first; empty without
+        error bars.
     scale : ScaleReference or None
         The stated mass to which moduli are relative; None if a force or a prior sets their scale.
-    probes : tuple of Probe
-        Refits with an assumption relaxed and, where requested, of parts of the data.
     places : mapping of experiment to mapping of marker to MarkerPlace
         Estimated places of the markers on the undeformed body.
     nuisance : mapping of experiment to mapping of label to NuisanceResult
@@ -309,10 +304,8 @@ class Result:
     derived: Mapping[str, ReportedEstimate]
     basis: tuple[str, ...]
     budget: Mapping[str, Mapping[str, float]]
-    alternatives: tuple[Alternative, ...]
-    origin_answers: tuple[OriginAnswer, ...]
+    effects: tuple[EffectEstimate, ...]
     scale: ScaleReference | None
-    probes: tuple[Probe, ...]
     places: Mapping[str, Mapping[str, MarkerPlace]]
     nuisance: Mapping[str, Mapping[str, NuisanceResult]]
     fields: Mapping[str, FieldResult]
@@ -379,14 +372,12 @@ class Result:
 
     @property
     def discretisation_kinds(self) -> tuple[str, ...]:
-        """Kinds of discretisation error that the combined intervals contain: "step",
-        "mesh".
-        """
+        """Kinds of discretisation error that a refinement measured: "step", "mesh"."""
         return known_kinds(self.numerical_errors.values())
 
     @property
     def numerical_errors(self) -> dict[str, DiscretisationError]:
-        """Known discretisation errors, by name of the estimate."""
+        """Measured discretisation errors, by name of the estimate."""
         errors = ((name, each.numerical_error) for name, each in self.estimates.items())
         return {name: error for name, error in errors if error is not None}
 

@@ -14,26 +14,21 @@ import numpy as np
 from ..common.array_types import Array
 from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
+from ..judge.posterior import BudgetLine, Posterior
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..recording.measurement import Measurement
-from ..statistics.assessment import Assessment, cause_concerns, numerical_concerns, probe_concerns
-from ..statistics.budget.alternatives import (
-    Alternative,
-    OriginAnswer,
-    find_alternatives,
-    modulus_axis_sentence,
-    origin_answers,
+from ..statistics.assessment import (
+    OPEN_CAUSES,
+    Assessment,
+    cause_concerns,
+    fit_concerns,
+    numerical_concerns,
 )
 from ..statistics.budget.combined_intervals import ReportedEstimate, combine
-from ..statistics.budget.discretisation_error import DiscretisationError, Refinement
-from ..statistics.budget.variance_sources import (
-    MESH,
-    NUMERICAL,
-    BudgetLine,
-    VarianceSources,
-    budget,
-)
+from ..statistics.budget.discretisation_error import Refinement
+from ..statistics.budget.effect_estimates import EffectEstimate, effect_concerns
+from ..statistics.budget.systematic_effects import DISCRETISATION
 from ..statistics.combinations import (
     Combination,
     Direction,
@@ -48,9 +43,7 @@ from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli, LinearisedFit
-from ..statistics.probes.budgeted_residuals import BudgetedResiduals
-from ..statistics.probes.profile_likelihood import Profile
-from ..statistics.probes.relaxed_assumptions import Probe
+from ..statistics.profile_likelihood import Profile
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
 from .check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
@@ -81,22 +74,18 @@ class SolvedProblem:
     notes: tuple[str, ...] = ()  # problems after the solve
     # Likely errors in the description of the problem, likeliest first.
     causes: tuple[Hypothesis, ...] = ()
-    # Discretisation errors of the estimates: from solves at finer discretisations if requested,
-    # else the first-order effect of the step from finer forward simulations; None where these are
-    # missing.
+    # Discretisation errors that solves at finer discretisations measured; None without these.
     refinement: Refinement | None = None
     omitted_checks: str = ""  # checks that were left out after Ctrl-C; empty if all were done
-    # Systematic effects on the estimates; None without error bars.
-    systematic_effects: VarianceSources | None = None
-    # Refits with an assumption relaxed: those of every solve, see `routine_probes`; or all, and of
-    # parts of the data, where these were requested. Empty without error bars.
-    probes: tuple[Probe, ...] = ()
+    posterior: Posterior | None = None  # with all effects of the budget; None without error bars
+    # Effects beyond the budget that would explain the residuals as well, by name, with the decrease of
+    # the loss; empty for a consistent fit.
+    suspects: Mapping[str, float] = field(default_factory=dict)
+    # Changes of the estimates over their values by elements of half the size; None if unknown.
+    by_mesh: Mapping[str, float] | None = None
     # mapping of frozenset of str to Fix: the sensor or test that would determine the constants of a
     # combination best, by their names.
     added_measurements: Mapping[frozenset[str], Fix] = field(default_factory=dict)
-    # Residuals that deviations within the budget leave; None if the residuals gave no concern, or
-    # if such deviations do not explain them.
-    budgeted: BudgetedResiduals | None = None
     elapsed_s: Elapsed = field(default_factory=Elapsed)  # durations of search and checks
 
     def __repr__(self) -> str:
@@ -111,8 +100,8 @@ class SolvedProblem:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of all parameters by name in SI units, also fixed ones, corrected for the known
-        discretisation error and known effects.
+        """Values of all parameters by name in SI units, also fixed ones, with the corrections of the
+        posterior.
         """
         return {name: self.estimates[name].value for name in self.solution.parameters}
 
@@ -130,27 +119,37 @@ class SolvedProblem:
         combined and statistical intervals, by name.
         """
         values = self.solution.parameters | self.derived
-        return {
-            name: self._report_estimate(name, self.optimum.get(name, Estimate(value)))
-            for name, value in values.items()
-        }
+        return {name: self._report_estimate(name, value) for name, value in values.items()}
 
-    def _report_estimate(self, name: str, optimum: Estimate) -> ReportedEstimate:
+    def _report_estimate(self, name: str, optimum: float) -> ReportedEstimate:
+        posterior = self.posterior
+        known = self._statistical.get(name, Estimate(optimum))
         item = next(
             (each for each in self.solution.collocation.parameters.components if each.name == name),
             None,
         )
-        line = self.budget.get(name)
-        linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
-        combined = combine(
-            name,
-            optimum,
-            error=self.discretisation_errors.get(name),
-            systematic=None if line is None else line.systematic,
-            known_effect=0.0 if line is None else line.known_effect,
-            linear=linear,
-            bounds=bounds,
-        )
+        if posterior is None or name not in self.budget:
+            combined = ReportedEstimate(**vars(known))
+        else:
+            combined = posterior.reported(name)
+            besides = self._besides_discretisation
+            combined = replace(
+                combined,
+                systematic=besides.systematic(name),
+                known_effect=besides.change(name, optimum),
+            )
+        combined = replace(combined, optimum=optimum)
+        if self.refinement is not None and name in self.refinement.errors:
+            linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
+            combined = combine(
+                name,
+                combined.at_optimum(name, linear=linear),
+                error=self.refinement.errors[name],
+                systematic=combined.systematic,
+                known_effect=combined.known_effect or 0.0,
+                linear=linear,
+                bounds=bounds,
+            )
         if item is None:
             return combined
         guess = np.nan if item.guess is None else item.guess
@@ -158,77 +157,46 @@ class SolvedProblem:
         return replace(combined, guess=guess, fixed=item.is_fixed or tied, tied=tied or None)
 
     @cached_property
-    def budget(self) -> dict[str, BudgetLine]:
-        """The uncertainty budget of each estimate, by name; empty without error bars or systematic
-        effects.
-        """
-        if self.uncertainty is None or self.systematic_effects is None:
-            return {}
-        return budget(
-            self.systematic_effects,
-            self.uncertainty,
-            numerical=self.discretisation_errors,
-            parameters=self.solution.collocation.parameters,
-        )
+    def _statistical(self) -> dict[str, Estimate]:
+        bars = self.uncertainty
+        return {} if bars is None else {**bars.estimates, **bars.derived}
 
     @cached_property
-    def alternatives(self) -> tuple[Alternative, ...]:
-        """Estimates under other assumptions, whose effect the intervals do not contain; empty
-        without systematic effects.
-        """
-        if self.systematic_effects is None:
-            return ()
-        return find_alternatives(
-            self.systematic_effects, self.estimates, parameters=self.solution.collocation.parameters
-        )
-
-    @cached_property
-    def origin_answers(self) -> tuple[OriginAnswer, ...]:
-        """Intervals for each answer to the open questions how the first body was made and where its
-        mesh comes from; empty without systematic effects.
-        """
-        if self.systematic_effects is None:
-            return ()
-        return tuple(
-            origin_answers(
-                self.systematic_effects,
-                self.budget,
-                parameters=self.solution.collocation.parameters,
-                body=self.problem.bodies[0],
-                stated=self.problem.uncertainty.assumptions,
-            )
-        )
-
-    def modulus_axis_sentence(self) -> str:
-        """Return a sentence on the axis along which E is measured, see `modulus_axis_sentence`; ""
-        without systematic effects, or if there is no such axis.
-        """
-        if self.systematic_effects is None:
-            return ""
-        anisotropy = self.problem.assumed_deviations["anisotropy"]
-        return modulus_axis_sentence(self.systematic_effects, self.estimates, anisotropy)
+    def _besides_discretisation(self) -> Posterior:
+        """The posterior without the errors of mesh and time step, which a refinement measures."""
+        assert self.posterior is not None
+        return self.posterior.without(row.name for row in DISCRETISATION)
 
     @property
-    def discretisation_errors(self) -> Mapping[str, DiscretisationError]:
-        """Known discretisation errors, by name of the estimate; empty without
-        `refinement`.
+    def optimum(self) -> dict[str, Estimate]:
+        """Parameters, also fixed ones, and derived moduli at the optimum of the discretised problem,
+        by name, with statistical intervals where they are known.
         """
-        return {} if self.refinement is None else self.refinement.errors
+        linear = self.solution.collocation.parameters.linear_names
+        return {
+            name: each.at_optimum(name, linear=name in linear)
+            for name, each in replace(self, refinement=None).estimates.items()
+        }
+
+    @property
+    def budget(self) -> dict[str, BudgetLine]:
+        """The uncertainty budget of each estimate, by name; empty without error bars."""
+        return {} if self.posterior is None else self.posterior.budget
+
+    @property
+    def effects(self) -> tuple[EffectEstimate, ...]:
+        """Posterior of each effect of the budget, the most surprising first; empty without error
+        bars.
+        """
+        return () if self.posterior is None else self.posterior.effect_estimates
 
     @cached_property
-    def optimum(self) -> dict[str, Estimate]:
-        """Scalar parameters, also fixed ones, and derived moduli at the optimum of the discretised
-        problem, by name.
-
-        They have statistical intervals where `uncertainty` has; the others have a value alone.
-        """
-        bars = self.uncertainty
-        known = {} if bars is None else {**bars.estimates, **bars.derived}
-        values = self.solution.collocation.parameters.scalar_values(self.solution.q)
-        return {
-            name: known.get(name, Estimate(value))
-            for name, value in (values | self.derived).items()
-        }
+    def is_consistent(self) -> bool:
+        """Whether residuals and effects are as expected of a true description."""
+        if self.uncertainty is None:
+            return False
+        concerns = [*fit_concerns(self.uncertainty), *effect_concerns(self.effects)]
+        return not concerns
 
     @cached_property
     def places(self) -> dict[str, dict[str, MarkerPlace]]:
@@ -253,25 +221,20 @@ class SolvedProblem:
             self.rollouts,
             motions=self.modes_by_experiment.values(),
             uncertainty=self.uncertainty,
-            budgeted=self.budgeted,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)
         of_fields = [concern for field in self.fields.values() for concern in field.list_concerns()]
         if not self.omitted_checks:
-            probed = probe_concerns(
-                self.probes,
-                self._compute_discretisation_corrections(),
-                [each.experiment for each in self.solution.collocation.transcriptions],
-            )
             causes = cause_concerns(self.causes)
-            meshes = mesh_resolution_concerns(self.problem, self.refinement)
+            meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
             return Assessment.from_concerns(
                 (
-                    *causes,
+                    *(each for each in causes if each.code not in OPEN_CAUSES),
+                    *effect_concerns(self.effects, self.suspects),
+                    *(each for each in causes if each.code in OPEN_CAUSES),
                     *of_fit,
                     *of_fields,
-                    *probed,
                     *numerical,
                     *meshes,
                     *grasp_extent_concerns(self.problem),
@@ -283,14 +246,6 @@ class SolvedProblem:
         return Assessment.from_concerns(
             (interrupted, *(of_fit if self.uncertainty is not None else ()))
         )
-
-    def _compute_discretisation_corrections(self) -> dict[str, float]:
-        """Ratio of reported value to optimum, by name."""
-        return {
-            item.name: each.value / each.optimum if each.optimum else 1.0
-            for item in self.solution.collocation.parameters.free_scalars
-            if (each := self.estimates[item.name])
-        }
 
     @cached_property
     def modes_by_experiment(self) -> dict[str, ModesCheck]:
@@ -308,7 +263,7 @@ class SolvedProblem:
         fields. Without error bars their standard deviations are NaN.
         """
         collocation = self.solution.collocation
-        q = self.solution.q
+        q = self._q
         bodies = dict.fromkeys(transcription.body for transcription in collocation.transcriptions)
         known = (
             field_estimates(b, collocation.parameters, q=q, uncertainty=self.uncertainty)
@@ -386,7 +341,7 @@ class SolvedProblem:
         ):
             if found not in known:
                 raise InputError(f"{name}: found {found!r}; expected one of {', '.join(known)}")
-        if self.uncertainty is None or self.systematic_effects is None:
+        if self.uncertainty is None or self.posterior is None:
             raise InputError("the run has no error bars, and therefore no covariance")
         matrix = self.uncertainty.covariance
         by_value = self._relative_by_value()
@@ -422,7 +377,7 @@ class SolvedProblem:
         if count < 1:
             raise InputError(f"count: found {count}; expected at least 1")
         pandas = _optional_package("pandas", "a data frame")
-        if self.uncertainty is None or self.systematic_effects is None:
+        if self.uncertainty is None or self.posterior is None:
             raise InputError("the run has no error bars, and therefore no samples")
         draws = draw_samples(
             self.solution.collocation,
@@ -516,9 +471,10 @@ class SolvedProblem:
     def _relative_by_value(self) -> Array:
         """Return the derivatives (k,) of relative coordinates by values."""
         parameters = self.solution.collocation.parameters
-        by_value = relative_derivatives(parameters, self.solution.q)
+        by_value = relative_derivatives(parameters, self._q)
+        values = parameters.values(self._q)
         for k, item in enumerate(parameters.free):
-            by_value[k] /= item.value_derivative(self.solution.parameters[item.name])
+            by_value[k] /= item.value_derivative(values[item.name])
             if item.scale == "log" and self.estimates[item.name].value:
                 by_value[k] = 1 / self.estimates[item.name].value
         return by_value
@@ -529,6 +485,10 @@ class SolvedProblem:
         return np.abs(self._relative_by_value()) * np.array(known)
 
     @property
+    def _q(self) -> Array:
+        return self.solution.q if self.posterior is None else self.posterior.reported_q
+
+    @property
     def _estimated_names(self) -> tuple[str, ...]:
         return tuple(item.name for item in self.solution.collocation.parameters.free)
 
@@ -536,24 +496,10 @@ class SolvedProblem:
     def _complete_covariance(self) -> Array:
         """Finite combined covariance (k, k) of relative coordinates."""
         assert self.uncertainty is not None
-        assert self.systematic_effects is not None
+        assert self.posterior is not None
         parameters = self.solution.collocation.parameters
-        numerical = np.zeros(len(parameters.free))
-        deviations = np.nan_to_num(self._collect_relative_deviations())
-        for k, name in enumerate(self._estimated_names):
-            error = self.discretisation_errors.get(name)
-            if error is None or name not in self.budget:
-                continue
-            shares = self.budget[name].shares
-            share = shares.get(MESH, 0.0) + shares.get(NUMERICAL, 0.0)
-            change = error.extrapolated - self.optimum[name].value
-            towards = error.estimated_mesh if MESH in shares else change
-            numerical[k] = np.copysign(np.sqrt(share) * deviations[k], towards or 0.0)
-        return self.systematic_effects.combine_covariance(
-            self._estimated_names,
-            self.uncertainty.complete_covariance,
-            relative_derivatives(parameters, self.solution.q),
-            numerical,
+        return self.posterior.combine_covariance(
+            self.uncertainty.complete_covariance, relative_derivatives(parameters, self._q)
         )
 
     @cached_property
@@ -586,19 +532,19 @@ class SolvedProblem:
 
     def _stated_covariance(self) -> tuple[list[str], Array, Array]:
         """Names, values and covariance of scalars that are not at a bound."""
-        if self.uncertainty is None or self.systematic_effects is None:
+        if self.uncertainty is None or self.posterior is None:
             return [], np.zeros(0), np.zeros((0, 0))
         free = enumerate(self._estimated_names)
-        kept = {k: n for k, n in free if n in self.optimum and not self.optimum[n].at_bound}
-        values = np.array([self.solution.parameters[name] for name in kept.values()])
+        kept = {k: n for k, n in free if n in self._statistical and not self.estimates[n].at_bound}
+        values = np.array([self.parameters[name] for name in kept.values()])
         return [*kept.values()], values, self._complete_covariance[np.ix_([*kept], [*kept])]
 
     def _modulus_slopes(self, names: Sequence[str]) -> dict[str, Array]:
         """Return ∂ln of the derived moduli by logarithms of parameters (k,)."""
-        assert self.systematic_effects is not None
-        sizes = relative_derivatives(self.solution.collocation.parameters, self.solution.q)
+        assert self.posterior is not None
+        sizes = relative_derivatives(self.solution.collocation.parameters, self._q)
         places = [self._estimated_names.index(name) for name in names]
-        by_q = self.systematic_effects.derivatives
+        by_q = self.posterior.derivatives
         return {
             modulus: (by_q[modulus] / sizes)[places] / value
             for modulus, value in self.derived.items()
@@ -669,7 +615,7 @@ class SolvedProblem:
             return self.notes
         notes = (
             *self.notes,
-            *mesh_resolution_notes(self.problem, self.refinement),
+            *mesh_resolution_notes(self.problem, self.by_mesh),
             *grasp_extent_notes(self.problem),
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty, self.combinations),

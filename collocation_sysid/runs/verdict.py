@@ -43,7 +43,6 @@ from ..statistics.plausibility import (
     material_hypothesis,
     size_and_density_hypotheses,
 )
-from ..statistics.probes.budgeted_residuals import BudgetedResiduals
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
@@ -60,7 +59,6 @@ def solution_concerns(
     rollouts: Mapping[str, ForwardSimulation | str],
     motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
-    budgeted: BudgetedResiduals | None = None,
 ) -> Iterator[Concern]:
     """Yield the concerns about a solution and its forward simulations.
 
@@ -77,8 +75,6 @@ def solution_concerns(
     uncertainty : Uncertainty or None
         Statistical uncertainty; None without error bars, which is a concern of its own if there
         are parameters.
-    budgeted : BudgetedResiduals, optional
-        Residuals that deviations within the budget leave.
     """
     status = solution.status
     yield from body_concerns(solution)
@@ -94,7 +90,7 @@ def solution_concerns(
     transcriptions = solution.collocation.transcriptions
     unknowns = [each for part in solution.parts for each in _nuisance_concerns(part)]
     if uncertainty is not None:
-        misfits = fit_concerns(uncertainty, budgeted and budgeted.basis)
+        misfits = fit_concerns(uncertainty)
         of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
         yield from as_specimen_concerns(
             [*misfits, *of_parameters, *unknowns], [each.experiment for each in transcriptions]

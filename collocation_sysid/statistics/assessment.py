@@ -14,26 +14,19 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.display import LARGEST_CHANGE, predicted_change, short
-from ..errors import listed
-from ..fem.laws.constants import symbol_of, unit_of
+from ..common.display import predicted_change
 from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
 from ..recording.deviation import Deviation, in_readable_unit
 from ..recording.experiment import Experiment
-from ..recording.hysteresis import branch_differences
 from ..recording.impact_steps import impact_steps
 from ..recording.rotation_per_step import WARNING_ANGLE_RAD, fastest_rotation
 from .budget.discretisation_error import Refinement
-from .budget.systematic_effects import DEVIATIONS
-from .budget.variance_sources import source_label
 from .concerns import Concern, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name, limitless_shares
 from .hypothesis import Hypothesis
 from .instrument_misfit import InstrumentMisfit
-from .probes.relaxed_assumptions import ANISOTROPY, DRIFT, MEMORY, Probe, assumption_name
-from .probes.routine import is_alarming, is_routine_assumption
 from .residuals.autocorrelation import Dependence
 from .residuals.diagnostics import MOST_WILD
 from .residuals.noise_level import NoiseLevel
@@ -70,44 +63,20 @@ Verdict = Literal["good", "check", "doubtful"]
 # Codes of concerns about bounds from which others may follow.
 FIRST = "information/default-bound", "information/flat", "information/liquid"
 # Codes of hypotheses that stand for several, none of which is likely alone.
-OPEN_CAUSES = "several", "insufficient"
+OPEN_CAUSES = "description/several", "description/insufficient"
 # Share of the samples beyond Huber's threshold: "check".
 WILD = MOST_WILD
-# End of the message about an assumption that other laws than the stated ones contradict as well.
-LAWS_ADVICE = (
-    "; a wrong damping or material law has similar effects: compare the laws first, with "
-    "compare-models --damping and --materials"
-)
-# The same without motion, where damping has no effect.
-STILL_ADVICE = (
-    "; memory or another material law has similar effects: compare them first, with "
-    "compare-models --prony 0,1 and --materials"
-)
-# The same for a branch of memory.
-MEMORY_ADVICE = (
-    "; these estimates are of first order in the share, for a given relaxation time. The moduli "
-    "without memory are too large for slow loads: add a branch to the material ([[object.prony]], "
-    "in Python Body(prony=...)), and estimate it"
-)
-# The same for a stiffness that is higher along one axis.
-ANISOTROPY_ADVICE = (
-    "; the modulus along this axis of the mesh is that of the estimates without this assumption "
-    "times one plus the anisotropy. A wrong material law, or a mesh of another width, has similar "
-    "effects"
-)
 # Advice about an unknown of a specimen that is far from its prior, and about one that is so far that
 # no such error is as large.
 WIDENING = (
     "check whether this value is possible, and if it is, widen its prior in the [[experiment]]"
 )
 HIDING = "it hides another error, such as a law that is too simple, or a wrong unit, area or kind of test"
-# Concerns about residuals that deviations within the budget may cause.
-WITHIN_BUDGET = "residuals/persist", "residuals/shared", "noise/larger"
 # Ratio of the steps that impacts need and the stated ones from which E is wrong by tens of percent: a
 # falling block with 4 in place of 15 was 46 % too stiff.
 FEW_IMPACT_STEPS = 2.0
-# Codes of the concern about an estimated, and about a measured discretisation error.
-NUMERICAL = "scheme/step", "mesh/refined"
+# Code of the concern about a measured discretisation error.
+NUMERICAL = "mesh/refined"
 
 
 @dataclass(frozen=True)
@@ -159,18 +128,17 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     """
     return [
         (
-            each if each.code in OPEN_CAUSES else replace(each, subject=f"likely: {each.subject}")
+            each
+            if f"description/{each.code}" in OPEN_CAUSES
+            else replace(each, subject=f"likely: {each.subject}")
         ).concern("doubtful" if each.strength > AS_GOOD_AS_CERTAIN else "check")
         for each in causes
     ]
 
 
-def fit_concerns(uncertainty: Uncertainty, budgeted: ErrorBasis | None = None) -> list[Concern]:
+def fit_concerns(uncertainty: Uncertainty) -> list[Concern]:
     """Return concerns about the residuals: size compared with σ, correlation, outliers and
     disagreement of recordings.
-
-    Those of `WITHIN_BUDGET` are the ones of the residuals that deviations within the budget leave,
-    if these are given.
 
     Correlation counts only if the error bars use autocorrelated errors and slow errors within σ do
     not explain it (`ErrorBasis.unexplained`): "residuals/persist" in time
@@ -185,15 +153,9 @@ def fit_concerns(uncertainty: Uncertainty, budgeted: ErrorBasis | None = None) -
     Parameters
     ----------
     uncertainty : Uncertainty
-        Error bars with the tests of the residuals.
-    budgeted : ErrorBasis, optional
-        Tests of the residuals that are left, see `budgeted_residuals`.
+        Error bars with the tests of the residuals, which are those of the posterior.
     """
-    concerns = _residual_concerns(uncertainty)
-    if budgeted is not None:
-        left = {each.code for each in _residual_concerns(budgeted)}
-        concerns = [e for e in concerns if e.code not in WITHIN_BUDGET or e.code in left]
-    return [*concerns, *_disagreement_concerns(uncertainty)]
+    return [*_residual_concerns(uncertainty), *_disagreement_concerns(uncertainty)]
 
 
 def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
@@ -345,8 +307,8 @@ def numerical_concerns(
     combined_std_errors: Mapping[str, float | None],
     refinement: Refinement | None,
 ) -> list[Concern]:
-    """Return a concern if the correction for step and mesh is large compared with the standard
-    uncertainty of a parameter; it names the parameter with the largest ratio.
+    """Return a concern if the measured correction for step and mesh is large compared with the
+    standard uncertainty of a parameter; it names the parameter with the largest ratio.
 
     Parameters
     ----------
@@ -355,14 +317,13 @@ def numerical_concerns(
     combined_std_errors : mapping of name to float or None
         Combined standard uncertainties; None if unknown, then the parameter is left out.
     refinement : Refinement or None
-        Discretisation errors; None if they are unknown, which is no concern.
+        Measured discretisation errors; None without.
 
     Returns
     -------
     list of Concern
         Empty, or one concern of grade "check" if the largest correction exceeds `MOVED` standard
-        uncertainties: "mesh/refined" if solutions on finer discretisations exist, else
-        "scheme/step".
+        uncertainties.
     """
     if refinement is None:
         return []
@@ -371,80 +332,8 @@ def numerical_concerns(
         return []
     value = optimum[worst].value
     change = (refinement.errors[worst].extrapolated - value) / abs(value)
-    code = NUMERICAL[1] if refinement.levels else NUMERICAL[0]
     text = predicted_change(change, f"{100 * change:+.2g} %")
-    data = {"name": worst, "change": text, "errors": largest}
-    return [Concern(code, data=data)]
-
-
-def probe_concerns(
-    probes: Iterable[Probe],
-    corrections: Mapping[str, float],
-    experiments: Iterable[Experiment] = (),
-) -> list[Concern]:
-    """Return one concern, as a list, about the assumption that the data contradict most, with the
-    estimates without it; empty if `is_alarming` is false for every probe.
-
-    Other alarming assumptions, which explain the data less well, are named in the same concern,
-    because relaxing one is mostly a substitute for relaxing another. The grade is "check".
-
-    Parameters
-    ----------
-    probes : iterable of Probe
-        Relaxed assumptions.
-    corrections : mapping of str to float
-        The estimated parameters in the order in which they are reported, each with the factor that
-        corrects its optimum for the known discretisation error.
-    experiments : iterable of Experiment
-        Fitted experiments, whose hysteresis is named as a cause of a drift of the stiffness.
-    """
-    alarming = sorted(filter(is_alarming, probes), key=lambda each: -each.chi_squared)
-    if not alarming:
-        return []
-    worst, *others = alarming
-    label = source_label(worst.name)
-    instead = listed(f"{source_label(p.name)} ({p.chi_squared:.3g})" for p in others)
-    data = {
-        "assumption": DEVIATIONS[assumption_name(worst.name)].assumed or f"{label} is as stated",
-        "name": label,
-        "size": short(worst.size or 0.0),
-        "size_error": short(worst.size_error or 0.0),
-        "chi_squared": worst.chi_squared,
-        "estimates": [_relaxed_estimate(worst, *each) for each in corrections.items()],
-        "instead": (f"; alternatives that decrease χ² less: {instead}" if others else "")
-        + (_hysteresis_text(experiments) if worst.name == DRIFT else "")
-        + _advice(worst, is_still={each.kind for each in experiments} == {"static"}),
-    }
-    return [Concern("assumption/contradicted", data=data)]
-
-
-def _advice(probe: Probe, is_still: bool) -> str:
-    """Return what a message adds; "" for an assumption that is not probed in every solve."""
-    if not is_routine_assumption(probe.name):
-        return ""
-    advice = {MEMORY: MEMORY_ADVICE, ANISOTROPY: ANISOTROPY_ADVICE}
-    return advice.get(assumption_name(probe.name), STILL_ADVICE if is_still else LAWS_ADVICE)
-
-
-def _hysteresis_text(experiments: Iterable[Experiment]) -> str:
-    sizes = branch_differences(experiments)
-    if not sizes:
-        return ""
-    return (
-        f"; hysteresis resembles such a drift: the stress in unloading differs from that in "
-        f'loading by {sizes}. To fit the loading alone, set branch = "loading"'
-    )
-
-
-def _relaxed_estimate(probe: Probe, name: str, correction: float) -> str:
-    """Return an estimate times a correction as text; its standard error is not multiplied."""
-    move = probe.moves.get(name)
-    if move is None:
-        return f"{symbol_of(name)} not determined"
-    value = correction * move.value
-    if abs(move.change) > LARGEST_CHANGE * abs(move.value - move.change):
-        return f"{symbol_of(name)} different by more than half"
-    return f"{symbol_of(name)} = {value:.4g} ± {move.std_error:.2g} {unit_of(name)}".strip()
+    return [Concern(NUMERICAL, data={"name": worst, "change": text, "errors": largest})]
 
 
 def outlier_share_concerns(wild: int, samples: int) -> list[Concern]:

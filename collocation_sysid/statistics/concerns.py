@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from ..errors import listed
+from .description_texts import MESSAGES
 
 Grade = Literal["check", "doubtful"]
 
@@ -54,6 +55,7 @@ TOPICS: dict[str, Topic] = {
         remedy="Compare units, frames, labels and clocks of the problem file with the laboratory's "
         "notes. The command check tests the recordings for common mistakes before a solve.",
         messages={
+            **MESSAGES,
             "length-unit/size": "the body is {size_m:.3g} m large; expected {least:g} to {most:g} "
             "m: check {likely}",
             "density": "the body's density is {density_kg_m3:.4g} kg/m³; expected {least:g} to "
@@ -134,20 +136,17 @@ TOPICS: dict[str, Topic] = {
             "Huber loss: look for exchanged labels and wrong samples in the residuals over time",
         },
     ),
-    "assumption": Topic(
-        "Assumptions that the data contradict",
+    "effect": Topic(
+        "Effects that the data need",
         "budget",
-        remedy="Find out whether the assumption is wrong, for instance by repeating the first "
-        "recording at the end, or whether the model lacks an effect with similar "
-        "consequences, as a missing memory resembles a drift, and a wrong damping law a clock "
-        "rate. The command compare-models tests other laws, with --materials, with --damping for motions, "
-        "and with --prony for slow loads that relax. The command "
-        "solve --probe (probe=True in Python) computes the effect beyond first order and relaxes "
-        "the other assumptions.",
+        remedy="The residuals need an effect of the budget that is larger than its deviation, or "
+        "something that looks the same and is not described, such as a mass at the markers, another "
+        "law of the material, memory, or a wrong time or place. The estimates are corrected for the "
+        "effect, which is right only if it is the cause. The table of effects (solve --budget) has "
+        "all of them.",
         messages={
-            "contradicted": "the data contradict the assumption that {assumption}: with {name} = "
-            "{size} ± {size_error}, χ² decreases by {chi_squared:.3g}, and the estimates become "
-            "{estimates}{instead}"
+            "surprising": "the residuals need a {effect}: {surprise:.1f} standard deviations"
+            "{alike}; {remedy}, and check what else the description lacks"
         },
     ),
     "information": Topic(
@@ -257,9 +256,6 @@ TOPICS: dict[str, Topic] = {
         remedy="Raise transcription.substeps, or use the midpoint scheme, which damps least. The "
         "command refine RUN measures the remaining error.",
         messages={
-            "step": "the estimated time-step error dominates the uncertainty of {name}: it was "
-            "corrected by {change}, {errors:.2g} standard uncertainties; raise "
-            "transcription.substeps, or run refine to measure the error",
             "damping": "the time-stepping scheme adds a damping ratio of {added:.2g} to the "
             "{damping:.2g} of the first mode of '{experiment}': raise transcription.substeps, or "
             "use the midpoint scheme",

@@ -219,6 +219,9 @@ class LinearisedFit:
         Parameters that ended at a bound.
     derived : DerivedModuli
         Moduli that follow from the shared parameters.
+    effect_count : int
+        Number of effects of the budget among the parameters, the last ones, in standard deviations
+        of their priors. Statistical covariances do not contain these priors.
     """
 
     blocks: tuple[ResidualBlock, ...]
@@ -228,6 +231,7 @@ class LinearisedFit:
     prior_jacobian: Array
     at_bound: Mask
     derived: DerivedModuli = field(default_factory=lambda: DerivedModuli({}, {}))
+    effect_count: int = 0
 
     @property
     def measurement_count(self) -> int:
@@ -255,6 +259,23 @@ class LinearisedFit:
         blocks_after = (replace(b, residual=b.residual + b.jacobian @ step) for b in self.blocks)
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
+
+    @property
+    def with_known_effects(self) -> LinearisedFit:
+        """The fit without the effects among its parameters."""
+        if not self.effect_count:
+            return self
+        count = len(self.names) - self.effect_count
+        blocks = (replace(b, jacobian=b.jacobian[..., :count]) for b in self.blocks)
+        return replace(
+            self,
+            blocks=tuple(blocks),
+            names=self.names[:count],
+            prior_residual=self.prior_residual[:count],
+            prior_jacobian=self.prior_jacobian[:count],
+            at_bound=self.at_bound[:count],
+            effect_count=0,
+        )
 
     @property
     def chi_squared(self) -> float:

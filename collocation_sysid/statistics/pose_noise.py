@@ -23,7 +23,8 @@ from ..program.sweep import Sweep, SweepColumns
 from ..recording.grasp import Grasp
 from ..recording.poses import PoseSequence
 from .budget.consider_analysis import propagate_columns
-from .linearised import LinearisedFit
+from .linearised import LinearisedFit, linearise_fit
+from .uncertainty import AUTO, ErrorModel, Uncertainty, uncertainty_from_fit
 
 # Samples of D η.
 DRAWS = 200
@@ -211,3 +212,20 @@ def _interpolate(poses: PoseSequence, values: Array, t_s: Array) -> Array:
     kind = "previous" if poses.interpolation == "hold" else "linear"
     inside = np.clip(t_s, poses.t_s[0], poses.t_s[-1])
     return interp1d(poses.t_s, values, kind, axis=0)(inside)
+
+
+def uncertainty_at(
+    collocation: Collocation, z: Array, error_model: ErrorModel = AUTO
+) -> Uncertainty:
+    """Return the uncertainty of the parameters at the optimum z (variables,), with noise of the
+    poses.
+
+    Raises
+    ------
+    InputError
+        If the noise is to be estimated from fewer measurements than parameters.
+    SimulationError
+        If the equations of motion are singular.
+    """
+    fit, _ = with_pose_noise(linearise_fit(collocation, z), collocation, z=z)
+    return uncertainty_from_fit(fit, collocation.parameters, z[: collocation.nq], error_model)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from .budget.systematic_effects import DEVIATIONS
-from .budget.variance_sources import BETWEEN, MESH, NOISE, NUISANCES, NUMERICAL
 
 # One remedy per source of the budget, as an imperative phrase that ends a sentence.
 REMEDIES: Mapping[str, str] = {
     **{name: row.remedy for name, row in DEVIATIONS.items() if row.remedy},
-    NOISE: "record longer, more often, or a motion or test that depends more on this parameter",
-    NUISANCES: "measure clocks, marker positions and the grip, or the area and unloaded length of "
-    "a specimen, and state tighter priors",
-    NUMERICAL: "raise transcription.substeps, or run refine",
-    MESH: "solve on a finer mesh, or run refine",
-    BETWEEN: "find out what differs between the recordings, such as temperature or clamping",
+    "noise": "record longer, more often, or a motion or test that depends more on this parameter",
+    "nuisance parameters": "measure clocks, marker positions and the grip, or the area and "
+    "unloaded length of a specimen, and state tighter priors",
+    "step and mesh": "raise transcription.substeps, or run refine",
+    "between recordings": "find out what differs between the recordings, such as temperature or clamping",
 }
 
 

@@ -1,8 +1,8 @@
 """Thresholds of all tests of a fit: each number with its reason, and its study.
 
-A test decides by one of these numbers: the verdict (`assessment`), the probes of assumptions
-(`probes`), and the refits of likely mistakes (package `judge`). Limits of effort, and ranges of
-what is physically possible, stand where they are used.
+A test decides by one of these numbers: the verdict (`assessment`), the effects of the budget
+(`effect_estimates`), and the refits of likely mistakes (package `judge`). Limits of effort, and
+ranges of what is physically possible, stand where they are used.
 """
 
 from __future__ import annotations
@@ -124,50 +124,11 @@ NOISE = Threshold(
     "RMS residual over σ up to which residuals count as noise, whatever their correlation.",
     study="verdict_reliability",
 )
-SUFFICIENT = Threshold(
-    0.5,
-    "Least share of what exceeds χ² of noise that an assumption explains, if the rest is not "
-    "noise.",
-    study="verdict_reliability",
-)
-RETURN = Threshold(
-    0.02,
-    "Share of the range of the load by which it may return in a static recording that still "
-    "counts as monotonic: measured displacements scatter.",
-    study="specimens",
-)
-RELEVANT = Threshold(
-    0.5,
-    "Least change of an estimate that is relevant, in half widths of its combined interval, "
-    "which is the one to publish: with the deviations of real bodies and laboratories every "
-    "assumption is violated a little, and the interval contains that. Memory left out changes "
-    "E by two half widths and more.",
-    study="verdict_reliability",
-)
-WIDENING_OF_FIELDS = Threshold(
-    100.0,
-    "Factor on the standard deviations of the coefficients of fields for which a probe must "
-    "be significant, too: hardly anything is smoothed then, and what the data do not "
-    "determine stays bounded.",
-    study="field_recovery",
-)
 CHANCE = Threshold(
     0.01,
-    "Probability that a faultless run has any significant probe, beside those of every solve, or "
+    "Probability that a faultless run has any effect of the budget that is not expected, or "
     "residuals that are larger than noise.",
     study="verdict_reliability",
-)
-GRANTED = Threshold(
-    3.0,
-    "Deviation of an assumption that is probed in every solve, in standard deviations of the "
-    "budget, up to which it is within the budget.",
-    study="laboratory",
-)
-DETERMINED = Threshold(
-    1 / 3,
-    "Standard error of a ruler over its deviation in the budget, with the whole budget relaxed, up to "
-    "which it is estimated. The prior then has a tenth of the information.",
-    study="contact_accuracy",
 )
 BETTER = Threshold(
     1.5,

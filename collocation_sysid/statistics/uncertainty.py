@@ -12,7 +12,7 @@ differ each has its own variance (see `noise_level`); intervals are then Student
 the residuals correlated, in time or among markers, Cov(e) is that of `autocorrelation`. The output
 states which was used.
 
-Use `curved_intervals.uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised
+Use `pose_noise.uncertainty_at` at a solution, or `uncertainty_from_fit` where the linearised
 fit is known. Estimated marker places have error bars too, see `marker_places`.
 """
 
@@ -220,8 +220,12 @@ def uncertainty_from_fit(
             "(sigma_m) and noise = 'given'"
         )
     covariance, determined, of_noise, basis = _error_bars(fit, factored, requested=error_model)
+    of_effects = factored.fit.root @ factored.fit.root[len(fit.names) - fit.effect_count :].T
+    of_effects[fit.shared_count :] = 0.0  # nuisance parameters and effects keep the complete one
+    of_effects = of_effects @ of_effects.T
+    covariance, determined = covariance - of_effects, determined - of_effects
     of_all, bounded = _reported_covariance(covariance, fit, parameters=parameters, q=q)
-    scatter = _compare_recordings(fit, parameters, q=q, errors=error_model)
+    scatter = _compare_recordings(fit.with_known_effects, parameters, q=q, errors=error_model)
     of_q, quantiles, widening = _widen_by_scatter(of_all[:shared, :shared], of_noise, scatter)
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles

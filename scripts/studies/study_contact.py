@@ -27,7 +27,7 @@ import collocation_sysid as cs
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.contact.force import contact_terms
 from collocation_sysid.recording.obstacle_solids import Solid
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 # True constants of the block.
 YOUNG_PA = 1e4

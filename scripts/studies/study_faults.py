@@ -29,7 +29,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import solve
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Nuisance, PoseSequence
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 from collocation_sysid.statistics.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]

@@ -22,8 +22,8 @@ from synthetic import swing
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 Array = NDArray[np.float64]
 # Edges of the block and of its elements [m].

@@ -31,7 +31,7 @@ from script_arguments import make_parser
 from study_independent_twins import compare, line, table
 
 import collocation_sysid as cs
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.1}
 GUESSES = {"young_pa": 1e5, "poisson": 0.4, "gamma_r_s": 4e-3, "gamma_m_1_s": 0.2}

@@ -23,7 +23,7 @@ from script_arguments import make_parser
 from collocation_sysid import Nuisance, Problem, SimulationError, Solution, simulate, solve
 from collocation_sysid.recording import Experiment
 from collocation_sysid.runs.warm_start import WarmStart
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 from collocation_sysid.statistics.uncertainty import Uncertainty
 
 # Duration at the end of a recording over which the final travel is averaged [s]: two oscillations.

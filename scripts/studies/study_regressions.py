@@ -36,7 +36,7 @@ from studies import markdown
 from collocation_sysid.common.array_types import Array
 from collocation_sysid.program.least_squares import SquareRootInformation
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.probes.profile_likelihood import THRESHOLD, profile_of_solution
+from collocation_sysid.statistics.profile_likelihood import THRESHOLD, profile_of_solution
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 LEVELS = ("Lower", "Average", "Higher")

@@ -26,12 +26,11 @@ from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
-from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
-from collocation_sysid.statistics.budget.variance_sources import source_label
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, source_label
 from collocation_sysid.statistics.concerns import TOPICS, Concern
 from collocation_sysid.statistics.remedies import REMEDIES
 
-CONCERNS = (Concern("residuals/persist"), Concern("scheme/step"), Concern("solve/no-start"))
+CONCERNS = (Concern("residuals/persist"), Concern("scheme/damping"), Concern("solve/no-start"))
 
 
 def test_topics_are_listed_with_a_line_each():
@@ -206,7 +205,10 @@ def test_every_word_that_a_solve_prints_is_explained(tmp_path, kind: str):
     assert len(tables) > 1
     words = {cell for table in tables for cell in table.heads} - {"", "value"}
     rows = [row[0] for table in tables for row in table.rows]
-    words |= {re.sub(r" (Pa|kPa|MPa|GPa|s|1/s)$", "", row) for row in rows}
+    words |= {
+        re.sub(r"(°| (Pa|kPa|MPa|GPa|s|1/s|%|mm|ms|g|mN m|px|1/m²|m/N|1/K))$", "", row)
+        for row in rows
+    }
     for each in found.result.fit.experiments.values():
         words |= {re.sub(r"\d+ ", "", re.split("[:,]", note)[0]) for note in each.notes}
     for each in found.result.nuisance.values():

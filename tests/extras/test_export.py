@@ -69,6 +69,8 @@ OTHERS = {"gamma_r_s": 0.002, "gamma_m_1_s": 0.0}
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export")
     problem = write_problem(folder, {"swing": 8})
+    with problem.open("a", encoding="utf-8") as file:  # simulated on this mesh
+        file.write('\n[uncertainty]\nassumptions = "none"\n')
     assert (
         run_command(
             "solve", problem, "--out", folder / "run", "-q", "--method", "reduced-space"

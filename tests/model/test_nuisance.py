@@ -33,7 +33,7 @@ from collocation_sysid.program.markers.association import MarkerAssociation
 from collocation_sysid.program.measurement_models import first_association
 from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 ONE_OF_EACH = {
     "place": Nuisance.none(marker_offset_m=0.003),

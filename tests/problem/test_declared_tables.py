@@ -55,8 +55,13 @@ def test_assumptions_have_a_field_for_each_row():
 
 
 BY_ORIGIN = {row.name for row in ASSUMPTIONS if row.by_origin}
-REPORTED = {"platen_stick", "section"}  # by default only as an alternative, outside the intervals
-ONE_SIDED = {"grip_layer_m", "machine_compliance_m_n", "marker_mass_kg", "specimen_sticking"}
+ONE_SIDED = {
+    "grip_layer_m",
+    "machine_compliance_m_n",
+    "marker_mass_kg",
+    "memory_share",
+    "specimen_sticking",
+}
 
 
 def test_defaults_by_origin_name_ways_of_making_a_body_or_origins_of_its_mesh():
@@ -70,8 +75,7 @@ def test_only_effects_of_known_sign_have_a_mean():
     forms = get_type_hints(Assumptions, include_extras=True)
     for field in fields(Assumptions):
         known = field.name in ONE_SIDED
-        is_open = field.name in BY_ORIGIN or field.name in REPORTED
-        usual = Deviated | None if is_open else Deviated
+        usual = Deviated | None if field.name in BY_ORIGIN else Deviated
         assert forms[field.name] == (KnownDeviation if known else usual)
 
 

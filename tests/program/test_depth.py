@@ -36,7 +36,7 @@ from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.sources.depth_files import read_depth
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 
 @pytest.mark.long

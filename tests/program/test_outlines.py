@@ -36,7 +36,7 @@ from collocation_sysid.methods.solution import Solution
 from collocation_sysid.program.observables import ObservableDerivatives
 from collocation_sysid.result.pictures.album import experiment_pictures
 from collocation_sysid.result.replay import read_run
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 
 def residual_of(experiment: cs.Experiment) -> OutlinesResidual:

@@ -31,7 +31,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.lifted.collocation import with_lifted_variables
 from collocation_sysid.recording import Experiment, Markers, Nuisance
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 PLACES = {"marker_offset_m": "shared"}
 ELASTIC = Parameters(

@@ -15,7 +15,7 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.model.parameters import Parameters, Tied, Unknown
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.sweep import Sweep
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 
 def collocation_of(name: str) -> Collocation:

@@ -195,7 +195,9 @@ def test_concerns_name_their_remedy(run_folder: Path, tmp_path: Path):
     whole = Result.read(copy)
     data = {"name": "mu_pa", "change": "+3 %", "errors": 4.0}
     concerns = (
-        Concern("scheme/step", data=data),
+        Concern(
+            "scheme/damping", data=data | {"added": 0.1, "damping": 0.1, "experiment": "swing"}
+        ),
         Concern("information/bound", data=data | {"names": ["mu_pa"]}),
     )
     (copy / "result.json").write_text(

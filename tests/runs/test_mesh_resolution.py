@@ -10,14 +10,9 @@ import pytest
 
 import collocation_sysid as cs
 from collocation_sysid.runs.mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
-from collocation_sysid.statistics.budget.discretisation_error import (
-    DiscretisationError,
-    Refinement,
-    RefinementLevel,
-)
+from collocation_sysid.statistics.budget.discretisation_error import Refinement, RefinementLevel
 
 FOAM_CYLINDER = Path(__file__).parents[2] / "problems" / "foam_cylinder" / "problem.toml"
-ERROR = DiscretisationError(-0.1, None, 2.0, None, 1.0, None)
 LEVEL = RefinementLevel("mesh", 1, 1, 1, 1, 1.0, {})
 
 
@@ -30,27 +25,27 @@ def of_real_body() -> cs.Problem:
 
 
 def test_a_coarse_mesh_of_a_real_body_is_to_be_checked():
-    (concern,) = mesh_resolution_concerns(of_real_body(), None)
+    (concern,) = mesh_resolution_concerns(of_real_body(), None, {})
     assert (concern.code, concern.grade) == ("mesh/few", "check")
     assert "stiffness of a real body will be too low" in concern.message
     assert mesh_resolution_notes(of_real_body()) == []
 
 
 def test_a_declared_simulation_has_a_note_instead():
-    (concern,) = mesh_resolution_concerns(of_real_body(), None)
+    (concern,) = mesh_resolution_concerns(of_real_body(), None, {})
     exact = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
     for problem in (declared_simulated(), replace(of_real_body(), uncertainty=exact)):
-        assert mesh_resolution_concerns(problem, None) == []
+        assert mesh_resolution_concerns(problem, None, None) == []
         assert mesh_resolution_notes(problem) == [concern.message]
 
 
 def test_a_solve_on_a_finer_mesh_answers_the_concern():
     estimated = Refinement({}, ())
-    assert mesh_resolution_concerns(of_real_body(), estimated)
+    assert mesh_resolution_concerns(of_real_body(), estimated, {})
     step = Refinement({}, (replace(LEVEL, refined="step"),))
-    assert mesh_resolution_concerns(of_real_body(), step)
+    assert mesh_resolution_concerns(of_real_body(), step, {})
     measured = Refinement({}, (LEVEL,))
-    assert mesh_resolution_concerns(of_real_body(), measured) == []
+    assert mesh_resolution_concerns(of_real_body(), measured, {}) == []
 
 
 def test_averaged_dilatation_has_a_note_unless_the_mesh_error_is_unknown():
@@ -65,15 +60,12 @@ def test_averaged_dilatation_has_a_note_unless_the_mesh_error_is_unknown():
     problem = cs.Problem(
         [rebuilt], {"mu_pa": cs.Unknown(), "poisson": 0.3, "gamma_r_s": 0.0} | {"gamma_m_1_s": 0.0}
     )
-    assert mesh_resolution_concerns(problem, None) == []
-    (note,) = mesh_resolution_notes(problem)
-    known = Refinement({"mu_pa": replace(ERROR, estimated_mesh=-0.1)}, ())
-    assert mesh_resolution_concerns(problem, known) == []
-    assert mesh_resolution_notes(problem, known) == [note]
-    unknown = Refinement({"mu_pa": ERROR}, ())
-    (concern,) = mesh_resolution_concerns(problem, unknown)
+    known = {"mu_pa": -0.1}
+    assert mesh_resolution_concerns(problem, None, known) == []
+    (note,) = mesh_resolution_notes(problem, known)
+    (concern,) = mesh_resolution_concerns(problem, None, None)
     assert concern.message == note
-    assert mesh_resolution_notes(problem, unknown) == []
+    assert mesh_resolution_notes(problem) == []
     assert "stiffness of a real body will be too high" in note
 
 
@@ -81,7 +73,7 @@ def test_a_mesh_matters_only_to_estimated_moduli_of_fitted_bodies():
     problem = of_real_body()
     known = {"lambda_pa": 800.0, "mu_pa": 600.0, "gamma_m_1_s": 1.5}
     damping = cs.Problem(problem.experiments, {**known, "gamma_r_s": cs.Unknown()})
-    assert mesh_resolution_concerns(damping, None) == []
+    assert mesh_resolution_concerns(damping, None, None) == []
 
 
 @pytest.mark.long

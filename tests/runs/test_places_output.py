@@ -25,7 +25,7 @@ from collocation_sysid.methods.starts.initial_trajectories import initial_variab
 from collocation_sysid.result.pictures.meshes import mesh_picture
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.runs.warm_start import WarmStart
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 from collocation_sysid.statistics.uncertainty import MarkerPlace, marker_places
 
 PLACES_M = {"low": [0.0, 0.0, 0.0], "mid": [0.03, 0.02, 0.03], "side": [0.06, 0.06, 0.03]}

@@ -30,26 +30,17 @@ from collocation_sysid import (
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.combined_intervals import combine
-from collocation_sysid.statistics.budget.consider_analysis import (
-    changes_of_assumptions,
-    changes_of_nuisances,
-)
+from collocation_sysid.statistics.budget.consider_analysis import changes_of_nuisances
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
 from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     CONSIDERED,
     Assumptions,
-)
-from collocation_sysid.statistics.budget.variance_sources import (
-    VarianceSources,
-    rescaled,
     source_label,
 )
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
@@ -87,24 +78,26 @@ def test_without_systematic_effects_and_discretisation_error_both_intervals_agre
     exact = run(replace(problem(**NOTHING), rollout=RolloutOptions("scheme")), seek_causes=False)
     for name, line in exact.budget.items():
         assert line.combined95 == pytest.approx(exact.estimates[name].statistical95)
-        assert set(line.shares) <= {"noise", "nuisance parameters", "step and mesh"}
+        assert set(line.shares) <= {"noise", "nuisance parameters"}
 
 
 def assumed_deviation(solved: Run, name: str) -> float:
     """Standard deviation of the systematic effects on the logarithm."""
-    return solved.budget[name].systematic
+    return solved.posterior.systematic(name)
 
 
 def test_one_assumption_alone_has_its_own_variance(finished):
     heavy = run(problem(**NOTHING | {"mass": 0.05}), seek_causes=False)
     # Markers that swing tell moduli over density: E follows the mass.
-    assert assumed_deviation(heavy, "mu_pa") == pytest.approx(0.05, rel=1e-3)
-    assert max(heavy.budget["mu_pa"].shares, key=heavy.budget["mu_pa"].shares.get) == "mass"
+    line = heavy.budget["mu_pa"]
+    relative = line.combined_std_error / line.value
+    assert relative * np.sqrt(line.shares["mass"]) == pytest.approx(0.05, rel=1e-3)
+    assert next(iter(line.shares)) == "mass"
 
 
 def test_a_large_systematic_effect_stays_on_the_logarithmic_scale_of_its_parameter():
     airy = run(problem(1.2, **NOTHING | {"air_drag": 20.0}), seek_causes=False)
-    assert airy.budget["gamma_m_1_s"].systematic > 0.3
+    assert assumed_deviation(airy, "gamma_m_1_s") > 0.3
     low, high = airy.estimates["gamma_m_1_s"].combined95
     assert 0 < low < high
 
@@ -114,12 +107,13 @@ def test_a_parameter_with_an_interval_wider_than_its_value_is_not_determined():
     assert not airy.estimates["gamma_m_1_s"].is_determined
     assert airy.estimates["mu_pa"].is_determined
     limit = airy.result.limits["gamma_m_1_s"]
-    assert (limit.determined, limit.source) == (False, "air_drag")
-    assert limit.remedy == REMEDIES["air_drag"]
+    source = next(iter(airy.budget["gamma_m_1_s"].shares))
+    assert (limit.determined, limit.source) == (False, source)
+    assert limit.remedy == REMEDIES[source]
     assert "not determined" in airy.table()
-    assert f"to reduce air drag, {limit.remedy}" in plain_text(run_summary(airy.result))
-    # A wide interval contradicts nothing.
-    assert airy.trust.verdict == "good"
+    assert limit.remedy in plain_text(run_summary(airy.result))
+    # A wide interval contradicts nothing; the recording has no noise.
+    assert {concern.code for concern in airy.trust.concerns} <= {"noise/smaller"}
 
 
 def test_intervals_respect_the_bounds_of_their_parameter():
@@ -177,17 +171,6 @@ def test_every_assumption_has_a_key_a_default_and_words():
     assert set(Assumptions().collect_deviations()) == {row.name for row in CONSIDERED}
     assert all(row.description and source_label(row.name) for row in ASSUMPTIONS)
     assert source_label("grip_layer_m") == "grip layer"
-
-
-def test_sources_need_no_nuisance_parameters():
-    solution = solve(Problem([measured(hung_cube(12))], GUESS))
-    fit = linearise_fit(solution.collocation, solution.z)
-    changes = changes_of_assumptions(
-        solution.collocation, solution.z, Assumptions().collect_deviations()
-    )
-    known = uncertainty_at(solution.collocation, solution.z)
-    sources = VarianceSources.from_fit(fit, changes, GUESS, solution.q, known)
-    assert sources.noise_shares(np.eye(len(solution.q))[0]) == (1.0, 1.0)
 
 
 def swings(*gamma_r_s: float) -> Problem:
@@ -293,7 +276,7 @@ def fitted_block(made_with: str, fitted_with: str, **stated):
         pytest.param("rayleigh", "kelvin-voigt", marks=pytest.mark.long),
     ],
 )
-def test_the_constant_of_a_damping_law_has_a_note_and_moduli_a_wider_interval(
+def test_the_constant_is_that_of_the_stated_damping_law_and_moduli_have_a_wider_interval(
     made_with, fitted_with
 ):
     stated = {"damping_law": 1.0} if made_with != "rayleigh" else {"rayleigh_damping": 1.0}
@@ -302,13 +285,7 @@ def test_the_constant_of_a_damping_law_has_a_note_and_moduli_a_wider_interval(
     line = wrong.budget["gamma_r_s"]
     low, high = wrong.estimates["gamma_r_s"].statistical95
     assert not low < truth < high
-    assert not {"damping_law", "rayleigh_damping"} & set(line.shares)
-    (other,) = wrong.alternatives
-    assert other.condition == f"with the damping law {made_with}"
-    assert set(other.values) == {"gamma_r_s"}
-    far = abs(np.log(wrong.estimates["gamma_r_s"].value / truth))
-    assert abs(np.log(other.values["gamma_r_s"] / truth)) < 0.5 * far
-    assert f"{other.condition}: γ_r" in plain_text(run_summary(wrong.result))
+    assert all(line.shares.get(name, 0.0) < 1e-9 for name in stated)
     assert set(stated) <= set(wrong.budget["young_pa"].shares)
     assert wrong.budget["young_pa"].combined95[0] < BLOCK["young_pa"]
     assert wrong.budget["young_pa"].combined95[1] > BLOCK["young_pa"]
@@ -342,20 +319,3 @@ def test_a_problem_file_states_with_one_word_that_all_is_exact(tmp_path):
     assert read.uncertainty.assumptions == Assumptions.exact()
     with pytest.raises(InputError, match=r'found "exact"; expected a table, or "none"'):
         Problem.read(file, ['uncertainty.assumptions="exact"'])
-
-
-def test_another_damping_law_of_much_larger_forces_has_a_smaller_constant():
-    """Forces K f + e in place of f: with 1/K of the constant they agree, and e/K remains."""
-    parameters = Parameters.from_mapping({"young_pa": Unknown(1e4), "gamma_r_s": Unknown(1e-3)})
-    times, rest = 1e3, 500.0
-    young, gamma = rescaled(np.array([rest, 1 - times]), parameters, lambda n: n == "gamma_r_s")
-    assert np.exp(gamma) == pytest.approx(1 / times)
-    assert young == pytest.approx(rest / times)
-
-
-def test_forces_that_are_a_little_larger_change_the_estimates_as_to_first_order():
-    parameters = Parameters.from_mapping({"young_pa": Unknown(1e4), "gamma_r_s": Unknown(1e-3)})
-    step = np.array([1e-3, -1e-3])
-    np.testing.assert_allclose(
-        rescaled(step, parameters, lambda n: n == "gamma_r_s"), step, rtol=2e-3
-    )

@@ -1,4 +1,4 @@
-"""Errors of ordinary cameras in three modes: estimated, considered in the budget, tested."""
+"""Errors of ordinary cameras: estimated, or effects of the budget."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from kit.filmed import (
 from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
+from collocation_sysid.judge.posterior import Effects, Posterior
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.statistics.budget.consider_analysis import (
     changes_of_assumptions,
     changes_of_nuisances,
 )
+from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
+from collocation_sysid.statistics.budget.effect_estimates import effect_concerns
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
-from collocation_sysid.statistics.budget.variance_sources import estimate_changes
-from collocation_sysid.statistics.linearised import gauss_newton_step, linearise_fit
-from collocation_sysid.statistics.probes.relaxed_assumptions import SolvedFit, probed_changes
-from collocation_sysid.statistics.probes.routine import probed_deviations, routine_probes
+from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.uncertainty import AUTO
 
 SINCE_S = T_S - T_S[0]
@@ -104,25 +104,16 @@ def faultless() -> Solution:
     return solved(problem(seen_at(T_S)))
 
 
-def probed(solution: Solution) -> SolvedFit:
-    """A solution with the columns of all routine probes."""
+def effects_of(described: cs.Problem) -> Posterior:
+    """The posterior with the errors of cameras alone, which the data determine."""
+    solution = solved(described)
     collocation, z = solution.collocation, solution.z
-    deviations = probed_deviations(dict.fromkeys(Assumptions().collect_deviations()))
-    of_images = {name: s if name in SEEN else None for name, s in deviations.items()}
+    usual = Assumptions().collect_deviations()
+    of_images = {name: s if name in SEEN else None for name, s in usual.items()}
     changes = changes_of_assumptions(collocation, z, of_images)
+    effects = Effects.from_changes(changes, of_images, {}, {})
     fit = linearise_fit(collocation, z)
-    at = SolvedFit(
-        collocation,
-        z,
-        fit,
-        AUTO,
-        {},
-        {},
-        of_images,
-        probed_changes(collocation, z, of_images, changes),
-    )
-    known = at.uncertainty_of_refit(fit, at.read_parameters())
-    return replace(at, statistical={**known.estimates, **known.derived})
+    return Posterior.from_fit(fit, effects, collocation.parameters, solution.q, AUTO)
 
 
 @pytest.mark.long
@@ -152,30 +143,25 @@ def test_a_considered_error_of_a_camera_moves_the_estimate_as_a_camera_with_the_
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SEEN)
-def test_an_error_of_a_camera_is_tested_by_one_linear_step(name: str) -> None:
-    film, size, _ = SEEN[name]
-    at = probed(solved(problem(film(3 * size), seed=1)))
-    probes = {probe.name: probe for probe in routine_probes(at)}
-    assert set(probes) == set(SEEN)
-    probe = probes[name]
-    assert probe.sentences
-    assert probe.size == pytest.approx(3 * size, abs=4 * (probe.size_error or 0.0), rel=0.15)
+def test_the_posterior_is_corrected_for_an_error_of_a_camera(name: str) -> None:
+    film, _, _ = SEEN[name]
+    size = 2 * Assumptions().collect_deviations()[name]
+    found = effects_of(problem(film(size), seed=1))
+    first = found.parameters.values(found.start)["young_pa"]
+    estimate = found.reported("young_pa")
+    assert estimate.combined95 is not None
+    low, high = estimate.combined95
+    assert low < 1.5e5 < high
+    right = effects_of(problem(film(0.0), seed=1)).reported("young_pa").value
+    assert abs(estimate.value - right) <= abs(first - right) + 30.0
+    sum_of_squares = sum(each.surprise**2 for each in found.effect_estimates)
+    assert sum_of_squares > 1.0
 
 
 @pytest.mark.long
-def test_faultless_tracks_have_no_significant_error_of_the_camera() -> None:
-    at = probed(faultless())
-    rng = np.random.default_rng(3)
-    for _ in range(12):
-        noisy = [
-            replace(b, residual=rng.normal(size=b.residual.shape) * b.is_measured, misfit=None)
-            for b in at.fit.blocks
-        ]
-        fit = replace(at.fit, blocks=tuple(noisy))
-        fit = fit.after_step(gauss_newton_step(fit))
-        known = at.uncertainty_of_refit(fit, at.read_parameters())
-        here = replace(at, fit=fit, statistical={**known.estimates, **known.derived})
-        assert not any(probe.sentences for probe in routine_probes(here))
+def test_faultless_tracks_need_no_error_of_the_camera() -> None:
+    for seed in range(3):
+        assert effect_concerns(effects_of(problem(seen_at(T_S), seed=seed)).effect_estimates) == []
 
 
 def test_what_a_camera_states_is_not_considered_again() -> None:

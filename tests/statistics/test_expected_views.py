@@ -15,7 +15,7 @@ from collocation_sysid.methods.solve_recorder import initial_variables
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.runs import check
 from collocation_sysid.runs.expected_precision import expected_deviations, views_note
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 VISIBLE = {"front": [0, 3, 5], "top": [2, 4, 6]}
 

@@ -26,9 +26,9 @@ from collocation_sysid.runs.forward_simulation import simulate_experiment
 from collocation_sysid.runs.result_content import FieldResult
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_assumptions
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.field_estimates import FieldEstimate, field_estimates
 from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 SIZE_M, SIGMA_M, YOUNG_PA = (0.04, 0.04, 0.12), 1e-4, 4e3
 KNOWN = {"poisson": 0.3, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.1}

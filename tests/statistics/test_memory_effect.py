@@ -1,10 +1,9 @@
-"""Viscoelastic memory that a model lacks: its effect on the markers, and its probe in every solve."""
+"""Viscoelastic memory that a model lacks: its effect on the markers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -17,20 +16,18 @@ from collocation_sysid import (
     Experiment,
     Grasp,
     Nuisance,
-    Problem,
     Region,
-    Run,
-    UncertaintyOptions,
     Unknown,
-    run,
     simulate,
-    with_markers,
 )
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.memory_effect import is_distinguishable, supports_memory
-from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, Assumptions
-from collocation_sysid.statistics.budget.variance_sources import source_label
+from collocation_sysid.statistics.budget.systematic_effects import (
+    ASSUMPTIONS,
+    Assumptions,
+    source_label,
+)
 
 VALUES = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 1.0}
 TAU_S = 0.1
@@ -39,7 +36,6 @@ NAME = f"memory_share τ={TAU_S:g}s"
 # Share of the simulated memory, small enough for a linear effect.
 SMALL_SHARE = 1e-4
 SMALL_MEMORY = {"b.share": SMALL_SHARE, "b.tau_s": TAU_S}
-NOISE_M = 2e-4
 
 
 def swung(samples: int = 24, **options) -> Experiment:
@@ -137,53 +133,3 @@ def test_a_recording_shows_times_between_its_sampling_and_its_duration(tau_s, is
 def test_memory_is_in_the_budget_only_if_stated():
     assert Assumptions().memory_share == "none"
     assert source_label(NAME) == "memory share (τ = 0.1 s)"
-
-
-# Whole solves -------------------------------------------------------------------------------------
-
-
-@cache
-def solved(share: float, models_memory: bool = False) -> Run:
-    """Answer for a swung cube with a branch of memory, described with or without it."""
-    remembering = swung(80, prony=["branch"])
-    memory = {"branch.share": share, "branch.tau_s": TAU_S}
-    exact_m = tracks_m(remembering, VALUES | memory, "midpoint")
-    noise_m = np.random.default_rng(1).normal(scale=NOISE_M, size=exact_m.shape)
-    described = remembering if models_memory else swung(80)
-    sigma_m = np.full(exact_m.shape[1], NOISE_M)
-    described = replace(described, markers=replace(described.markers, sigma_m=sigma_m))
-    names = (*VALUES, *memory) if models_memory else tuple(VALUES)
-    problem = Problem(
-        [with_markers(described, exact_m + noise_m)],
-        {name: Unknown() for name in names},
-        substeps=1,
-        scheme="midpoint",
-        uncertainty=UncertaintyOptions(assumptions=Assumptions.exact()),
-    )
-    return run(problem, seek_causes=False)
-
-
-@pytest.mark.long
-def test_memory_that_the_model_lacks_is_reported_with_a_better_modulus():
-    finished = solved(0.3)
-    truth_pa = VALUES["young_pa"]
-    assert finished.estimates["young_pa"].value > 1.15 * truth_pa
-    assert finished.trust.verdict == "check"
-    (concern,) = (c for c in finished.trust.concerns if c.topic == "assumption")
-    assert "the material has no viscoelastic memory" in concern.message
-    assert "[[object.prony]]" in concern.message
-    best = max(finished.probes, key=lambda probe: probe.chi_squared)
-    assert best.name.startswith("memory_share")
-    # The estimate of the probe is of first order in the share, and better than the one without.
-    assert best.moves["young_pa"].value == pytest.approx(truth_pa, rel=0.1)
-
-
-@pytest.mark.long
-def test_a_material_without_memory_and_a_model_with_memory_give_no_alarm():
-    without = solved(0.0)
-    assert not any(probe.sentences for probe in without.probes)
-    assert not any(c.topic == "assumption" for c in without.trust.concerns)
-    modelled = solved(0.3, models_memory=True)
-    names = [probe.name for probe in modelled.probes]
-    assert not any(name.startswith("memory_share") for name in names)
-    assert not any(probe.sentences for probe in modelled.probes)

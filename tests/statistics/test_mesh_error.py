@@ -13,17 +13,21 @@ from kit.problems import measured, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.judge.engine import find_misspecifications
+from collocation_sysid.judge.posterior import Effects, Posterior
 from collocation_sysid.methods.solve_recorder import initial_variables
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.runs import mesh_resolution
-from collocation_sysid.runs.mesh_resolution import estimate_mesh_error, mesh_resolution_concerns
+from collocation_sysid.runs.mesh_resolution import mesh_changes, mesh_resolution_concerns
 from collocation_sysid.runs.numerical_error import finer_mesh
 from collocation_sysid.runs.solving import solve
 from collocation_sysid.statistics.budget import mesh_error
-from collocation_sysid.statistics.budget.discretisation_error import Refinement, with_estimated_mesh
-from collocation_sysid.statistics.budget.mesh_error import mesh_change
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
-from collocation_sysid.statistics.estimates import Estimate
+from collocation_sysid.statistics.budget.consider_analysis import ResidualChanges
+from collocation_sysid.statistics.budget.discretisation_error import (
+    MESH_ORDER,
+    estimate_changes,
+    extrapolated,
+)
+from collocation_sysid.statistics.budget.mesh_error import mesh_residual_changes
 from collocation_sysid.statistics.linearised import linearise_fit, parameter_values
 from collocation_sysid.statistics.uncertainty import ErrorModel
 
@@ -77,12 +81,18 @@ def coarse_problem(element: str, poisson: float = TRUTH["poisson"]) -> cs.Proble
     return replace(problem, experiments=[measured])
 
 
+def mesh_change(solution: cs.Solution) -> np.ndarray:
+    """Change of q with half the edge lengths, to first order."""
+    fit = linearise_fit(solution.collocation, solution.z)
+    changes = mesh_residual_changes(solution.collocation, solution.z)
+    return estimate_changes(fit, changes)[: len(solution.q), 0]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("element", "least", "most"), [("tet4", 0.6, 1.0), ("tet10", 0.7, 1.5)])
 def test_estimated_change_is_nearly_that_of_a_solve_on_the_finer_mesh(element, least, most):
     solution = solve(coarse_problem(element))
-    fit = linearise_fit(solution.collocation, solution.z)
-    change = mesh_change(solution.collocation, solution.z, fit)
+    change = mesh_change(solution)
     before = solution.parameters["young_pa"]
     after = parameter_values(solution.collocation, solution.q + change)["young_pa"]
     assert abs(before / TRUTH["young_pa"] - 1) > 0.04
@@ -93,8 +103,7 @@ def test_estimated_change_is_nearly_that_of_a_solve_on_the_finer_mesh(element, l
 @pytest.mark.parametrize("poisson", [0.45, 0.49, 0.4999])
 def test_estimated_change_of_a_nearly_incompressible_body_is_as_small_as_the_true_one(poisson):
     solution = solve(coarse_problem("tet10-p0", poisson))
-    fit = linearise_fit(solution.collocation, solution.z)
-    change = mesh_change(solution.collocation, solution.z, fit)
+    change = mesh_change(solution)
     before = solution.parameters["young_pa"]
     after = parameter_values(solution.collocation, solution.q + change)["young_pa"]
     needed = np.log(TRUTH["young_pa"] / before)
@@ -103,24 +112,30 @@ def test_estimated_change_of_a_nearly_incompressible_body_is_as_small_as_the_tru
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("element", ["tet10", "tet10-p0"])
-def test_intervals_contain_the_error_of_the_mesh(element):
+@pytest.mark.parametrize("element", ["tet4", "tet10", "tet10-p0"])
+def test_the_posterior_is_nearer_to_the_truth_and_contains_the_error_of_the_mesh(element):
     problem = coarse_problem(element)
     solution = solve(problem)
-    independent = ErrorModel(errors="independent")
-    known = uncertainty_at(solution.collocation, solution.z, independent).estimates
+    parameters = solution.collocation.parameters
     fit = linearise_fit(solution.collocation, solution.z)
-    refinement, note = estimate_mesh_error(problem, solution, fit, known, None)
+    changes, by_mesh, note = mesh_changes(problem, solution, fit)
     assert not note
-    assert refinement is not None
+    assert by_mesh is not None
+    nothing = ResidualChanges((), [each[..., :0] for each in changes])
+    of_mesh = {"mesh": [extrapolated(each, MESH_ORDER) for each in changes]}
+    effects = Effects.from_changes(nothing, {}, {}, of_mesh)
+    independent = ErrorModel(errors="independent")
+    found = Posterior.from_fit(fit, effects, parameters, solution.q, independent)
+    (of_row,) = found.effect_estimates
+    assert (of_row.name, of_row.mean, of_row.deviation) == ("mesh", 1.0, 0.5)
     for name in ("young_pa", "poisson"):
-        error = refinement.errors[name]
-        assert error.extrapolated == known[name].value  # not corrected
-        low, high = error.interval95
+        optimum, estimate = solution.parameters[name], found.reported(name)
+        assert abs(estimate.value - TRUTH[name]) < abs(optimum - TRUTH[name])
+        assert estimate.combined95 is not None
+        low, high = estimate.combined95
         assert low < TRUTH[name] < high
-    if element == "tet10":
-        low, high = known["poisson"].statistical95
-        assert not low < TRUTH["poisson"] < high
+    shares = found.budget["young_pa"].shares
+    assert shares["mesh"] > 0
 
 
 @pytest.mark.long
@@ -131,8 +146,7 @@ def test_a_body_with_memory_has_a_mesh_error():
     measured = with_wrenches(cs.with_markers(experiment, truth.markers_m), truth.wrenches)
     problem = cs.Problem([measured], constants | {"young_pa": cs.Unknown(14e3)})
     solution = solve(problem)
-    fit = linearise_fit(solution.collocation, solution.z)
-    change = mesh_change(solution.collocation, solution.z, fit)
+    change = mesh_change(solution)
     after = parameter_values(solution.collocation, solution.q + change)["young_pa"]
     assert 1.02 < after / TRUTH["young_pa"] < 1.3  # a finer mesh needs a stiffer material
 
@@ -143,7 +157,7 @@ def test_recordings_that_are_declared_to_be_simulated_have_no_mesh_error():
     problem = replace(coarse_problem("tet10"), uncertainty=exact)
     solution = solve(problem)
     fit = linearise_fit(solution.collocation, solution.z)
-    assert estimate_mesh_error(problem, solution, fit, {}, None) == (None, "")
+    assert mesh_changes(problem, solution, fit) == ((), None, "")
 
 
 def shaken_bar(element: str) -> cs.Experiment:
@@ -183,38 +197,18 @@ def test_a_mesh_that_is_too_coarse_for_the_noise_is_the_cause_of_the_misfit(elem
     assert 'set object.element = "tet10"' in cause.message
 
 
-def estimated(halved: float, least_order: float = 1.0) -> Refinement:
-    """The error of a modulus of 100 Pa that is `halved` with half the edge lengths."""
-    answer = {"mu_pa": Estimate(100.0, 0.5, (99.0, 101.0))}
-    return with_estimated_mesh(
-        None, answer, {"mu_pa": halved}, least_order=least_order, linear=frozenset()
-    )
-
-
-def test_interval_is_widened_towards_the_finest_mesh():
-    low, high = estimated(110.0).errors["mu_pa"].interval95
-    assert low == pytest.approx(99.0, rel=1e-3)
-    assert high == pytest.approx(121.0, rel=1e-2)  # twice the change
-    assert estimated(110.0, least_order=0.5).errors["mu_pa"].interval95[1] > 135.0
-    low, high = estimated(100.0 / 1.1).errors["mu_pa"].interval95
-    assert (low, high) == (pytest.approx(100.0 / 1.21, rel=1e-2), pytest.approx(101.0, rel=1e-3))
-
-
-def test_change_too_large_for_first_order_widens_both_sides_and_is_a_concern():
-    refinement = estimated(300.0)
-    low, high = refinement.errors["mu_pa"].interval95
-    assert low * high == pytest.approx(1e4)
+def test_a_change_by_more_than_half_is_a_concern():
     experiments = coarse_problem("tet10").experiments
     damping = {name: value for name, value in TRUTH.items() if name.startswith("gamma")}
     problem = cs.Problem(experiments, damping | {"mu_pa": cs.Unknown(100.0), "lambda_pa": 200.0})
-    assert mesh_resolution_concerns(problem, estimated(110.0)) == []
-    assert mesh_resolution_concerns(cs.Problem(experiments, {**GUESS}), refinement) == []
-    (concern,) = mesh_resolution_concerns(problem, refinement)
+    assert mesh_resolution_concerns(problem, None, {"mu_pa": 0.1}) == []
+    assert mesh_resolution_concerns(cs.Problem(experiments, {**GUESS}), None, {"mu_pa": 2.0}) == []
+    (concern,) = mesh_resolution_concerns(problem, None, {"mu_pa": -0.6})
     assert (concern.code, concern.grade) == ("mesh/error", "check")
     assert "mu_pa would change by more than half" in concern.message
     unknown = cs.Unknown(100.0, scale="linear")  # it may pass through zero
     linear = cs.Problem(experiments, damping | {"mu_pa": unknown, "lambda_pa": 200.0})
-    assert mesh_resolution_concerns(linear, refinement) == []
+    assert mesh_resolution_concerns(linear, None, {"mu_pa": 2.0}) == []
 
 
 @pytest.mark.long
@@ -222,9 +216,11 @@ def test_moduli_that_would_change_sign_are_a_note(monkeypatch):
     problem = coarse_problem("tet10")
     solution = solve(problem)
     fit = linearise_fit(solution.collocation, solution.z)
-    monkeypatch.setattr(mesh_resolution, "mesh_change", lambda *_: np.array([5.0, 0.0]))
-    refinement, note = estimate_mesh_error(problem, solution, fit, {}, None)
-    assert refinement is None
+    large = np.zeros((len(fit.names), 1))
+    large[0] = 5.0
+    monkeypatch.setattr(mesh_resolution, "estimate_changes", lambda *_: large)
+    _, by_mesh, note = mesh_changes(problem, solution, fit)
+    assert by_mesh is None
     assert "mu_pa would change by more than half" in note
     assert "`refine`" in note
 
@@ -235,8 +231,8 @@ def test_intervals_in_contact_are_stated_to_contain_no_error_of_the_mesh():
     z, _ = initial_variables(collocation)
     solution = SimpleNamespace(collocation=collocation, z=z, q=z[: collocation.nq])
     fit = linearise_fit(collocation, z)
-    refinement, note = estimate_mesh_error(problem, solution, fit, {}, None)
-    assert refinement is None
+    _, by_mesh, note = mesh_changes(problem, solution, fit)
+    assert by_mesh is None
     assert note == (
         "the intervals contain no error of the mesh: obstacles touch the body; `refine` measures it"
     )
@@ -264,11 +260,10 @@ def test_a_motion_of_close_samples_has_the_error_of_a_part_of_the_samples(monkey
         swing, cs.simulate(swing, constants, "midpoint", substeps=1).markers_m
     )
     solution = solve(cs.Problem([measured], constants | {"young_pa": cs.Unknown(3e4)}))
-    fit = linearise_fit(solution.collocation, solution.z)
-    of_part = mesh_change(solution.collocation, solution.z, fit)
+    of_part = mesh_change(solution)
     monkeypatch.setattr(mesh_error, "ROW_DISTANCES", ())
     # Another program: the changes of the last answer of a program are known.
-    of_all = mesh_change(replace(solution.collocation), solution.z, fit)
+    of_all = mesh_change(replace(solution, collocation=replace(solution.collocation)))
     assert abs(of_all[0]) > 0.05
     assert of_part[0] != of_all[0]
     np.testing.assert_allclose(of_part, of_all, rtol=0.005)

@@ -183,18 +183,6 @@ def test_sticking_faces_change_the_load_of_sliding_faces_as_in_a_simulation():
     np.testing.assert_allclose(change_n[1:], expected_n[1:], rtol=0.02)
 
 
-def test_an_answer_with_sliding_platens_states_the_modulus_with_sticking_platens():
-    """Faces that stuck, described as sliding: the residuals are small, and E is too large."""
-    stuck = with_loads(bench(block("z")), bench(block("xyz")))
-    fitted = solved(stuck)
-    assert fitted.trust.verdict != "doubtful"
-    assert fitted.estimates["young_pa"].value > 1.1 * YOUNG_PA
-    (sticking,) = (each for each in fitted.alternatives if each.assumption == "platen_stick")
-    assert abs(sticking.values["young_pa"] / YOUNG_PA - 1) < 0.05
-    text = str(run_summary(fitted.result))
-    assert "if the faces stuck to the platens" in text
-
-
 def at_answer(experiment: Experiment) -> tuple[Collocation, np.ndarray]:
     values = {"young_pa": YOUNG_PA, **STATED}
     parameters = Parameters.from_mapping(values | {"young_pa": Unknown(YOUNG_PA, 10.0, 1e6)})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.statistics.probes.profile_likelihood import THRESHOLD, compute_profile
+from collocation_sysid.statistics.profile_likelihood import THRESHOLD, compute_profile
 
 BOUNDS = (1.0, 1e6)
 BEST = 1000.0

@@ -114,7 +114,7 @@ def test_a_mass_sets_the_scale_and_the_density_is_found_without_a_note():
     found = problem(OPEN, masses=[PointMass(tip(cube), 0.01)])
     finished = run(found, seek_causes=False)
     assert not any("ratios" in said for said in (*found.notes, *finished.trust.reasons))
-    assert finished.parameters["density_kg_m3"] == pytest.approx(30.0, rel=0.05)
+    assert finished.solution.parameters["density_kg_m3"] == pytest.approx(30.0, rel=0.05)
     assert np.isfinite(finished.std_error("density_kg_m3"))
 
 

@@ -72,19 +72,6 @@ def fitted(shape: str, is_weighed: bool, pull: bool = False) -> cs.Run:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("pull", [False, True])
-def test_what_cannot_be_seen_is_said(pull):
-    """A weighed rod fits with either section: the answer has the modulus of the other one."""
-    run = fitted("square", True, pull)
-    assert run.parameters["young_pa"] < 0.85 * TRUTH["young_pa"]
-    (other,) = (each for each in run.alternatives if each.assumption == "section")
-    assert "round" in other.condition
-    # The inscribed polygon is smaller than the circle.
-    assert other.values["young_pa"] == pytest.approx(TRUTH["young_pa"], rel=0.12)
-    assert "if the section of the body is round" in str(run)
-
-
-@pytest.mark.long
 def test_a_weight_that_contradicts_the_section_is_named():
     run = fitted("square", False)
     assert run.trust.verdict == "doubtful"

@@ -76,9 +76,9 @@ def test_a_high_specimen_and_a_foam_depend_little_on_the_platens():
 
     exact = {"specimen_sticking": "none"}
     high = {"length_m": 0.05, "area_m2": AREA_M2}
-    assert half_width(solved(1e6 * STRAIN, **high)) < 1.15 * half_width(
-        solved(1e6 * STRAIN, stated=exact, **high)
-    )
+    # The shape factor is 0.12: faces that stick make it 1 + 2 S², or 3 %, stiffer.
+    alone = half_width(solved(1e6 * STRAIN, stated=exact, **high))
+    assert half_width(solved(1e6 * STRAIN, **high)) < np.hypot(alone, 1.96 * 0.03)
     assert half_width(solved(1e6 * STRAIN, poisson=0.0)) == pytest.approx(
         half_width(solved(1e6 * STRAIN, poisson=0.0, stated=exact))
     )

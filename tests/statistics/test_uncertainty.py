@@ -28,9 +28,9 @@ from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.program.transcription import Transcription
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
 from collocation_sysid.statistics.estimates import IntervalCoordinate
 from collocation_sysid.statistics.linearised import linearise_fit, observable_responses
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit
 
 AT_TRUTH = GUESS.with_guess(TRUTH)

@@ -20,7 +20,7 @@ from collocation_sysid.pipeline import Run
 from collocation_sysid.program.wrench_residual import without_grasp_sensors
 from collocation_sysid.recording import Nuisance
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.curved_intervals import uncertainty_at
+from collocation_sysid.statistics.pose_noise import uncertainty_at
 from collocation_sysid.statistics.uncertainty import ErrorModel, Uncertainty
 
 PROBLEMS = Path(__file__).parents[2] / "problems"

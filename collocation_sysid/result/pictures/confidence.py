@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 
 from ...common.array_types import Array
 from ...fem.laws.constants import symbol_of
+from ...judge.posterior import main_sources
 from ...runs.result_content import Result
 from ...statistics.budget.combined_intervals import NORMAL_95
-from ...statistics.budget.variance_sources import main_sources, source_label
+from ...statistics.budget.systematic_effects import source_label
 from ...statistics.combinations import WIDE, Direction
 from ...statistics.distributions import chi2_isf, normal_isf
 from ...statistics.estimates import correlation_from_covariance

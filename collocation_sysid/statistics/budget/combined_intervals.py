@@ -29,8 +29,8 @@ Interval = tuple[float, float]
 class ReportedEstimate(Estimate):
     """A parameter or derived modulus as it is reported; derived moduli have no `guess`.
 
-    `value` is corrected for the known discretisation error and for known effects, and
-    `statistical95` is centred on it.
+    `value` is that of the posterior, or the one extrapolated by a refinement, and `statistical95`
+    is centred on it.
     """
 
     # Standard uncertainty due to noise, discretisation and systematic effects; None if the quantity
@@ -43,12 +43,10 @@ class ReportedEstimate(Estimate):
     # Standard deviation of the systematic effects in the coordinate of the estimate, see
     # `statistics.budget.variance_sources`.
     systematic: float | None = None
-    # Correction for known effects, such as the compliance of a machine, in the coordinate of the
-    # estimate; None if there is none.
+    # Change of the value by the effects of the budget, in the same coordinate. `systematic` and
+    # `known_effect` do not contain step and mesh, whose error a refinement measures.
     known_effect: float | None = optional()
-    # The same correction as part of `value`; None if there is none.
-    known_correction: float | None = optional()
-    numerical_error: DiscretisationError | None = None  # discretisation error as far as it is known
+    numerical_error: DiscretisationError | None = None  # measured by a refinement
     guess: float | None = optional()  # initial guess
     # Whether the parameter was not estimated, or followed another one.
     fixed: bool | None = optional()
@@ -161,19 +159,18 @@ def combine(
     centre = optimum if error is None else at.from_value(error.extrapolated)
     centre += known_effect
     value = _clip(bounds, at.to_value(centre)) if is_corrected else estimate.value
-    correction = at.to_value(centre) - at.to_value(centre - known_effect) if known_effect else None
     spread = estimate.statistical_std_error
     if spread is not None:
         spread *= at.derivative(estimate.value) / at.derivative(at.to_value(centre))
     if estimate.statistical95 is None:
-        return reported(value, spread, known_correction=correction)
+        return reported(value, spread)
     low, high = (at.from_value(end) + centre - optimum for end in estimate.statistical95)
     statistical95 = _interval(at, low, high=high, bounds=bounds)
     if not is_corrected:
         least, most = estimate.statistical95
         statistical95 = _clip(bounds, least), _clip(bounds, most)
     if systematic is None:
-        return reported(value, spread, statistical95, known_correction=correction)
+        return reported(value, spread, statistical95)
     if error is not None and error.interval95 is not None:
         low, high = map(at.from_value, error.interval95)
         low = low + known_effect
@@ -182,12 +179,7 @@ def combine(
     combined95 = _interval(at, low, high=high, bounds=bounds)
     deviation = (high - low) / 2 / NORMAL_95 / at.derivative(at.to_value(centre))
     return reported(
-        value,
-        spread,
-        statistical95,
-        combined_std_error=deviation,
-        combined95=combined95,
-        known_correction=correction,
+        value, spread, statistical95, combined_std_error=deviation, combined95=combined95
     )
 
 

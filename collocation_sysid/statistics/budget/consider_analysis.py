@@ -8,7 +8,7 @@ ones, in the same program with them among its parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from ...program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, Swee
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
-from ..linearised import LinearisedFit, linearise_fit
+from ..linearised import linearise_fit
 from .systematic_effects import ASSUMPTIONS, Effect, ExperimentAtAnswer
 
 # A threshold of Huber's loss that no residual reaches.
@@ -58,60 +58,6 @@ class ResidualChanges(NamedTuple):
     # list of (T, M, 3, a): changes for each block of `LinearisedFit`, in units of σ.
     blocks: list[Array]
 
-    def without(self, assumptions: Iterable[str]) -> ResidualChanges:
-        """Return the changes without the assumptions of these names (without component), each with
-        all its components; names that do not occur are ignored.
-        """
-        excluded = set(assumptions)
-        remaining = [
-            k for k, name in enumerate(self.names) if name.partition(" ")[0] not in excluded
-        ]
-        names = tuple(self.names[k] for k in remaining)
-        return ResidualChanges(names, [block[..., remaining] for block in self.blocks])
-
-
-def with_relaxed_assumption(
-    fit: LinearisedFit, changes: ResidualChanges, name: str, widening: float = 1.0
-) -> LinearisedFit:
-    """Return a fit in which an assumption is one more nuisance parameter, or several of its name.
-
-    Parameters
-    ----------
-    changes : ResidualChanges
-        Changes of its residuals by the assumptions, each off by its standard deviation, which is
-        the unit of the new parameters.
-    name : str
-        Name of the assumption with its component. If `changes` does not contain it, no parameter is
-        added; if it does several times (once for each recording), as many are added at the end,
-        named by it and a number from 0.
-    widening : float
-        Standard deviation of the prior of the new parameters, in these deviations.
-    """
-    columns = [k for k, other in enumerate(changes.names) if other == name]
-    return with_relaxed_columns(fit, changes, columns, widening)
-
-
-def with_relaxed_columns(
-    fit: LinearisedFit, changes: ResidualChanges, columns: Sequence[int], widening: float = 1.0
-) -> LinearisedFit:
-    """Return a fit in which columns of `changes`, by their indices, are nuisance parameters; those
-    of one name are numbered from 0, see `with_relaxed_assumption`.
-    """
-    blocks = []
-    for block, change in zip(fit.blocks, changes.blocks, strict=True):
-        more = change[..., columns] * (block.compute_root_weight() * block.is_measured)[..., None]
-        blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
-    count = len(columns)
-    added = [changes.names[k] for k in columns]
-    return replace(
-        fit,
-        blocks=tuple(blocks),
-        names=(*fit.names, *(f"{name} {added[:k].count(name)}" for k, name in enumerate(added))),
-        prior_residual=np.append(fit.prior_residual, np.zeros(count)),
-        prior_jacobian=np.append(fit.prior_jacobian, np.full(count, 1 / widening)),
-        at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
-    )
-
 
 def changes_of_assumptions(
     collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
@@ -141,15 +87,6 @@ def changes_of_assumptions(
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
     blocks = [np.concatenate(each, axis=3) for each in both]
     return ResidualChanges(of_bodies.names + of_nuisances.names, blocks)
-
-
-def prescribes_no_motion(collocation: Collocation) -> bool:
-    """Return whether all grasps and obstacles rest: motions that are prescribed may have been
-    measured by the cameras whose scale is tested.
-    """
-    poses = [grasp.poses for each in collocation.experiments for grasp in each.grasps]
-    tracks = [track for each in poses for track in (each.positions_m, each.quaternions_xyzw)]
-    return all((track == track[0]).all() for track in tracks)
 
 
 def changes_of_nuisances(

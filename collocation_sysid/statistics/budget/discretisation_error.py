@@ -19,8 +19,8 @@ n being the half width for the noise and u the uncertainty of each Δ on that si
 
 A cheaper estimate is a Gauss–Newton step towards a finer simulation with the answer's parameters:
 −A⁻¹ Sᵀ d to first order, see `linearised`, d being the change of the residuals with half the step.
-It replaces the change with half the step. The change with half the edge lengths is estimated
-likewise, see `mesh_error`; it widens the interval, and does not correct the value.
+The number of steps is chosen by it; d itself, and the same of the mesh (`mesh_error`), are effects
+in the posterior.
 
 The number of steps that leaves a small enough error follows from the error with one step a sample,
 because an error of order p decreases with the p-th power of their number.
@@ -29,7 +29,7 @@ because an error of order p decreases with the p-th power of their number.
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
@@ -45,8 +45,6 @@ OBSERVED = 1.25
 MESH_ORDER = 2.0
 # Lowest order of the mesh, where elements are too stiff or at the edge of a grasp.
 LEAST_ORDER = 0.5
-# Change of a logarithm up to which an estimate of first order has the right sign.
-FIRST_ORDER = 1.0
 # Largest change of an estimate due to the step, in standard errors, where the number of steps is
 # chosen.
 LITTLE = 0.5
@@ -71,47 +69,6 @@ class DiscretisationError:
     # (lower, upper) or None: 95 % interval due to noise and discretisation; None if that due to
     # noise is unknown.
     interval95: tuple[float, float] | None
-    # Change of the value with half the edge lengths to first order, without a solve on a finer
-    # mesh. The interval contains it, `extrapolated` does not. None if it was not estimated.
-    estimated_mesh: float | None = None
-
-    def with_estimated_mesh(
-        self, name: str, estimate: Estimate, halved: float, *, least_order: float, linear: bool
-    ) -> DiscretisationError:
-        """Return the error with an interval that contains the error of the mesh, too.
-
-        The value is not corrected, because the estimate is of first order. The interval is
-        widened towards the value of the finest mesh, or, where the change is too large for an
-        estimate to first order, on both sides.
-
-        Parameters
-        ----------
-        name : str
-            Name of the parameter or derived modulus.
-        estimate : Estimate
-            The answer with its statistical interval.
-        halved : float
-            Its value with half the edge lengths, to first order.
-        least_order : float
-            Lowest order of the elements.
-        linear : bool
-            Whether the parameter is its own coordinate.
-        """
-        change = halved - estimate.value
-        if self.interval95 is None:
-            return replace(self, estimated_mesh=change)
-        known = (estimate.value, halved, self.extrapolated, *self.interval95)
-        at = IntervalCoordinate.for_estimate(name, known, linear=linear)
-        x = at.from_value(estimate.value)
-        mesh = _Extrapolation.from_values([x, at.from_value(halved)], MESH_ORDER, least=least_order)
-        centre = at.from_value(self.extrapolated)
-        low, high = map(at.from_value, self.interval95)
-        down = np.hypot(centre - low, max(0.0, mesh.below - mesh.change))
-        up = np.hypot(high - centre, max(0.0, mesh.above + mesh.change))
-        if abs(at.from_value(halved) - x) > FIRST_ORDER:
-            down = up = max(down, up)
-        interval = at.to_value(centre - float(down)), at.to_value(centre + float(up))
-        return replace(self, interval95=interval, estimated_mesh=change)
 
 
 def known_kinds(errors: Iterable[DiscretisationError]) -> tuple[str, ...]:
@@ -353,39 +310,9 @@ def discretisation_errors(
     return errors
 
 
-def with_estimated_mesh(
-    known: Refinement | None,
-    estimates: Mapping[str, Estimate],
-    halved: Mapping[str, float],
-    *,
-    least_order: float,
-    linear: Container[str],
-) -> Refinement:
-    """Return discretisation errors with the effect of the mesh to first order, see
-    `DiscretisationError.with_estimated_mesh`.
-
-    Parameters
-    ----------
-    known : Refinement or None
-        Errors of the step; None if they are unknown.
-    halved : mapping of str to float
-        Values by name with half the edge lengths, to first order.
-    least_order : float
-        Lowest order of the elements.
-    linear : container of str
-        Names of the parameters that are their own coordinates.
-    """
-    errors = dict(() if known is None else known.errors)
-    for name, estimate in estimates.items():
-        if estimate.at_bound or halved[name] == estimate.value:
-            continue
-        error = errors.get(name) or DiscretisationError(
-            None, None, None, None, estimate.value, interval95=estimate.statistical95
-        )
-        errors[name] = error.with_estimated_mesh(
-            name, estimate, halved[name], least_order=least_order, linear=name in linear
-        )
-    return Refinement(errors, () if known is None else known.levels)
+def extrapolated(change: Array, order: float) -> Array:
+    """Return the change to infinitely small steps or elements from that to half their size."""
+    return change * 2**order / (2**order - 1)
 
 
 def change_in_observations(fit: LinearisedFit, residual_changes: Sequence[Array]) -> Array:

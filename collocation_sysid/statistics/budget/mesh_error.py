@@ -53,9 +53,7 @@ from ...program.linear_algebra.reused_factor import (
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.experiment_refinement import refined_experiment
-from ..linearised import LinearisedFit
 from .consider_analysis import changed_residuals
-from .discretisation_error import estimate_changes
 from .systematic_effects import Effect, ExperimentAtAnswer
 
 # Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
@@ -71,16 +69,15 @@ ORDER = 3
 NO_WEIGHT = 1e-9
 
 
-def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array:
-    """Return the changes (nq,) of the shared parameters, to first order, on a mesh with every
-    tetrahedron split into eight.
+@known_at_last
+def mesh_residual_changes(collocation: Collocation, z: Array) -> Sequence[Array]:
+    """Return the changes (T, M, 3, 1) of the residuals of each block of a fit, to first order, on a
+    mesh with every tetrahedron split into eight.
 
     Parameters
     ----------
     z : (variables,) array
         Variables that satisfy the equations of motion.
-    fit : LinearisedFit
-        The measurements linearised at z.
 
     Raises
     ------
@@ -88,14 +85,6 @@ def mesh_change(collocation: Collocation, z: Array, fit: LinearisedFit) -> Array
         If an experiment cannot be transferred to the finer mesh.
     SimulationError, numpy.linalg.LinAlgError
         If the equations are singular.
-    """
-    return estimate_changes(fit, mesh_residual_changes(collocation, z))[: collocation.nq, 0]
-
-
-@known_at_last
-def mesh_residual_changes(collocation: Collocation, z: Array) -> Sequence[Array]:
-    """Return the changes (T, M, 3, 1) of the residuals of each block of a fit at z by a finer mesh,
-    see `mesh_change`.
     """
     return changed_residuals(collocation, z, [(finer_mesh_row(collocation), 1.0)]).blocks
 

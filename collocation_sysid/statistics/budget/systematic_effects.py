@@ -25,7 +25,7 @@ from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
 from ...fem.body import Body
-from ...fem.laws.constants import GAMMA_M, GAMMA_R, is_modulus, without_region
+from ...fem.laws.constants import GAMMA_M, GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.mesh import boundary_of
@@ -35,7 +35,7 @@ from ...model.force_term import States
 from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
 from ...program.reactions.forces import forces_on_dofs, reaction_forces
-from ...recording.deviation import WIDENING, Deviation
+from ...recording.deviation import Deviation
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import (
     CELL_SIZE_M,
@@ -76,11 +76,6 @@ AIR_DENSITY_DEVIATION = 0.03
 # Relative standard deviation of the added mass and of the drag coefficient of a given body: they
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
-# Deviation of the share of a branch of memory in its test: it is not in the budget by default.
-MEMORY_SHARE = 0.1
-# Smaller than `WIDENING`: across the axis of bending hardly anything depends on the anisotropy, so
-# that any error of the model needs an impossible one (0.7 to 0.9 in twins without any).
-WIDENING_OF_ANISOTROPY = 4.0
 _AXES = "xyz"
 # Shape factor of a pressed specimen of unknown size: four times as wide as high.
 FLAT_SHAPE_FACTOR = 1.0
@@ -465,8 +460,7 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Return the effect of a stiffness that is higher along one axis (index) by a share of E, the
     Young's modulus of the softest part: the energy ½ E e² of the strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative. For specimens e is such that its stress
-    at large stretches λ, (λ − 1/λ²) / 3, is a constant share of that of Neo-Hooke's law.
+    Rayleigh damping K(x) v follows by its time derivative.
     """
     body = at.body
     xi, nu = at.states
@@ -482,8 +476,6 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
         )
         squared = np.sum(stretch**2, axis=2, keepdims=True)
         strain = 0.5 * (squared - 1)
-        if at.iterate.transcription.experiment.specimen is not None:
-            strain = (1 - squared**-1.5) / 3
         pull = (strain + gamma * np.sum(stretch * rate, axis=2, keepdims=True)) * stretch
         pull = weight[..., None] * (pull + gamma * strain * rate)
         np.subtract.at(own.reshape(-1, 3), body.cells, np.einsum("eqa,eqj->eaj", slopes, pull))
@@ -491,8 +483,12 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     return Effect(force)
 
 
-def _drift(at: ExperimentAtAnswer, _: int) -> Effect:
-    """Return the effect of a share that grows linearly in time, zero at the mean time."""
+def _drift(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a share that grows linearly in time, zero at the mean time; None for
+    equilibria, whose load grows in time too.
+    """
+    if at.iterate.transcription.experiment.is_static:
+        return None
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
@@ -757,10 +753,6 @@ def _air_drag(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(at.air_drag_n) if at.iterate.transcription.experiment.has_air_drag else None
 
 
-def _is_stiffness_damping(name: str) -> bool:
-    return without_region(name) == GAMMA_R.name
-
-
 def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
     """Return the effect of replacing the stated damping law by another with the same γ_r: the
     difference of the forces along the answer.
@@ -870,7 +862,6 @@ ASSUMPTIONS = (
         "body_scale",
         "1",
         considered=0.01,
-        is_ruler=True,
         description="relative error of the size of the mesh",
         remedy="measure two lengths of the real body and scale the mesh to them",
         effect=_size,
@@ -879,6 +870,7 @@ ASSUMPTIONS = (
     Deviation(
         "rest_shape",
         "1",
+        wide=1.0,
         description="share of the weight of the body under which the mesh was deformed when "
         "it was made, along each axis, if object.rest_shape is not stated",
         remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
@@ -886,7 +878,6 @@ ASSUMPTIONS = (
         effect=_rest_shape,
         axes="x y z",
         by_origin={"scan": UNKNOWN_ORIENTATION},
-        alternative="if the mesh was scanned while the body hung along its {component} axis",
     ),
     Deviation(
         "surface",
@@ -907,7 +898,6 @@ ASSUMPTIONS = (
         remedy="mesh the section of the body",
         effect=_section,
         axes=" ".join(SECTIONS),
-        alternative="if the section of the body is {component}, of the same width",
     ),
     Deviation(
         "mass",
@@ -920,6 +910,7 @@ ASSUMPTIONS = (
     Deviation(
         "marker_mass_kg",
         "kg",
+        wide=0.01,
         is_one_sided=True,
         description="mass of each marker, which is not part of the mass of the body",
         remedy="weigh the markers and state "
@@ -952,37 +943,30 @@ ASSUMPTIONS = (
     Deviation(
         "anisotropy",
         "1",
-        widening=WIDENING_OF_ANISOTROPY,
         considered=0.05,
         description="relative difference of the stiffness along one axis from that across it",
-        assumed="the material is equally stiff along all axes",
         remedy='state how the body was made, such as made = "cast" in [object]; or repeat the recording '
         "with the body loaded along another axis, or test specimens cut along each axis",
         effect=_anisotropy,
         axes="x y z",
-        of_specimens=True,
         by_origin={"cast": 0.015, "foam": 0.2, "printed": 0.15, "tissue": 0.3},
     ),
     Deviation(
         "stiffness_drift",
         "1",
-        widening=WIDENING,
         considered=0.02,
         description="relative change of the stiffness from the beginning to the end of a recording",
-        assumed="the stiffness is constant during a recording",
         remedy="repeat the first recording at the end",
         effect=_drift,
-        of_specimens=True,
         by_origin={"tissue": 0.05},
     ),
     Deviation(
         "memory_share",
         "1",
-        widening=WIDENING,
-        tested=MEMORY_SHARE,
+        is_one_sided=True,  # no material has a memory with a negative share
+        wide=1.0,
         description="share of a branch of viscoelastic memory (Prony term) that the material lacks, for "
         "each relaxation time that the recording can show",
-        assumed="the material has no viscoelastic memory",
         remedy="add a branch of memory to the material, and estimate its share",
         effect=_memory,
         axes=" ".join(f"{RELAXATION_TIME}{tau_s:g}s" for tau_s in RELAXATION_TIMES_S),
@@ -993,7 +977,6 @@ ASSUMPTIONS = (
         "1",
         considered=1e-4,
         description="relative error of the rate of all clocks",
-        assumed="all clocks run at the right rate",
         remedy="compare all clocks with a reference clock",
         effect=_time_scale,
     ),
@@ -1019,19 +1002,16 @@ ASSUMPTIONS = (
         effect=_objective_damping,
         axes=" ".join(OBJECTIVE_DAMPINGS),
         redefines=(GAMMA_R.name, GAMMA_M.name),
-        alternative="with the damping law {component}",
-        proportional_to=_is_stiffness_damping,
     ),
     Deviation(
         "rayleigh_damping",
         "1",
+        wide=1.0,
         description="effect of Rayleigh damping, as a fraction of the complete difference of "
         "its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on motions that rotate the body",
         effect=_rayleigh_damping,
         redefines=(GAMMA_R.name, GAMMA_M.name),
-        alternative="with the damping law rayleigh",
-        proportional_to=_is_stiffness_damping,
     ),
     Deviation(
         "grip_layer_m",
@@ -1120,13 +1100,12 @@ ASSUMPTIONS = (
     Deviation(
         "platen_stick",
         "1",
+        wide=1.0,
         description="sticking of faces that slide on platens, as a fraction of that without any "
         "slip, if only loads are measured",
         remedy="measure the bulge, by markers on the side or depth images, or compare both "
         "assumptions with compare-models --with",
         effect=_platen_stick,
-        alternative="if the faces stuck to the platens",
-        proportional_to=is_modulus,
     ),
     Deviation(
         "contact_stiffness",
@@ -1163,8 +1142,26 @@ ASSUMPTIONS = (
     ),
 )
 
+# Errors of the discretisation, whose mean is the estimated change; the order of convergence, and with
+# it this change, is known to about half.
+DISCRETISATION = (
+    Deviation(
+        "mesh",
+        "1",
+        considered=0.5,
+        description="error of the mesh, as a share of its estimate by elements of half the size",
+        remedy="solve on a finer mesh, or run refine",
+    ),
+    Deviation(
+        "time_step",
+        "1",
+        considered=0.5,
+        description="error of the time step, as a share of its estimate by steps of half the length",
+        remedy="raise transcription.substeps, or run refine",
+    ),
+)
 # Every deviation, by its name.
-DEVIATIONS = {row.name: row for row in (*ASSUMPTIONS, *KINDS)}
+DEVIATIONS = {row.name: row for row in (*ASSUMPTIONS, *KINDS, *DISCRETISATION)}
 # Those of the budget; other nuisance parameters are estimated or exact.
 CONSIDERED = (*ASSUMPTIONS, *(row for row in KINDS if row.considered is not None))
 
@@ -1203,14 +1200,13 @@ KnownDeviation = Annotated[KnownEffect | Deviated, ByForm((dict, KnownEffect))]
 
 def _field_of(row: Deviation) -> FieldOfRow:
     """Return the field of `Assumptions` for a row; None is the default of bodies that were made
-    like those of the problem, see `Deviation.by_origin`, or that only the alternative is reported.
+    like those of the problem, see `Deviation.by_origin`.
     """
     default = "none" if row.considered is None else row.considered
     annotation: Any = KnownDeviation if row.is_one_sided else Deviated
     form = 'float, "none" or table' if row.is_one_sided else 'float or "none"'
     text = sentence(f"{row.description} [{row.unit or 1}]")
-    is_reported = row.alternative and row.considered is None and not row.redefines
-    if row.by_origin or is_reported:
+    if row.by_origin:
         return FieldOfRow(annotation | None, None, f"{form}, optional", text)
     return FieldOfRow(annotation, default, form, text)
 
@@ -1292,3 +1288,17 @@ class ExactIfNone:
                 f'found "{value}"; expected a table, or "none" if all assumptions are exact'
             )
         return vars(Assumptions.exact()) if value == "none" else value
+
+
+def source_label(source: str) -> str:
+    """Return the name of an effect, or of another source of variance, as text for messages: without
+    a unit suffix such as "_rad", with spaces for underscores, and with a relaxation time in
+    parentheses.
+    """
+    head, blank, component = source.partition(" ")
+    unit = next(
+        (u for u in ("_m_n", "_1_m2", "_rad", "_px", "_m", "_s", "_kg") if head.endswith(u)), ""
+    )
+    label = f"{head.removesuffix(unit)}{blank}{component}".replace("_", " ")
+    name, _, time = label.partition(f" {RELAXATION_TIME}")
+    return f"{name} (τ = {time.removesuffix('s')} s)" if time else label

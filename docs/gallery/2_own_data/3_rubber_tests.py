@@ -70,8 +70,8 @@ assert (measured_pa > np.minimum(*ends_pa))[-3:].all()
 
 # %%
 # Planar tension (pure shear) as a second test determines μ₂: its statistical uncertainty is a fifth
-# of its value; the rest of its interval comes from the anisotropy that rubber may have. Now the
-# error of the prediction of the equibiaxial test, 10 kPa, is that of the measurements.
+# of its value. Now the error of the prediction of the equibiaxial test, 10 kPa, is that of the
+# measurements.
 both = fit("uniaxial", "planar")
 print(both.table())
 mu_2 = both.estimates["mu_2_pa"]

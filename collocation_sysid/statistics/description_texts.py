@@ -1,8 +1,6 @@
-"""Messages of the likely mistakes, by their codes after "description/"; the import declares them."""
+"""Messages of the likely mistakes, by their codes after "description/"."""
 
 from __future__ import annotations
-
-from ..statistics.concerns import declare_messages
 
 MESSAGES = {
     "poses-inverted": "the markers move as if the poses were inverted: invert them; a pose must "
@@ -214,4 +212,3 @@ MESSAGES = {
     "pixels, the body {body_px}): check camera.pose (x to the right, y down, z forward, in "
     "metres), the calibration, and that the mask is one of the body",
 }
-declare_messages({f"description/{code}": text for code, text in MESSAGES.items()})

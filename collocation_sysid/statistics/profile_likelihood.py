@@ -13,18 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import root_scalar
 
-from ...common.array_types import Array
-from ...common.step_counting import search_activity
-from ...errors import InputError, SimulationError
-from ...fem.laws.constants import Scale
-from ...methods.reduced_space import ReducedSpace
-from ...methods.solution import Solution
-from ...model.parameters import Parameter, Parameters
-from ...program.collocation import Collocation
-from ..distributions import chi2_isf
-from ..estimates import relative_derivatives
-from ..linearised import LinearisedFit, least_squares_of_fit, parameter_values
-from ..uncertainty import Uncertainty
+from ..common.array_types import Array
+from ..common.step_counting import search_activity
+from ..errors import InputError, SimulationError
+from ..fem.laws.constants import Scale
+from ..methods.reduced_space import ReducedSpace
+from ..methods.solution import Solution
+from ..model.parameters import Parameter, Parameters
+from ..program.collocation import Collocation
+from .distributions import chi2_isf
+from .estimates import relative_derivatives
+from .linearised import LinearisedFit, least_squares_of_fit
+from .uncertainty import Uncertainty
 
 SolveFixed = Callable[[str, float], float]
 
@@ -212,50 +212,21 @@ def profile_of_solution(
             None,
             where="uncertainty.profile",
         )
-    profile, _ = profile_and_refits(
-        solution.collocation, solution.z, fit, uncertainty, free.index(name)
-    )
-    return profile
-
-
-def profile_and_refits(
-    collocation: Collocation,
-    z: Array,
-    fit: LinearisedFit,
-    uncertainty: Uncertainty,
-    k: int,
-    first_step: float = 2.0,
-    widening: float = 1.0,
-) -> tuple[Profile, Refits]:
-    """Return the profile likelihood of free parameter k at the optimum z, and its refits.
-
-    Parameters
-    ----------
-    first_step : float
-        First step of the search, in standard errors.
-    widening : float
-        Factor on the rise of the loss at the ends, beyond that of the noise.
-
-    Raises
-    ------
-    InputError
-        If the estimate is not within its bounds.
-    """
+    k = free.index(name)
+    collocation, z = solution.collocation, solution.z
     item = collocation.parameters.free[k]
-    value = item.from_coordinate(float(z[k]))
     refits = Refits(collocation, z, fit, k)
-    deviation = float(np.sqrt(uncertainty.covariance[k, k])) * first_step / 2
-    profile = compute_profile(
+    value = item.from_coordinate(float(z[k]))
+    deviation = float(np.sqrt(uncertainty.covariance[k, k]))
+    return compute_profile(
         refits,
         item.name,
         best=(value, refits.loss),
         bounds=(item.lower, item.upper),
         deviation=deviation * (1.0 if item.scale == "log" else abs(value)),
-        noise_scale=_noise_scale(collocation.parameters, z[: collocation.nq], fit, uncertainty, k)
-        * widening,
+        noise_scale=_noise_scale(collocation.parameters, z[: collocation.nq], fit, uncertainty, k),
         scale=item.scale,
     )
-    return profile, refits
 
 
 class Refits:
@@ -293,11 +264,6 @@ class Refits:
         self._known.append((at, refit.collocation, refit.z))
         loss = refit.collocation.objective(refit.z) / refit.collocation.loss_scale
         return loss + _prior_loss(self.item, value)
-
-    def values_near(self, value: float) -> dict[str, float]:
-        """Return all parameters and derived moduli of the refit nearest to a value."""
-        _, collocation, z = self._nearest(self.item.to_coordinate(value))
-        return parameter_values(collocation, z[: collocation.nq])
 
     def _nearest(self, at: float) -> tuple[float, Collocation, Array]:
         return min(self._known, key=lambda each: abs(each[0] - at))

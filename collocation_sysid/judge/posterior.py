@@ -1,0 +1,571 @@
+"""Posterior of an answer: parameters, nuisance parameters and effects of the budget in one fit.
+
+An effect is one way in which reality may deviate from the description. It has a prior, and its
+columns E = ∂r/∂b follow by linear algebra at the answer, see `consider_analysis`. One least-squares
+step over parameters q, nuisance parameters φ and effects b,
+
+    min ‖r + J (q, φ) + E b‖² + ‖(φ, b) − mean‖² / deviation²,
+
+gives the published estimates, their covariance, and the posterior of each effect (Bayesian
+approximation error: Kaipio & Somersalo, J. Comput. Appl. Math. 198, 2007). Where the data see an
+effect, they correct the estimates for it and narrow their intervals; where they do not, its whole
+prior counts, as in a type B evaluation (JCGM 100:2008, 4.3). The estimates depend linearly on
+residuals and priors, so that their variance is a sum over noise and priors: with C the inverse of the
+information, that of an estimate with derivative g by q contains (gᵀ C_k)² for effect k, whose unit
+is the standard deviation of its prior.
+
+The error of the mesh and of the time step are effects with a mean: that of the estimated change to
+elements, or steps, of half the length, extrapolated to infinitely small ones. The data learn its
+size, but not its shape, which is known as badly: each channel (one number of a marker over time) has
+an amplitude of its own with the same deviation, which is considered.
+
+A single curve of a static test does not tell effects from each other, nor from the law of the
+material, which is never exact. There effects are considered but not learnt: the estimates are
+corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962).
+
+An effect that redefines a constant, such as another damping law for γ_r, does not change that
+constant: the constant is the one given the stated definition, b = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..common.array_types import Array, Index
+from ..fem.laws.constants import without_region
+from ..model.parameters import Parameters
+from ..statistics.budget.combined_intervals import NORMAL_95, ReportedEstimate, combine
+from ..statistics.budget.consider_analysis import ResidualChanges
+from ..statistics.budget.discretisation_error import estimate_changes
+from ..statistics.budget.effect_estimates import EffectEstimate, effect_row
+from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
+from ..statistics.distributions import student_95
+from ..statistics.estimates import Estimate, IntervalCoordinate
+from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
+
+NOISE = "noise"
+NUISANCES = "nuisance parameters"
+BETWEEN = "between recordings"
+# Cosine of the columns of two effects, beside all parameters, from which on they look alike.
+ALIKE = 0.9
+# Share of the prior variance of an effect below which the data say nothing about it.
+UNSEEN = 1e-6
+
+
+@dataclass(frozen=True)
+class BudgetLine:
+    """Uncertainty budget of one estimate."""
+
+    value: float
+    # mapping of str to float: share of each source in the variance, largest first; they sum to one.
+    shares: Mapping[str, float]
+    combined95: tuple[float, float]  # (lower, upper): 95 % interval due to all sources
+    combined_std_error: float  # standard uncertainty due to all sources
+
+
+@dataclass(frozen=True, eq=False)
+class Effects:
+    """Columns of effects at one point, in standard deviations of their priors."""
+
+    names: tuple[str, ...]  # (a,): names with component
+    blocks: tuple[Array, ...]  # (T, M, 3, a): changes of the residuals of each block of a fit
+    means: Array  # (a,): means of the priors
+    deviations: Array  # (a,): standard deviations of the priors, in the unit of each effect
+
+    @classmethod
+    def from_changes(
+        cls,
+        changes: ResidualChanges,
+        deviations: Mapping[str, float | None],
+        means: Mapping[str, float],
+        discretisation: Mapping[str, Sequence[Array]],
+    ) -> Effects:
+        """Return the effects that change any residual.
+
+        Parameters
+        ----------
+        changes : ResidualChanges
+            Changes of the residuals if each effect is off by its standard deviation.
+        means : mapping of str to float
+            Known effects over their standard deviations.
+        discretisation : mapping of str to sequence of (T, M, 3, 1) arrays
+            Changes of the residuals without the error of the mesh and of the time step.
+        """
+        count = len(changes.names)
+        blocks = list(changes.blocks)
+        for name, added in discretisation.items():
+            size = effect_row(name).considered or 1.0
+            own = [size * each for each in added]
+            blocks = [np.concatenate(each, axis=3) for each in zip(blocks, own, strict=True)]
+        names = (*changes.names, *discretisation)
+        rows = [name.partition(" ")[0] for name in names]
+        sizes = np.array([deviations.get(r) or DEVIATIONS[r].considered for r in rows], dtype=float)
+        expected = np.array([means.get(row, 0.0) for row in rows])
+        expected[count:] = 1 / sizes[count:]
+        seen = [k for k in range(len(names)) if any(block[..., k].any() for block in blocks)]
+        return cls(
+            tuple(names[k] for k in seen),
+            tuple(block[..., seen] for block in blocks),
+            expected[seen],
+            sizes[seen],
+        )
+
+    def without(self, rows: Iterable[str]) -> Effects:
+        """Return the effects without those of some rows, by name."""
+        left_out = set(rows)
+        return self.only(
+            k for k, name in enumerate(self.names) if name.partition(" ")[0] not in left_out
+        )
+
+    def only(self, indices: Iterable[int]) -> Effects:
+        """Return some of the effects."""
+        kept = list(indices)
+        return Effects(
+            tuple(self.names[k] for k in kept),
+            tuple(block[..., kept] for block in self.blocks),
+            self.means[kept],
+            self.deviations[kept],
+        )
+
+    def added_to(self, fit: LinearisedFit, parameters: Parameters) -> LinearisedFit:
+        """Return the fit with the effects as its last parameters."""
+        blocks = []
+        for block, change in zip(fit.blocks, self.blocks, strict=True):
+            more = change * (block.compute_root_weight() * block.is_measured)[..., None]
+            blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
+        count = len(self.names)
+        wide = replace(
+            fit,
+            blocks=tuple(blocks),
+            names=(*fit.names, *self._unique_names),
+            prior_residual=np.append(fit.prior_residual, -self.means),
+            prior_jacobian=np.append(fit.prior_jacobian, np.ones(count)),
+            at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
+            effect_count=count,
+        )
+        return self._as_defined(wide, parameters)
+
+    @property
+    def _unique_names(self) -> list[str]:
+        known = self.names
+        return [
+            f"{name} {known[: k + 1].count(name)}" if known.count(name) > 1 else name
+            for k, name in enumerate(known)
+        ]
+
+    def _as_defined(self, fit: LinearisedFit, parameters: Parameters) -> LinearisedFit:
+        """Return the fit in which constants that an effect redefines are those of its absence: the
+        change of the constants with the effect belongs to the column of the effect.
+
+        Forces of an alternative may be K times those of the answer, as viscosities that contain the
+        bulk modulus of a nearly incompressible body. With 1/K of the constant they agree; only 1/K of
+        what they differ in otherwise is the effect.
+        """
+        first = len(fit.names) - len(self.names)
+        rows = {k: effect_row(name) for k, name in enumerate(self.names, start=first)}
+        redefining = [k for k, row in rows.items() if row.redefines]
+        changed = [block.jacobian.copy() for block in fit.blocks]
+        for k in redefining:
+            defined = [
+                j
+                for j, item in enumerate(parameters.free)
+                if without_region(item.name) in rows[k].redefines and not fit.at_bound[j]
+            ]
+            slopes = _conditional_slopes(fit, k, redefining)
+            ratio = 1.0 - min(0.0, *(float(slopes[j]) for j in defined)) if defined else 1.0
+            for block, jacobian in zip(fit.blocks, changed, strict=True):
+                own = block.jacobian[..., k] + block.jacobian[..., defined] @ slopes[defined]
+                jacobian[..., k] = own / ratio
+        pairs = zip(fit.blocks, changed, strict=True)
+        return replace(fit, blocks=tuple(replace(b, jacobian=each) for b, each in pairs))
+
+
+def _step(fit: LinearisedFit, considered: Effects) -> Array:
+    """Return the step (p,) of all parameters of a fit, with effects that are not learnt at their means."""
+    return gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
+
+
+def _conditional_slopes(fit: LinearisedFit, column: int, left_out: Sequence[int]) -> Array:
+    """Return the changes (p,) of all parameters but some if one of them changes by one."""
+    information = least_squares_of_fit(fit).information
+    others = np.setdiff1d(np.flatnonzero(~fit.at_bound), left_out)
+    slopes = np.zeros(len(fit.names))
+    inverse = np.linalg.pinv(information[np.ix_(others, others)], hermitian=True)
+    slopes[others] = -inverse @ information[others, column]
+    return slopes
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Posterior of an answer.
+
+    The step and the covariances are those of `fit`; `uncertainty` has the statistical part, without
+    the priors of the effects.
+    """
+
+    fit: LinearisedFit  # linearised fit with the learnt effects as its last parameters, before the step
+    parameters: Parameters
+    start: Array  # (nq,): q at which `fit` is linearised
+    effects: Effects  # that are learnt
+    considered: Effects  # that are not
+    uncertainty: Uncertainty  # of the fit after the step
+    reported_q: Array  # (nq,): q of `uncertainty`, after the step
+
+    @classmethod
+    def from_fit(
+        cls,
+        fit: LinearisedFit,
+        effects: Effects,
+        parameters: Parameters,
+        q: Array,
+        error_model: ErrorModel,
+        *,
+        is_learnt: bool = True,
+        derived_at: Callable[[Array], object] | None = None,
+    ) -> Posterior:
+        """Return the posterior by one step.
+
+        Parameters
+        ----------
+        fit : LinearisedFit
+            Linearised fit at q (nq,), without effects.
+        is_learnt : bool
+            Whether the data correct the effects.
+        derived_at : callable, optional
+            ``derived_at(q)``, the derived moduli at q; by default those of the fit.
+        """
+        none = effects.only(())
+        learnt, considered = (effects, none) if is_learnt else (none, effects)
+        wide = learnt.added_to(fit, parameters)
+        after = wide.after_step(gauss_newton_step(wide))
+        step = _step(wide, considered)
+        there = np.clip(q + step[: len(q)], *parameters.bounds_q)
+        if derived_at is not None:
+            after = replace(after, derived=derived_at(there))
+        uncertainty = uncertainty_from_fit(after, parameters, there, error_model)
+        wide = replace(wide, derived=after.derived)
+        return cls(wide, parameters, q, learnt, considered, uncertainty, there)
+
+    @cached_property
+    def step(self) -> Array:
+        """Step (p + a,) of all parameters and effects."""
+        return _step(self.fit, self.considered)
+
+    @cached_property
+    def q(self) -> Array:
+        """Estimates (nq,) in the solver's coordinates."""
+        moved = self.start + self.step[: len(self.start)]
+        return np.clip(moved, *self.parameters.bounds_q)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (p + a, p + a) with the stated noise; zero for parameters at a bound."""
+        free = np.flatnonzero(~self.fit.at_bound)
+        matrix = np.zeros(2 * (len(self.fit.names),))
+        information = least_squares_of_fit(self.fit).information[np.ix_(free, free)]
+        matrix[np.ix_(free, free)] = np.linalg.pinv(information, hermitian=True)
+        return matrix
+
+    @cached_property
+    def sources(self) -> tuple[tuple[str, ...], Array]:
+        """Names of the effects, and changes (nq, a) of q if each is off by the standard deviation of
+        its prior; mesh and time step occur again, once for each channel.
+        """
+        count = len(self.start)
+        ways = [self.covariance[:count, self._of_effects]]
+        ways.append(estimate_changes(self.fit, self.considered.blocks)[:count])
+        rows = {row.name for row in DISCRETISATION}
+        again = [k for k, name in enumerate(self.effects.names) if name in rows]
+        names = (*self.effects.names, *self.considered.names)
+        for k in again:
+            unknown = self._changes_by_channel(k) * self.effects.deviations[k]
+            ways.append(unknown)
+            names += (self.effects.names[k],) * unknown.shape[1]
+        return names, np.hstack(ways)
+
+    def _changes_by_channel(self, k: int) -> Array:
+        """Return the changes (nq, c) of q by each channel of effect k alone, as large as it is
+        estimated; a channel is one number of a marker over time.
+        """
+        place = self._of_effects[k]
+        scores = [
+            np.einsum("tmap,tma->pma", block.jacobian, block.jacobian[..., place])
+            for block in self.fit.blocks
+        ]
+        flat = np.hstack([each.reshape(len(each), -1) for each in scores])
+        return -self.step[place] * self.covariance[: len(self.start)] @ flat
+
+    @property
+    def sensitivities(self) -> Array:
+        """Changes (nq, a) of q by each of `sources`."""
+        return self.sources[1]
+
+    @property
+    def _of_effects(self) -> Index:
+        return np.arange(len(self.fit.names) - len(self.effects.names), len(self.fit.names))
+
+    def without(self, rows: Iterable[str]) -> Posterior:
+        """Return the posterior without some effects, with the same statistical uncertainty."""
+        first = len(self.fit.names) - len(self.effects.names)
+        left_out = set(rows)
+        kept = [
+            *range(first),
+            *(
+                first + k
+                for k, name in enumerate(self.effects.names)
+                if name.partition(" ")[0] not in left_out
+            ),
+        ]
+        blocks = (replace(b, jacobian=b.jacobian[..., kept]) for b in self.fit.blocks)
+        fit = replace(
+            self.fit,
+            blocks=tuple(blocks),
+            names=tuple(self.fit.names[k] for k in kept),
+            prior_residual=self.fit.prior_residual[kept],
+            prior_jacobian=self.fit.prior_jacobian[kept],
+            at_bound=self.fit.at_bound[kept],
+            effect_count=len(kept) - first,
+        )
+        considered = self.considered.without(left_out)
+        learnt = self.effects.without(left_out)
+        return replace(self, fit=fit, effects=learnt, considered=considered)
+
+    @cached_property
+    def derivatives(self) -> dict[str, Array]:
+        """Derivatives (nq,) of each estimate by q, by name; zero for fixed ones."""
+        values = self.parameters.values(self.reported_q)
+        slopes = {name: np.zeros(len(self.start)) for name in values}
+        for k, item in enumerate(self.parameters.free):
+            slopes[item.name][k] = item.value_derivative(values[item.name])
+        for item in self.parameters.components:
+            if item.tied is not None:
+                slopes[item.name] = item.tied.ratio * slopes[item.tied.to]
+        return slopes | dict(self.fit.derived.derivatives)
+
+    # Estimates ------------------------------------------------------------------------------------
+
+    @cached_property
+    def statistical(self) -> dict[str, Estimate]:
+        """Estimates with their statistical intervals, by name: parameters and derived moduli."""
+        return {**self.uncertainty.estimates, **self.uncertainty.derived}
+
+    def reported(self, name: str) -> ReportedEstimate:
+        """Return an estimate with its combined interval, without the one of the optimum."""
+        estimate = self.statistical[name]
+        linear, bounds = self.parameters.scale_and_bounds(name)
+        systematic = self.systematic(name) if estimate.statistical95 is not None else None
+        return combine(name, estimate, None, systematic, linear=linear, bounds=bounds)
+
+    def systematic(self, name: str) -> float:
+        """Return the standard deviation of an estimate, in the coordinate of its interval, due to all
+        effects and to differences between recordings.
+        """
+        return float(
+            np.sqrt(sum(self._systematic_variances(name, self._coordinate(name)).values()))
+        )
+
+    def change(self, name: str, optimum: float) -> float:
+        """Return the change of an estimate from its value `optimum` without effects, in the coordinate
+        of its interval.
+        """
+        value = self.statistical[name].value
+        linear, _ = self.parameters.scale_and_bounds(name)
+        at = IntervalCoordinate.for_estimate(name, (value, optimum), linear=linear)
+        besides = float(self.derivatives[name] @ (self.q - self.reported_q)) * at.derivative(value)
+        return at.from_value(value) - at.from_value(optimum) + besides
+
+    def _coordinate(self, name: str) -> IntervalCoordinate:
+        estimate = self.statistical[name]
+        linear, _ = self.parameters.scale_and_bounds(name)
+        known = (estimate.value, *(estimate.statistical95 or ()))
+        return IntervalCoordinate.for_estimate(name, known, linear=linear)
+
+    def _systematic_variances(self, name: str, at: IntervalCoordinate) -> dict[str, float]:
+        """Return the variances of an estimate by each row of effects and by differences between
+        recordings, in the coordinate of its interval.
+        """
+        by_q = self.derivatives[name] * at.derivative(self.statistical[name].value)
+        variances: dict[str, float] = {}
+        names, ways = self.sources
+        for effect, way in zip(names, by_q @ ways, strict=True):
+            row = effect.partition(" ")[0]
+            variances[row] = variances.get(row, 0.0) + float(way) ** 2
+        between = self._variance_between_recordings(name, at, by_q, sum(variances.values()))
+        return variances | ({BETWEEN: between} if between else {})
+
+    def _variance_between_recordings(
+        self, name: str, at: IntervalCoordinate, by_q: Array, others: float
+    ) -> float:
+        """Return the variance due to differences of other parameters between recordings, beyond
+        what the statistical interval contains.
+
+        It is enlarged such that a normal interval is as wide as Student's interval of the sum (Welch
+        & Satterthwaite: JCGM 100:2008, G.4).
+        """
+        scatter = self.uncertainty.scatter
+        if scatter is None:
+            return 0.0
+        noise, _, counted = self._noise_parts(name, at, by_q)
+        between = by_q @ scatter.sensitivities[: len(self.start)]
+        more = max(0.0, float(np.sum(between**2)) - counted)
+        if not more:
+            return 0.0
+        freedom = (len(scatter.recordings) - 1) * ((noise + others + more) / more) ** 2
+        return more * float(student_95(freedom) / NORMAL_95) ** 2
+
+    def _noise_parts(
+        self, name: str, at: IntervalCoordinate, by_q: Array
+    ) -> tuple[float, float, float]:
+        """Return the parts of the statistical variance of an estimate, in the coordinate of its
+        interval: by noise, by the priors of nuisance parameters, and by the disagreement of
+        recordings.
+        """
+        estimate = self.statistical[name]
+        assert estimate.statistical95 is not None
+        noise = _variance(at, estimate.value, estimate.statistical95)
+        count = len(self.start)
+        widened = self.uncertainty.widening * by_q
+        learnt = self.covariance[:count, self._of_effects]
+        free = self.covariance[:count, :count] - learnt @ learnt.T
+        agreeing, of_all = float(by_q @ free @ by_q), float(widened @ free @ widened)
+        share = 1.0 if not of_all > 0 else agreeing / of_all
+        phi = slice(count, len(self.fit.names) - len(self.effects.names))
+        of_priors = (by_q @ self.covariance[:count, phi]) * self.fit.prior_jacobian[phi]
+        nuisances = min(1.0, float(of_priors @ of_priors) / agreeing) if agreeing > 0 else 0.0
+        return noise * share * (1 - nuisances), noise * share * nuisances, noise * (1 - share)
+
+    @cached_property
+    def budget(self) -> dict[str, BudgetLine]:
+        """Uncertainty budget of every estimate that has a statistical interval, by name; estimates
+        that do not depend on q, such as fixed ones, are left out.
+        """
+        lines = {}
+        for name, estimate in self.statistical.items():
+            if estimate.statistical95 is None or not self.derivatives[name].any():
+                continue
+            at = self._coordinate(name)
+            by_q = self.derivatives[name] * at.derivative(estimate.value)
+            noise, nuisances, between = self._noise_parts(name, at, by_q)
+            variances = {NOISE: noise, NUISANCES: nuisances}
+            variances |= self._systematic_variances(name, at)
+            variances[BETWEEN] = variances.get(BETWEEN, 0.0) + between
+            total = sum(variances.values())
+            shares = {source: part / total for source, part in variances.items() if part > 0}
+            shares = dict(sorted(shares.items(), key=lambda part: -part[1]))
+            reported = self.reported(name)
+            assert reported.combined95 is not None
+            assert reported.combined_std_error is not None
+            lines[name] = BudgetLine(
+                reported.value, shares, reported.combined95, reported.combined_std_error
+            )
+        return lines
+
+    def combine_covariance(self, statistical: Array, sizes: Array) -> Array:
+        """Return the covariance (nq, nq) due to noise and systematic effects in the coordinates of a
+        statistical one, `sizes` (nq,) being the derivatives of these coordinates by q.
+        """
+        ways = [self.sensitivities]
+        if self.uncertainty.scatter is not None:
+            ways.append(self.uncertainty.scatter.sensitivities[: len(self.start)])
+        moved = sizes[:, None] * np.hstack(ways)
+        return statistical + moved @ moved.T
+
+    # Consistency ----------------------------------------------------------------------------------
+
+    @cached_property
+    def effect_estimates(self) -> tuple[EffectEstimate, ...]:
+        """Posterior of each effect that the data may see, the most surprising first."""
+        places = self._of_effects
+        values = self.step[places]
+        own = np.diag(self.covariance)[places]
+        # The residuals may show more noise than stated, or correlated noise.
+        count = len(self.effects.names)
+        actual = np.diag(self.uncertainty.nuisance_covariance)[-count:] if count else own
+        predicted = np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
+        sizes = self.effects.deviations
+        found = []
+        for k, name in enumerate(self.fit.names[len(self.fit.names) - count :]):
+            if predicted[k] < UNSEEN:
+                continue
+            off = float(values[k] - self.effects.means[k])
+            found.append(
+                EffectEstimate(
+                    name,
+                    float(self.effects.means[k] * sizes[k]),
+                    float(sizes[k]),
+                    float(values[k] * sizes[k]),
+                    float(np.sqrt(own[k]) * sizes[k]),
+                    off / float(np.sqrt(predicted[k])),
+                    self._alike(k),
+                )
+            )
+        return tuple(sorted(found, key=lambda each: -abs(each.surprise)))
+
+    def decreases(self, others: Effects) -> dict[str, float]:
+        """Return by how much the least loss decreases with each of other effects, whose priors have the
+        mean zero and the deviations of the columns, by name; those that cannot be negative and would be
+        are left out.
+        """
+        fit = self.fit
+        found = {}
+        before = least_squares_of_fit(fit).loss(self.step)
+        for k, name in enumerate(others.names):
+            wide = replace(others.only([k]), means=np.zeros(1)).added_to(fit, self.parameters)
+            step = gauss_newton_step(wide)
+            if step[-1] > 0 or not effect_row(name).is_one_sided:
+                found[name] = before - least_squares_of_fit(wide).loss(step)
+        return found
+
+    @cached_property
+    def _cosines(self) -> Array:
+        """Cosines (a, a) of the columns of effects beside all parameters."""
+        information = least_squares_of_fit(self.fit).information
+        places = self._of_effects
+        others = np.flatnonzero(~self.fit.at_bound)[: -len(places)]
+        inverse = np.linalg.pinv(information[np.ix_(others, others)], hermitian=True)
+        across = information[np.ix_(places, others)]
+        own = information[np.ix_(places, places)] - across @ inverse @ across.T
+        own -= np.eye(len(places))  # the priors
+        length = np.sqrt(np.maximum(np.diag(own), 1e-300))
+        return own / np.outer(length, length)
+
+    def _alike(self, k: int) -> tuple[str, ...]:
+        cosines = np.abs(self._cosines[k])
+        names = self.fit.names[len(self.fit.names) - len(self.effects.names) :]
+        order = np.argsort(-cosines)
+        return tuple(names[j] for j in order if j != k and cosines[j] > ALIKE)
+
+
+def _variance(at: IntervalCoordinate, middle: float, ends: tuple[float, float]) -> float:
+    """Return the variance of a 95 % interval, in the coordinate of the interval.
+
+    If both sides are equal, half the interval counts as 1.96 standard deviations; else, as where
+    one end is cut off by a bound, it is the mean of the variances of both sides.
+    """
+    centre = at.from_value(middle)
+    low, high = map(at.from_value, ends)
+    if np.isclose(centre - low, high - centre, rtol=1e-6):
+        return ((high - low) / 2 / NORMAL_95) ** 2
+    return float(np.mean([((centre - low) / NORMAL_95) ** 2, ((high - centre) / NORMAL_95) ** 2]))
+
+
+def main_sources(shares: Mapping[str, Mapping[str, float]], minimum_share: float) -> list[str]:
+    """Return the sources whose share in the variance of at least one estimate is `minimum_share` or
+    more, by their largest share, the largest first.
+
+    Parameters
+    ----------
+    shares : mapping of str to mapping of str to float
+        Shares by estimate and source.
+    minimum_share : float
+        Smallest share of interest.
+    """
+    largest: dict[str, float] = {}
+    for source, share in (each for line in shares.values() for each in line.items()):
+        largest[source] = max(share, largest.get(source, 0.0))
+    return sorted((s for s in largest if largest[s] >= minimum_share), key=lambda s: -largest[s])

@@ -1,0 +1,83 @@
+"""Posterior of single effects of the budget, and what is concluded from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ...errors import listed
+from ...recording.deviation import Deviation, in_readable_unit
+from ..concerns import Concern
+from ..distributions import normal_isf
+from ..thresholds import CHANCE, RARE
+from .systematic_effects import DEVIATIONS, source_label
+
+# Decrease of the loss by another effect, over that by the most surprising one, from which on both
+# explain the residuals.
+AS_WELL = 0.8
+# Most effects that a message names besides the most surprising one.
+MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class EffectEstimate:
+    """Posterior of one effect, in its unit."""
+
+    name: str  # name with its component, and with a number if several recordings have it
+    mean: float
+    deviation: float  # standard deviation of the prior
+    value: float
+    std_error: float
+    # Value less mean over the standard deviation that this difference has for a true description.
+    surprise: float
+    alike: tuple[str, ...] = ()  # other effects that look alike in these data
+
+    def describe(self) -> str:
+        """Return name, estimate and prior as text."""
+        unit = effect_row(self.name).unit
+        value, error, mean, sigma = (
+            in_readable_unit(each, unit)[0]
+            for each in (self.value, self.std_error, self.mean, self.deviation)
+        )
+        shown = in_readable_unit(1.0, unit)[1]
+        return (
+            f"{source_label(self.name)} of {value:+.2g} ± {error:.1g}{shown}, where {mean:.2g} ± "
+            f"{sigma:.2g}{shown} is expected"
+        )
+
+
+def effect_row(name: str) -> Deviation:
+    """Return the row of an effect, by its name with or without component."""
+    return DEVIATIONS[name.partition(" ")[0]]
+
+
+def effect_concerns(
+    effects: Sequence[EffectEstimate], suspects: Mapping[str, float] | None = None
+) -> list[Concern]:
+    """Return one concern, as a list, if the data need an effect that is not expected of a true
+    description; else empty.
+
+    It names the most surprising effect, others whose columns look alike, and `suspects` beyond the
+    budget, by their decrease of the loss, that explain the residuals as well (`AS_WELL`). The
+    probability that any of the effects is so surprising by chance (Bonferroni) is below `CHANCE`, or
+    below `RARE`, which is doubtful.
+    """
+    if not effects:
+        return []
+    worst = max(effects, key=lambda each: abs(each.surprise))
+    limit, gross = (float(normal_isf(p / 2 / len(effects))) for p in (CHANCE, RARE))
+    if abs(worst.surprise) <= limit:
+        return []
+    found = sorted((suspects or {}).items(), key=lambda each: -each[1])
+    instead = [name for name, gain in found if gain > AS_WELL * worst.surprise**2]
+    alike = dict.fromkeys(source_label(name) for name in (*instead, *worst.alike))
+    others = [label for label in alike if label != source_label(worst.name)][:MOST_NAMED]
+    data = {
+        "effect": worst.describe(),
+        "surprise": abs(worst.surprise),
+        "alike": f"; {listed(others)} would look the same" if others else "",
+        "remedy": effect_row(worst.name).remedy,
+    }
+    return [
+        Concern("effect/surprising", "doubtful" if abs(worst.surprise) > gross else "check", data)
+    ]

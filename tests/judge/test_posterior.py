@@ -1,0 +1,196 @@
+"""The posterior of an answer against Bayes' formula, and what it says of single effects."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.judge.posterior import NOISE, NUISANCES, Effects, Posterior
+from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.statistics.budget.effect_estimates import EffectEstimate
+from collocation_sysid.statistics.budget.systematic_effects import DEVIATIONS
+from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
+from collocation_sysid.statistics.uncertainty import ErrorModel
+
+GIVEN = ErrorModel("given", "independent")
+PARAMETERS = Parameters.from_mapping(
+    {"young_pa": cs.Unknown(1e4), "gamma_r_s": cs.Unknown(1e-2), "gamma_m_1_s": cs.Unknown(0.5)}
+)
+NAMES = (*(item.name for item in PARAMETERS.free), "swing: time shift [s]")
+SHARED = len(PARAMETERS.free)
+Q = PARAMETERS.guess_q
+SAMPLES, MARKERS = 12, 2
+LAWS = ("damping_law material", "damping_law kelvin-voigt")
+
+
+def linear_fit(slopes: np.ndarray, residual: np.ndarray) -> LinearisedFit:
+    """A fit of residuals (n,) with derivatives (n, 4) by three constants and a time shift, whose
+    prior has the standard deviation one.
+    """
+    shape = (SAMPLES, MARKERS, 3)
+    measured = ResidualBlock(
+        "swing",
+        0.01 * np.arange(SAMPLES),
+        tuple(f"m{k}" for k in range(MARKERS)),
+        np.ones(shape[:2], dtype=bool),
+        residual.reshape(shape),
+        slopes.reshape(*shape, -1),
+        np.ones(MARKERS),
+    )
+    prior = np.array([0.0, 0.0, 0.0, 1.0])
+    return LinearisedFit((measured,), NAMES, SHARED, 0 * prior, prior, np.zeros(4, dtype=bool))
+
+
+def effects(columns: np.ndarray, *names: str, means: float | np.ndarray = 0.0) -> Effects:
+    """Effects with columns (n, a), in standard deviations of their priors."""
+    deviations = np.array([DEVIATIONS[name.partition(" ")[0]].considered for name in names])
+    blocks = (columns.reshape(SAMPLES, MARKERS, 3, -1),)
+    return Effects(names, blocks, np.broadcast_to(means, len(names)).astype(float), deviations)
+
+
+def posterior(fit: LinearisedFit, columns: np.ndarray, *names: str, means=0.0) -> Posterior:
+    return Posterior.from_fit(fit, effects(columns, *names, means=means), PARAMETERS, Q, GIVEN)
+
+
+def slopes(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Correlated columns, as those of the constants of a body are."""
+    size = SAMPLES * MARKERS * 3
+    return 3 * rng.normal(size=(size, count)) + 2 * rng.normal(size=(size, 1))
+
+
+def by_bayes(
+    slopes: np.ndarray, residual: np.ndarray, columns: np.ndarray, means: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of all parameters and effects, whose priors are normal; those of the
+    constants are flat.
+    """
+    rows = np.hstack([slopes, columns])
+    precision = np.diag(np.repeat([0.0, 1.0], [SHARED, rows.shape[1] - SHARED]))
+    mean = np.concatenate([np.zeros(slopes.shape[1]), means])
+    covariance = np.linalg.inv(rows.T @ rows + precision)
+    return covariance @ (precision @ mean - rows.T @ residual), covariance
+
+
+def of_effect(found: Posterior, name: str) -> EffectEstimate:
+    (own,) = (each for each in found.effect_estimates if each.name == name)
+    return own
+
+
+# Bayes' formula -----------------------------------------------------------------------------------
+
+
+def test_step_covariance_and_budget_are_those_of_bayes_formula(rng):
+    by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
+    residual = rng.normal(size=len(columns))
+    means = np.array([0.0, 2.0, 0.0])
+    names = ("mass", "grip_layer_m", "body_scale")
+    found = posterior(linear_fit(by_parameters, residual), columns, *names, means=means)
+    mean, covariance = by_bayes(by_parameters, residual, columns, means)
+    np.testing.assert_allclose(found.step, mean, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, covariance, atol=1e-9)
+    np.testing.assert_allclose(found.q, Q + mean[:SHARED], atol=1e-9)
+    by_noise = covariance @ np.hstack([by_parameters, columns]).T
+    for k, name in enumerate(PARAMETERS.names):
+        line, variance = found.budget[name], covariance[k, k]
+        expected = {NOISE: np.sum(by_noise[k] ** 2), NUISANCES: covariance[k, 3] ** 2}
+        expected |= dict(zip(names, covariance[k, 4:] ** 2, strict=True))
+        for source, part in expected.items():
+            assert line.shares[source] == pytest.approx(part / variance, rel=1e-4), source
+        assert np.log(line.value) == pytest.approx(Q[k] + mean[k])
+        low, high = np.log(line.combined95)
+        assert high - low == pytest.approx(2 * 1.96 * np.sqrt(variance), rel=1e-4)
+        assert line.combined_std_error / line.value == pytest.approx(np.sqrt(variance), rel=1e-4)
+    for k, name in enumerate(names, start=4):
+        own, size = of_effect(found, name), DEVIATIONS[name].considered
+        assert own.value == pytest.approx(mean[k] * size)
+        assert own.std_error == pytest.approx(np.sqrt(covariance[k, k]) * size)
+        assert (own.mean, own.deviation) == pytest.approx((means[k - 4] * size, size))
+
+
+def test_effects_without_some_are_those_of_a_fit_without_them(rng):
+    by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
+    fit = linear_fit(by_parameters, rng.normal(size=len(columns)))
+    whole = posterior(fit, columns, "mass", "grip_layer_m", "body_scale")
+    part = posterior(fit, columns[:, 1:], "grip_layer_m", "body_scale")
+    np.testing.assert_allclose(whole.without(["mass"]).q, part.q, atol=1e-9)
+    np.testing.assert_allclose(whole.without(["mass"]).covariance, part.covariance, atol=1e-9)
+
+
+@pytest.mark.long
+def test_intervals_hold_and_surprises_are_standard_normal_if_all_is_drawn_from_its_prior():
+    rng = np.random.default_rng(11)
+    by_parameters, columns = slopes(rng, 4), 0.7 * slopes(rng, 3)
+    columns[:, 2] = by_parameters[:, 0] + 0.3 * rng.normal(size=len(columns))
+    names, means, draws = ("mass", "body_scale", "air_drag"), np.array([0.0, 0.0, 1.0]), 600
+    held, surprises = [], []
+    for _ in range(draws):
+        truth = np.concatenate([0.1 * rng.normal(size=SHARED), rng.normal(size=1)])
+        residual = rng.normal(size=len(columns)) - by_parameters @ truth
+        residual -= columns @ (means + rng.normal(size=3))
+        found = posterior(linear_fit(by_parameters, residual), columns, *names, means=means)
+        for k, name in enumerate(PARAMETERS.names):
+            low, high = np.log(found.reported(name).combined95)
+            held.append(low < Q[k] + truth[k] < high)
+        surprises.append([of_effect(found, name).surprise for name in names])
+    assert 0.93 < np.mean(held) < 0.97
+    np.testing.assert_allclose(np.mean(surprises, axis=0), 0.0, atol=3 / np.sqrt(draws))
+    np.testing.assert_allclose(np.var(surprises, axis=0), 1.0, atol=3 * np.sqrt(2 / draws))
+
+
+# Single effects -----------------------------------------------------------------------------------
+
+
+def test_an_effect_that_the_data_cannot_see_leaves_the_value_and_adds_its_prior(rng):
+    by_parameters = slopes(rng, 4)
+    fit = linear_fit(by_parameters, rng.normal(size=len(by_parameters)))
+    without = posterior(fit, by_parameters[:, :0])
+    # A mass that is too large by 10 % is as a modulus that is too large by 10 %.
+    found = posterior(fit, 0.1 * by_parameters[:, :1], "mass")
+    np.testing.assert_allclose(found.q, without.q, atol=1e-9)
+    added = found.covariance[:SHARED, :SHARED] - without.covariance[:SHARED, :SHARED]
+    np.testing.assert_allclose(added, np.diag([0.01, 0.0, 0.0]), atol=1e-9)
+    assert found.systematic("young_pa") == pytest.approx(0.1)
+    assert found.effect_estimates == ()
+
+
+def test_an_effect_that_the_data_determine_corrects_the_value_and_adds_nothing(rng):
+    by_parameters = slopes(rng, 4)
+    noise = rng.normal(size=len(by_parameters))
+    column = 1e3 * slopes(rng, 1)
+    found = posterior(linear_fit(by_parameters, noise - 2 * column[:, 0]), column, "mass")
+    # As a parameter without a prior.
+    rows = np.hstack([by_parameters, column])
+    bare = np.linalg.inv(rows.T @ rows + np.diag([0.0, 0.0, 0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(found.covariance, bare, rtol=1e-4, atol=1e-9)
+    right = posterior(linear_fit(by_parameters, noise), column, "mass")
+    np.testing.assert_allclose(found.q, right.q, atol=1e-5)
+    assert found.systematic("young_pa") < 1e-3
+    own = of_effect(found, "mass")
+    assert own.value / own.deviation == pytest.approx(2.0, abs=1e-3)
+    assert own.surprise == pytest.approx(2.0, abs=1e-3)
+
+
+def test_effects_that_look_alike_name_each_other(rng):
+    by_parameters, columns = slopes(rng, 4), slopes(rng, 3)
+    columns[:, 1] = -2 * columns[:, 0] + by_parameters @ [3.0, 0.0, 1.0, 0.0]
+    fit = linear_fit(by_parameters, rng.normal(size=len(columns)))
+    found = posterior(fit, columns, "mass", "body_scale", "air_drag")
+    assert of_effect(found, "mass").alike == ("body_scale",)
+    assert of_effect(found, "body_scale").alike == ("mass",)
+    assert of_effect(found, "air_drag").alike == ()
+
+
+@pytest.mark.parametrize("laws", [LAWS[:1], LAWS])
+def test_a_constant_is_that_of_the_stated_damping_law(rng, laws):
+    """Another law, one or two of them, and an effect that changes no definition."""
+    by_parameters, columns = slopes(rng, 4), slopes(rng, 1 + len(laws))
+    fit = linear_fit(by_parameters, 3 * rng.normal(size=len(columns)))
+    stated = posterior(fit, columns[:, :1], "mass")
+    found = posterior(fit, columns, "mass", *laws)
+    np.testing.assert_allclose(found.q[1:], stated.q[1:], atol=1e-9)
+    for name in ("gamma_r_s", "gamma_m_1_s"):
+        line = found.budget[name]
+        assert line.shares.get("damping_law", 0.0) < 1e-12
+        assert line.combined95 == pytest.approx(stated.budget[name].combined95)
+    assert found.budget["young_pa"].shares["damping_law"] > 0
