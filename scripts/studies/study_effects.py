@@ -139,7 +139,8 @@ def recorded_m(
     twin: Twin, divisions: Divisions, stated: cs.Experiment, rng: np.random.Generator
 ) -> Array:
     """Return the tracks (T, M, 3) [m] that cameras with errors record of a body with errors."""
-    refined = tuple(2 * count for count in divisions)
+    across, deep, along = (2 * count for count in divisions)
+    refined: Divisions = (across, deep, along)
     fine = _sampled(twin, refined, SUBSTEPS)
     nuisance = stated.nuisance
     hand_eye = _size(nuisance.hand_eye_m), _size(nuisance.hand_eye_rad)

@@ -103,7 +103,7 @@ def independent_tracks_m(places_m: np.ndarray) -> np.ndarray:
     bar, motion = independent_motion()
     x, y, z = places_m.T
     unit = np.column_stack([y / 0.015 - 1, z / 0.01 - 1, x / 0.12])
-    return np.asarray(bar.interpolation(unit) @ motion(LONG_S))
+    return np.asarray(bar.interpolation(unit.tolist()) @ motion(LONG_S))
 
 
 def hand_poses(t_s: np.ndarray) -> np.ndarray:
