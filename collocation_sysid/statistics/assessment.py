@@ -176,7 +176,9 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     # Residuals of exactly zero are those of no measurement at all. Dependent residuals scatter less
     # by chance, too, and their error bars do not follow from sigma.
     least = GROSS_MISFIT if is_used and any(_correlations(uncertainty.dependence)) else MISFIT
-    smaller = not larger and 0 < factor < 1 / least and level.smaller_p < RARE
+    # The stated σ of instruments that may err slowly contains more than the noise of a sample.
+    may_err_slowly = uncertainty.unexplained is not uncertainty.dependence
+    smaller = 0 < factor < 1 / least and level.smaller_p < RARE and not (larger or may_err_slowly)
     sigma_key = level.sigma_key
     return [
         *(each.to_concern() for each in uncertainty.outliers if each.deviations > GROSS_MISFIT),

@@ -233,7 +233,9 @@ def white(kind, seed=0):
 def size_of_residuals(kind):
     assert codes(kind, white(kind)) == set()
     assert named(kind, "noise/larger") in codes(kind, 5 * white(kind))
-    assert named(kind, "noise/smaller") in codes(kind, white(kind) / 5)
+    # Trackers may err slowly by more than from image to image.
+    is_smaller = named(kind, "noise/smaller") in codes(kind, white(kind) / 5)
+    assert is_smaller == (kind != "image tracks")
 
 
 def small_but_persistent(kind):
@@ -242,7 +244,7 @@ def small_but_persistent(kind):
     """
     slow = autoregressive(np.random.default_rng(3), SAMPLES, BLOCKS[kind][1][0], 0.99)
     found = codes(kind, slow / 4)
-    assert named(kind, "noise/smaller") in found
+    assert (named(kind, "noise/smaller") in found) == (kind != "image tracks")
     if kind not in (*SPECIMENS, "image tracks"):
         assert "residuals/persist" in found
 
