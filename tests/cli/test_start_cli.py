@@ -52,7 +52,7 @@ def result_of(run: Path) -> dict:
 def test_the_truth_is_found_without_a_guess(folder):
     found = result_of(folder / "run")["parameters"]
     for name, value in TRUTH.items():
-        assert found[name]["value"] == pytest.approx(value, rel=1e-4)
+        assert found[name]["optimum"] == pytest.approx(value, rel=1e-4)
 
 
 def test_the_scan_is_reported(folder):
@@ -138,7 +138,7 @@ def test_an_earlier_answer_is_a_start(folder):
     result, earlier = result_of(run), result_of(folder / "run")
     for name in TRUTH:
         guess = result["parameters"][name]["guess"]
-        assert guess == pytest.approx(earlier["parameters"][name]["value"])
+        assert guess == pytest.approx(earlier["parameters"][name]["optimum"])
     assert result["scan"] is None
 
 
