@@ -185,11 +185,6 @@ class Effects:
         return replace(fit, blocks=tuple(replace(b, jacobian=each) for b, each in pairs))
 
 
-def _step(fit: LinearisedFit, considered: Effects) -> Array:
-    """Return the step (p,) of all parameters of a fit, with effects that are not learnt at their means."""
-    return gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
-
-
 def _conditional_slopes(fit: LinearisedFit, column: int, left_out: Sequence[int]) -> Array:
     """Return the changes (p,) of all parameters but some if one of them changes by one."""
     information = least_squares_of_fit(fit).information
@@ -213,6 +208,7 @@ class Posterior:
     start: Array  # (nq,): q at which `fit` is linearised
     effects: Effects  # that are learnt
     considered: Effects  # that are not
+    step: Array  # (p + a,): step of all parameters and learnt effects
     uncertainty: Uncertainty  # of the fit after the step
     reported_q: Array  # (nq,): q of `uncertainty`, after the step
 
@@ -242,19 +238,15 @@ class Posterior:
         none = effects.only(())
         learnt, considered = (effects, none) if is_learnt else (none, effects)
         wide = learnt.added_to(fit, parameters)
-        after = wide.after_step(gauss_newton_step(wide))
-        step = _step(wide, considered)
+        step = gauss_newton_step(wide)
+        after = wide.after_step(step)
+        step = step + estimate_changes(wide, considered.blocks) @ considered.means
         there = np.clip(q + step[: len(q)], *parameters.bounds_q)
         if derived_at is not None:
             after = replace(after, derived=derived_at(there))
         uncertainty = uncertainty_from_fit(after, parameters, there, error_model)
         wide = replace(wide, derived=after.derived)
-        return cls(wide, parameters, q, learnt, considered, uncertainty, there)
-
-    @cached_property
-    def step(self) -> Array:
-        """Step (p + a,) of all parameters and effects."""
-        return _step(self.fit, self.considered)
+        return cls(wide, parameters, q, learnt, considered, step, uncertainty, there)
 
     @cached_property
     def q(self) -> Array:
@@ -263,12 +255,16 @@ class Posterior:
         return np.clip(moved, *self.parameters.bounds_q)
 
     @cached_property
+    def _information(self) -> Array:
+        return least_squares_of_fit(self.fit).information
+
+    @cached_property
     def covariance(self) -> Array:
         """Covariance (p + a, p + a) with the stated noise; zero for parameters at a bound."""
         free = np.flatnonzero(~self.fit.at_bound)
         matrix = np.zeros(2 * (len(self.fit.names),))
-        information = least_squares_of_fit(self.fit).information[np.ix_(free, free)]
-        matrix[np.ix_(free, free)] = np.linalg.pinv(information, hermitian=True)
+        own = self._information[np.ix_(free, free)]
+        matrix[np.ix_(free, free)] = np.linalg.pinv(own, hermitian=True)
         return matrix
 
     @cached_property
@@ -301,11 +297,6 @@ class Posterior:
         return -self.step[place] * self.covariance[: len(self.start)] @ flat
 
     @property
-    def sensitivities(self) -> Array:
-        """Changes (nq, a) of q by each of `sources`."""
-        return self.sources[1]
-
-    @property
     def _of_effects(self) -> Index:
         return np.arange(len(self.fit.names) - len(self.effects.names), len(self.fit.names))
 
@@ -333,7 +324,8 @@ class Posterior:
         )
         considered = self.considered.without(left_out)
         learnt = self.effects.without(left_out)
-        return replace(self, fit=fit, effects=learnt, considered=considered)
+        step = gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
+        return replace(self, fit=fit, effects=learnt, considered=considered, step=step)
 
     @cached_property
     def derivatives(self) -> dict[str, Array]:
@@ -469,7 +461,7 @@ class Posterior:
         """Return the covariance (nq, nq) due to noise and systematic effects in the coordinates of a
         statistical one, `sizes` (nq,) being the derivatives of these coordinates by q.
         """
-        ways = [self.sensitivities]
+        ways = [self.sources[1]]
         if self.uncertainty.scatter is not None:
             ways.append(self.uncertainty.scatter.sensitivities[: len(self.start)])
         moved = sizes[:, None] * np.hstack(ways)
@@ -524,7 +516,7 @@ class Posterior:
     @cached_property
     def _cosines(self) -> Array:
         """Cosines (a, a) of the columns of effects beside all parameters."""
-        information = least_squares_of_fit(self.fit).information
+        information = self._information
         places = self._of_effects
         others = np.flatnonzero(~self.fit.at_bound)[: -len(places)]
         inverse = np.linalg.pinv(information[np.ix_(others, others)], hermitian=True)

@@ -415,11 +415,3 @@ def gauss_newton_step(fit: LinearisedFit) -> Array:
     """
     free = np.where(fit.at_bound, NO_STEP, np.inf)
     return least_squares_of_fit(fit).minimiser(-free, free)
-
-
-def covariance_of_fit(fit: LinearisedFit) -> Array:
-    """Return the covariance (p, p) of all parameters of a fit with the stated noise and priors,
-    bounds ignored; directions that are not determined count as known.
-    """
-    information = least_squares_of_fit(fit).information
-    return np.asarray(np.linalg.pinv(information, hermitian=True), float)

@@ -260,11 +260,6 @@ AGAINST = Threshold(
     "leave it positive.",
     study="mistakes",
 )
-SIGNIFICANT_ALONE = Threshold(
-    15.0,
-    "Decrease of χ² that a reader takes for significant: the reason why it is not is stated.",
-    study="mistakes",
-)
 SUDDEN = Threshold(4.0, "Size of a step over usual changes between samples.", study="mistakes")
 CLEARLY = Threshold(2.5, "Factor by which exchanged names must fit better.", study="mistakes")
 TAMED = Threshold(
