@@ -20,6 +20,7 @@ from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
 from .condensed_steps import StepEquations
 from .extrapolation import MOST_VALUES, next_value
+from .homogeneous_equilibria import homogeneous_equilibria
 from .initial_equilibrium import initial_state
 from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .newton_solver import (
@@ -109,6 +110,10 @@ def continue_simulation(
     failure = _body_failure(dynamics)
     if failure is not None:
         return x[:0] if known is None else known, failure
+    options = options or NewtonOptions()
+    equilibria = homogeneous_equilibria(experiment, dynamics, options, approximate_solution)
+    if equilibria is not None:
+        return equilibria, None
     solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     v0 = np.zeros(x.shape[1])
