@@ -15,7 +15,7 @@ from ..fem.body import Body
 from ..recording import Experiment, Specimen
 from ..recording.homogeneous_deformation import shape_factor
 from ..recording.hysteresis import loading_rows
-from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.sample_times import TIME_TOLERANCE_S, first_unordered_time
 from ..recording.specimen_checks import (
     order_warnings,
     require_plausible_specimen,
@@ -54,18 +54,13 @@ class SpecimenReader:
         """
         section = self.section
         file = existing_file(self.folder, section.file, key="file")
-        table = read_specimen(
-            file,
-            layout_from_section(
-                section,
-                requires_times=section.modulus != "harmonic"
-                and (
-                    self.body.has_memory
-                    or section.window_s is not None
-                    or section.modulus is not None
-                ),
-            ),
+        is_timed = section.modulus != "harmonic" and (
+            self.body.has_memory or section.modulus is not None
         )
+        layout = layout_from_section(
+            section, requires_times=is_timed or section.window_s is not None, is_timed=is_timed
+        )
+        table = read_specimen(file, layout)
         if table.is_incompressible:
             what = (
                 "the difference of the true stresses is taken"
@@ -123,7 +118,15 @@ class SpecimenReader:
         rows = self._rows(table)
         if len(rows) < len(table.t_s):
             self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
-        arguments = values_over_time(at_times(table, rows))
+        used = at_times(table, rows)
+        if fault := first_unordered_time(table.t_s):
+            self._add_note(
+                f"{section.file}: times are not in order (row {fault[0] + 1}); the rows are taken as "
+                "they stand, because the law does not depend on times"
+            )
+            if first_unordered_time(used.t_s):
+                used = replace(used, t_s=np.arange(float(len(rows))))
+        arguments = values_over_time(used)
         temperature = {
             "shift": section.shift,
             "temperature_difference_k": section.temperature_difference_k,
@@ -203,14 +206,16 @@ class SpecimenReader:
         if self.simulation:
             return rows
         first_s, last_s = section.window_s or (-np.inf, np.inf)
-        is_inside = (table.t_s >= first_s - TIME_TOLERANCE_S) & (
-            table.t_s <= last_s + TIME_TOLERANCE_S
-        )
-        rows = rows[is_inside]
+        if section.window_s is not None:
+            # Times that are not in order end the window where they leave it.
+            begun = np.flatnonzero(table.t_s >= first_s - TIME_TOLERANCE_S)
+            rows = rows[begun[0] :] if begun.size else rows[:0]
+            left = np.flatnonzero(table.t_s[rows] > last_s + TIME_TOLERANCE_S)
+            rows = rows[: left[0]] if left.size else rows
         if not rows.size:
             raise InputError(
                 f"found [{first_s:g}, {last_s:g}], which contains no sample; expected a window "
-                f"within the times of the table, {table.t_s[0]:g} s to {table.t_s[-1]:g} s",
+                f"within the times of the table, {np.nanmin(table.t_s):g} s to {np.nanmax(table.t_s):g} s",
                 where="window_s",
             )
         if section.skip_cycles:
@@ -240,10 +245,10 @@ class SpecimenReader:
 
 
 def layout_from_section(
-    section: SpecimenSection, *, requires_times: bool = False
+    section: SpecimenSection, *, requires_times: bool = False, is_timed: bool = True
 ) -> SpecimenLayout:
     """Return the meaning of the columns of the file of a specimen; `requires_times` is whether the
-    file must contain times.
+    file must contain times, `is_timed` whether they must increase.
     """
     return SpecimenLayout(
         test=section.deformation,
@@ -256,6 +261,7 @@ def layout_from_section(
         length_m=section.length_m,
         area_m2=section.area_m2,
         requires_times=requires_times,
+        is_timed=is_timed,
         axial_stretch=section.axial_stretch,
         transverse_stretch=section.transverse_stretch,
     )

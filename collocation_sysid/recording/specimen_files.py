@@ -84,6 +84,7 @@ class SpecimenLayout:
     length_m: float | None = None  # undeformed length that divides a displacement
     area_m2: float | None = None  # undeformed area by which a force is divided
     requires_times: bool = False  # whether the table must have times
+    is_timed: bool = True  # whether its times must increase, because the law depends on them
     # Those of `Specimen`.
     axial_stretch: float = 1.0
     transverse_stretch: float | None = None
@@ -149,7 +150,8 @@ class SpecimenLayout:
 class SpecimenTable:
     """Measurements of a material test in the terms of `Specimen`."""
 
-    # (T,): times; the number of the row in seconds if the table has none.
+    # (T,): times; the number of the row in seconds if the table has none. NaN or in any order if the
+    # law does not depend on them.
     t_s: Array = field(metadata=over_time())
     # (T,): strain without NaN; stress NaN where the cell is blank.
     strain: Array = field(metadata=over_time())
@@ -208,6 +210,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         column_names=layout.columns,
         blank_allowed=True,
         requires_times=layout.requires_times,
+        is_timed=layout.is_timed,
         column_advice=partial(column_advice, layout=layout),
         noise_columns=layout.noise_columns,
     )

@@ -201,6 +201,7 @@ def read_columns(
     column_names: Mapping[str, str] | None = None,
     blank_allowed: bool = False,
     requires_times: bool = True,
+    is_timed: bool = True,
     requires_all: bool = False,
     column_advice: Callable[[Table], str] | None = None,
     noise_columns: Mapping[str, str] | None = None,
@@ -218,6 +219,8 @@ def read_columns(
         Whether cells may be blank, which become NaN; a column of blank cells alone is refused.
     requires_times : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
+    is_timed : bool
+        Whether times must be numbers that increase; otherwise a time that is no number is NaN.
     requires_all : bool
         Whether each of `quantities` is required; otherwise one is enough.
     column_advice : callable, optional
@@ -232,7 +235,7 @@ def read_columns(
     ------
     InputError
         If a column is missing, repeated, unknown, without unit or with a wrong one, a cell is not a
-        number, or time does not increase; the line is named.
+        number, or time does not increase (`is_timed`); the line is named.
     """
     grid = read_table(path)
     noises = {}
@@ -255,7 +258,9 @@ def read_columns(
         values[key] = factor * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
         if np.isnan(values[key]).all():
             raise InputError(f"column {grid.columns[place]} has no values; remove it")
-    t_s = np.arange(float(len(grid.cells))) if t is None else times_in_column(grid, *t)
+    t_s = np.arange(float(len(grid.cells)))
+    if t is not None:
+        t_s = times_in_column(grid, *t, is_timed=is_timed)
     used = [place for place, _ in (*places.values(), *([] if t is None else [t]))]
     unread = [
         column

@@ -305,19 +305,24 @@ def _require_no_codes(grid: Table, column: int, values: Array, blank_allowed: bo
         )
 
 
-def times_in_column(grid: Table, column: int, factor: float = 1.0) -> Array:
+def times_in_column(grid: Table, column: int, factor: float = 1.0, is_timed: bool = True) -> Array:
     """Return the times (rows,) [s] in a column.
 
     Parameters
     ----------
     factor : float
         Factor from the column's unit to seconds.
+    is_timed : bool
+        Whether times must be numbers that increase; otherwise cells that are no numbers are NaN.
 
     Raises
     ------
     InputError
         If a cell is blank or not a number, or time does not increase; the line is named.
     """
+    if not is_timed:
+        values = np.array([_number_of_cell(str(cell)) for cell in grid.cells[:, column]])
+        return factor * np.where(np.isfinite(values), values, np.nan)
     t_s = factor * numeric_cells(grid, [column], blank_allowed=False)[:, 0]
     if fault := first_unordered_time(t_s):
         raise grid.error_at(fault[1], fault[0])
