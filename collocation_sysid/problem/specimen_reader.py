@@ -16,6 +16,7 @@ from ..recording import Experiment, Specimen
 from ..recording.homogeneous_deformation import shape_factor
 from ..recording.hysteresis import loading_rows
 from ..recording.sample_times import TIME_TOLERANCE_S, first_unordered_time
+from ..recording.specimen_averages import RESOLUTION, with_averaged_rows
 from ..recording.specimen_checks import (
     order_warnings,
     require_plausible_specimen,
@@ -105,7 +106,15 @@ class SpecimenReader:
                 '[uncertainty.assumptions] contains 5 %; state "none" for an extensometer or a strip'
             )
         self._note_unknown_past(specimen)
-        experiment = specimen.experiment(
+        fitted = specimen
+        if not (self.simulation or section.validation or self.body.has_memory):
+            fitted = with_averaged_rows(specimen)
+        if fitted is not specimen:
+            self._add_note(
+                f"{section.file}: {len(specimen.strain)} rows are averaged to {len(fitted.strain)}, "
+                f"while the strain changes by less than {RESOLUTION:.0%} of its range"
+            )
+        experiment = fitted.experiment(
             name=section.name, validation=section.validation, body=self.body
         )
         return specimen, replace(experiment, specimen=deformation)
