@@ -206,7 +206,8 @@ def _power_law_start(solution: Solution) -> Start | None:
         abs(ended - other) <= OTHER_EXPONENT * (1 + abs(other))
         for ended, other in zip(*exponents, strict=True)
     )
-    if is_same or solution.history[-1].loss <= (1 + LEAST_SHARE) * start.loss:
+    is_as_good = solution.history[-1].loss <= (1 + LEAST_SHARE) * start.loss
+    if is_same or (is_as_good and solution.status.converged):
         return None
     found = ", ".join(f"{exponent:.3g}" for exponent in exponents[1])
     note = f"a second start, from the exponents {found} of the closed forms,"

@@ -184,6 +184,59 @@ def test_terms_that_run_together_and_explain_little_are_left_out():
     assert items["mu_2_pa"].guess == 0.0
 
 
+def pull_of(stress_of, sigma_pa=500.0):
+    """Uniaxial test whose stress is a function of the stretch."""
+    strain = np.linspace(0.04, 1.95, 43)
+    return cs.Specimen("uniaxial", strain, stress_of(1 + strain), sigma_pa)
+
+
+@pytest.mark.parametrize("stated", [{}, {"alpha_1": cs.Unknown(2.0), "alpha_2": cs.Unknown(-2.0)}])
+def test_a_law_that_fits_but_is_unstable_has_one_term_less(stated):
+    """A term with μ α < 0 and a large exponent: the specimen does not resist a change of its section."""
+
+    def stress_pa(stretch):
+        terms = ((110e3, 3.2), (2.3e3, -10.4))
+        return sum(mu * (stretch**a - stretch ** (-a / 2)) / stretch for mu, a in terms)
+
+    problem = without_guess("ogden-2", [pull_of(stress_pa)], **stated)
+    start, items = start_of(problem)
+    assert "1 of 2 terms" in start.note
+    assert "unstable" in start.note
+    assert items["mu_2_pa"].is_fixed
+    assert items["mu_2_pa"].guess == 0.0
+    assert not items["alpha_1"].is_fixed
+
+
+@pytest.mark.long
+def test_a_law_whose_second_term_is_unstable_converges_with_one():
+    def stress_pa(stretch):
+        terms = ((110e3, 3.2), (2.3e3, -10.4))
+        return sum(mu * (stretch**a - stretch ** (-a / 2)) / stretch for mu, a in terms)
+
+    answer = cs.run(without_guess("ogden-2", [pull_of(stress_pa)]))
+    assert answer.solution.status.converged
+    assert answer.parameters["mu_2_pa"] == 0.0
+    assert answer.trust.verdict == "doubtful"
+    assert answer.trust.concerns[0].code == "specimen/law"
+
+
+@pytest.mark.parametrize("has_guess", [False, True])
+def test_two_terms_of_a_foam_that_run_together_without_fitting_are_one(has_guess):
+    """A plateau and densification that no term has, in compression and tension."""
+    random = np.random.default_rng(1)
+    tests = []
+    for strain in (np.linspace(-0.02, -0.6, 60), np.linspace(0.02, 0.6, 60)):
+        size = np.abs(strain)
+        dense = np.maximum(-strain - 0.25, 0.0) ** 2
+        stress_pa = 6e4 * np.tanh(size / 0.04) + 5e5 * size + 5e6 * dense
+        noise_pa = 2e3 * random.standard_normal(len(strain))
+        tests.append(cs.Specimen("uniaxial", strain, np.sign(strain) * stress_pa + noise_pa, 5e3))
+    stated = {"alpha_1": cs.Unknown(4.0)} if has_guess else {}
+    _, items = start_of(without_guess("hyperfoam-2", tests, **stated))
+    terms = {p: (items[f"mu_{p}_pa"].guess, items[f"alpha_{p}"].guess) for p in (1, 2)}
+    assert terms[2][0] == 0.0 or abs(terms[1][1] - terms[2][1]) > 1.0
+
+
 def test_specimens_of_other_laws_have_no_closed_start():
     strain = np.linspace(0.0, 0.5, 10)
     specimen = cs.Specimen("uniaxial", strain, 1e5 * strain, 100.0)

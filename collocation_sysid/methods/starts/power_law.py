@@ -13,7 +13,7 @@ not determine the constants of the stated law that it lacks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
@@ -52,10 +52,11 @@ EQUAL_LOSS = 4.0
 # Least decrease of χ² per constant that a larger law has more, over χ² of one measurement: normal
 # noise exceeds it in 1 of 1000 fits.
 LEAST_GAIN = 10.8
-# Least decrease of χ², relative to the laws with fewer terms, by two exponents that run together:
-# of a misfit of the law itself they explain a little more with factors that cancel, and a search
-# among such terms does not end.
-LEAST_SHARE_TOGETHER = 0.2
+# Deviation of χ² from its mean that chance allows, in its standard deviations.
+MOST_DEVIATIONS = 3.0
+# Largest χ² of one measurement with two exponents that run together: of a misfit of the law itself
+# they explain a little more with factors that cancel, and a search among such terms does not end.
+MOST_TOGETHER = 2.0
 # Exponents nearer to zero are replaced by this one: the quotients by α lose digits.
 SMALLEST_EXPONENT = 1e-5
 # Largest exponent of e in a power of a stretch.
@@ -77,12 +78,17 @@ class _Stress:
 class _Test:
     gradient: Array  # (T, 3, 3): prescribed deformation gradients, 1 where the specimen is free
     per_strain: Array  # (3, 3): derivative of the gradient by an offset of all strains
-    free: int  # number of directions in which the specimen is free to contract
+    free_axes: list[int]  # directions in which the specimen is free to contract
     test: str  # kind of test, see `Specimen`
     # Prior standard deviation of a constant offset of the first strain; 0 if exact.
     strain_zero: float
     stresses: list[_Stress]
     lateral: tuple[Array, Array] | None  # (values (T,), sigma) or None: measured free stretch
+
+    @property
+    def free(self) -> int:
+        """Number of directions in which the specimen is free to contract."""
+        return len(self.free_axes)
 
     @property
     def measurements(self) -> int:
@@ -369,10 +375,32 @@ class _PowerLawFits:
             return None
         return _Fit(2 * float(result.cost), alpha, shares, betas, has_one_beta, 2 * n + count)
 
+    def _is_stable(self, fit: _Fit) -> bool:
+        """Return whether the law resists shear in each principal plane at all measured stretches.
+
+        In a plane of principal directions i and j this is Σ_p G_p (λ_i^α_p + λ_j^α_p) > 0 with the
+        shares G_p of the shear modulus.
+        """
+        for test in self.tests:
+            logs = test.log_stretches(0.0)
+            free = _free_stretch(test, logs, fit.alpha, fit.shear_pa, fit.beta)
+            logs[:, test.free_axes] = free[:, None]
+            moduli = np.stack([_power(each, fit.alpha) @ fit.shear_pa for each in logs.T])
+            if min((moduli[i] + moduli[j]).min() for i, j in combinations(range(3), 2)) <= 0:
+                return False
+        return True
+
     def _smallest_sufficient(self, fits: Sequence[_Fit]) -> _Fit:
-        """Return the fit with the fewest constants that no larger law improves clearly."""
+        """Return the fit with the fewest constants that no larger law improves clearly.
+
+        If σ is more than what the best law leaves, σ contains more than noise: then the fit with the
+        fewest constants counts that explains the measurements within σ.
+        """
         fits = sorted(fits, key=lambda fit: fit.constants)
         freedom = max(1, self.measurements - fits[-1].constants)
+        chance = MOST_DEVIATIONS * np.sqrt(2 * freedom)
+        if min(fit.loss for fit in fits) < freedom - chance:
+            return next(fit for fit in fits if fit.loss <= freedom + chance)
         unit = max(1.0, min(fit.loss for fit in fits) / freedom)
         for k, fit in enumerate(fits):
             gains = [
@@ -390,25 +418,39 @@ class _PowerLawFits:
             for item in self.parameters.components
             if item.name in names
         )
+        fits = self._fits([self.terms] if has_guess else self._numbers(), may_tie=not has_guess)
+        admissible = list(filter(self._is_admissible, fits))
+        if has_guess and fits and not admissible:
+            fits += self._fits(self._numbers()[:-1], may_tie=True)
+            admissible = list(filter(self._is_admissible, fits))
+            has_guess = not admissible
+        if not fits:
+            return None
+        chosen = self._smallest_sufficient(admissible or fits)
+        is_unstable = any(
+            each.loss < chosen.loss and not self._is_stable(each)
+            for each in fits
+            if len(each.alpha) > len(chosen.alpha)
+        )
+        return self._with_fit(chosen, may_fix=not has_guess, is_unstable=is_unstable)
+
+    def _fits(self, numbers: Iterable[int], may_tie: bool) -> list[_Fit]:
+        """Return the fits of laws with numbers of terms; those with one β too if `may_tie`."""
         fits = []
-        for terms in [self.terms] if has_guess else self._numbers():
+        for terms in numbers:
             fit = self._fit(terms)
             own = None
             if fit and terms > 1 and self.beta_is_free.sum() > 1:
                 own = self._improve(fit, has_one_beta=False)
-            fits += [each for each in (own or fit, fit if own and not has_guess else None) if each]
-        if not fits:
-            return None
-        apart = [each for each in fits if not each.pairs or self._is_worth_a_pair(each, fits)]
-        return self._with_fit(self._smallest_sufficient(apart), may_fix=not has_guess)
+            fits += [each for each in (own or fit, fit if own and may_tie else None) if each]
+        return fits
 
-    @staticmethod
-    def _is_worth_a_pair(fit: _Fit, fits: Sequence[_Fit]) -> bool:
-        """Whether two exponents that run together are clearly better than fewer terms."""
-        fewer = [each.loss for each in fits if len(each.alpha) < len(fit.alpha)]
-        return fit.loss < (1 - LEAST_SHARE_TOGETHER) * min(fewer, default=np.inf)
+    def _is_admissible(self, fit: _Fit) -> bool:
+        """Whether the law is stable, and exponents that run together explain the measurements."""
+        explains = fit.loss < MOST_TOGETHER * self.measurements
+        return (explains or not fit.pairs) and self._is_stable(fit)
 
-    def _with_fit(self, fit: _Fit, may_fix: bool) -> PowerLawStart:
+    def _with_fit(self, fit: _Fit, may_fix: bool, is_unstable: bool) -> PowerLawStart:
         """Return the start from a fit; constants that it lacks are fixed or tied if `may_fix`."""
         may_be_first = self._may_be_first(fit.alpha, fit.shear_pa)
         order = sorted(
@@ -438,7 +480,7 @@ class _PowerLawFits:
                 }
                 if self.is_foam and self.beta_is_free[p - 1]:
                     fixed[f"beta_{p}"] = 0.0
-            notes = self._notes(len(order), near=near, tied=tied, fixed=fixed)
+            notes = self._notes(len(order), is_unstable, near=near, tied=tied, fixed=fixed)
         young_pa = 3 * max(abs(float(fit.shear_pa.sum())), 1e-3 * float(np.abs(fit.shear_pa).max()))
         parameters = self.parameters.map_components(
             lambda item: _started(self.items[item.name], guesses, fixed=fixed, tied=tied)
@@ -455,13 +497,21 @@ class _PowerLawFits:
         )
 
     def _notes(
-        self, terms: int, near: Sequence[int], tied: Mapping[str, Tied], fixed: Mapping[str, float]
+        self,
+        terms: int,
+        is_unstable: bool,
+        near: Sequence[int],
+        tied: Mapping[str, Tied],
+        fixed: Mapping[str, float],
     ) -> list[str]:
         notes = []
         if terms < self.terms:
             zero = ", ".join(symbol_of(f"mu_{p}_pa") for p in range(terms + 1, self.terms + 1))
+            why = ""
+            if is_unstable:
+                why = ", because with more terms the law that fits is unstable at their stretches"
             notes.append(
-                f"the measurements determine {terms} of {self.terms} terms of the law: {zero} = 0"
+                f"the measurements determine {terms} of {self.terms} terms of the law: {zero} = 0{why}"
             )
         for p in near:
             name = f"alpha_{p}"
@@ -620,5 +670,5 @@ def _test(experiment: Experiment, is_foam: bool) -> _Test | None:
     if not stresses:
         return None
     zero = experiment.nuisance.strain_zero or 0.0
-    free = len(deformation.free)
+    free = [AXES.index(axis) for axis in deformation.free]
     return _Test(gradient, per_strain, free, deformation.test, zero, stresses, lateral)
