@@ -24,6 +24,7 @@ from ..methods.starts.stiffness_scan import rescue, start_problem
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
+from .branch_order import with_ascending_times
 from .check.cost import require_memory
 from .coarse_start import CoarseStart
 from .second_start import second_start, start_beyond_bounds, without_limitless_shares
@@ -285,6 +286,8 @@ def _solve_once(
             scan, solution = _solve_from_scan(solver, solution, watch=watch)
         if warm_start is None and solution.method == ReducedSpace.name:
             solution = best_of_second_start(solver, solution, watch=watch)
+        if warm_start is None:
+            solution = with_ascending_times(solution, problem.parameters)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
