@@ -79,14 +79,17 @@ class IntervalCoordinate:
         name : str
             Name of the parameter or modulus.
         values : iterable of float
-            Value and ends of its intervals, at least one; if any is not positive, the coordinate is
-            linear.
+            Value and ends of its intervals, the value first; if any is not positive, the coordinate
+            is linear.
         linear : bool
             Whether the parameter is its own coordinate; a positive Poisson's ratio has ln ν/(½ − ν)
-            nevertheless.
+            nevertheless, unless it is one half.
         """
-        lowest = min(values)
-        return cls(without_region(name) == "poisson" and lowest > 0, linear or lowest <= 0)
+        value, *ends = values
+        lowest = min(value, *ends, np.inf)
+        is_ratio = without_region(name) == "poisson"
+        is_odds = is_ratio and lowest > 0 and value < 0.5
+        return cls(is_odds, linear or lowest <= 0 or is_ratio)
 
     def derivative(self, value: float) -> float:
         """Return the derivative of the coordinate by the value, at a value within the domain."""

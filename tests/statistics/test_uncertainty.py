@@ -394,3 +394,10 @@ def test_the_ends_of_the_domain_of_poissons_ratio_have_infinite_coordinates():
     assert at.from_value(0.5) == np.inf
     assert at.from_value(0.0) == -np.inf
     assert at.to_value(at.from_value(0.3)) == pytest.approx(0.3)
+
+
+def test_a_ratio_of_one_half_is_its_own_coordinate():
+    at = IntervalCoordinate.for_estimate("poisson", (0.5, 0.5, 0.5), linear=False)
+    assert at.from_value(0.5) == 0.5
+    assert at.derivative(0.5) == 1.0
+    assert at.to_value(0.5) == 0.5
