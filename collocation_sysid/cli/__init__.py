@@ -30,7 +30,7 @@ from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
 from ..common.installation import package_version
-from ..common.signal_handling import INTERRUPTS, heed_interrupts, leave
+from ..common.signal_handling import INTERRUPTS, heed_interrupts, ignore_interrupts, leave
 from ..errors import ImplausibleMarkersError, InputError, SimulationError, hint_at
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
@@ -165,7 +165,7 @@ def main() -> None:
 
 
 def _run_command() -> None:
-    restore = heed_interrupts()
+    heed_interrupts()
     if Path("matplotlibrc").is_file():
         # matplotlib obeys the one in the working folder when it is imported.
         with chdir(Path(__file__).parent):
@@ -184,7 +184,7 @@ def _run_command() -> None:
     except SimulationError as error:
         _exit_with_error("simulation failed", error, code=EXIT_NOT_CONVERGED)
     finally:
-        restore()
+        ignore_interrupts()
 
 
 def _likely_cause(error: BaseException | None) -> str:

@@ -11,10 +11,10 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
@@ -105,44 +105,42 @@ INTERRUPTS = Interrupts()
 
 
 def _end_quietly() -> None:
-    """Restore the default action of Ctrl-C, which has no traceback, on the command line."""
-    handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    """End the command line at Ctrl-C and SIGTERM during imports with its own exit codes."""
     command = os.path.splitext(os.path.basename(sys.argv[0]))[0]
-    if command == COMMAND and handled and _in_main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if command == COMMAND:
+        _handle(_leave_at_once, (signal.SIG_DFL, signal.default_int_handler))
 
 
-def heed_interrupts() -> Callable[[], None]:
+def _leave_at_once(number: int, _: FrameType | None) -> None:
+    os._exit(128 + number)
+
+
+def _handle(handler: Any, replaced: tuple[object, ...]) -> None:
+    """Set the handler of Ctrl-C and SIGTERM where it is one of the replaced ones."""
+    if threading.current_thread() is threading.main_thread():  # others may set none
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) in replaced:
+                signal.signal(number, handler)
+
+
+def heed_interrupts() -> None:
     """Let Ctrl-C and SIGTERM raise `KeyboardInterrupt` as `Interrupts` does.
 
     A signal that is ignored or that has a handler of its own keeps it; outside of the main thread
     nothing is changed.
-
-    Returns
-    -------
-    callable
-        Function without arguments that restores the previous handlers, and raises
-        `KeyboardInterrupt` if a signal is deferred.
     """
-    default_handlers = (signal.SIG_DFL, signal.default_int_handler)
-    previous = {}
-    previous_hook = sys.unraisablehook
     INTERRUPTS.number = int(signal.SIGINT)
-    if _in_main_thread():
+    if threading.current_thread() is threading.main_thread():
         sys.unraisablehook = INTERRUPTS.note_unraisable
-        for number in (signal.SIGINT, signal.SIGTERM):
-            handler = signal.getsignal(number)
-            if handler in default_handlers:
-                previous[number] = handler
-                signal.signal(number, INTERRUPTS)
+    _handle(INTERRUPTS, (signal.SIG_DFL, signal.default_int_handler, _leave_at_once))
 
-    def restore() -> None:
-        sys.unraisablehook = previous_hook
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        INTERRUPTS.raise_deferred()
 
-    return restore
+def ignore_interrupts() -> None:
+    """Ignore the signals that `INTERRUPTS` has handled, until the interpreter has ended: the exit code
+    remains that of the command. `KeyboardInterrupt` is raised if a signal is deferred.
+    """
+    _handle(signal.SIG_IGN, (INTERRUPTS,))
+    INTERRUPTS.raise_deferred()
 
 
 def raises_interrupt(handler: object) -> bool:
@@ -173,11 +171,6 @@ def _is_losing(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-def _in_main_thread() -> bool:
-    """Return whether this is the main thread, the only one that may set handlers."""
-    return threading.current_thread() is threading.main_thread()
 
 
 _end_quietly()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -157,6 +158,19 @@ class Outcome:
     err: str
 
 
+@contextlib.contextmanager
+def handlers_of_signals_kept() -> Iterator[None]:
+    """Set the handlers of this process again after the block."""
+    hook = sys.unraisablehook
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
 def run_command(*arguments: object) -> Outcome:
     """Run the command line in this process, as in a shell without a terminal."""
     out, err = io.StringIO(), io.StringIO()
@@ -167,6 +181,7 @@ def run_command(*arguments: object) -> Outcome:
         with (
             contextlib.redirect_stdout(out),
             contextlib.redirect_stderr(err),
+            handlers_of_signals_kept(),
             pytest.raises(SystemExit) as ended,
         ):
             cli.main()

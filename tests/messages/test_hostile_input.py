@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -12,6 +13,7 @@ import time
 import tracemalloc
 import weakref
 import zipfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -19,12 +21,24 @@ from types import FrameType
 import casadi as ca
 import numpy as np
 import pytest
-from kit.problem_files import REFERENCES, replace_cell, replace_text, run_command, settings
+from kit.problem_files import (
+    REFERENCES,
+    handlers_of_signals_kept,
+    replace_cell,
+    replace_text,
+    run_command,
+    settings,
+)
 
 from collocation_sysid.common import files, machine
 from collocation_sysid.common.files import read_json
 from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
-from collocation_sysid.common.signal_handling import INTERRUPTS, LOSING, heed_interrupts
+from collocation_sysid.common.signal_handling import (
+    INTERRUPTS,
+    LOSING,
+    heed_interrupts,
+    ignore_interrupts,
+)
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import (
@@ -455,7 +469,7 @@ def ended(program: str) -> subprocess.CompletedProcess[str]:
 )
 def test_an_interrupt_during_imports_prints_nothing(name: str):
     done = ended(STARTED.format(name=name))
-    assert done.returncode == -signal.SIGINT
+    assert done.returncode == 130
     assert done.stderr == ""
 
 
@@ -505,19 +519,23 @@ def test_a_second_signal_ends_an_import(tiny: Path):
     assert json.loads((tiny / "run" / "result.json").read_text())["status"] == "converged"
 
 
+@contextlib.contextmanager
+def heeded() -> Iterator[None]:
+    with handlers_of_signals_kept():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        heed_interrupts()
+        yield
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_deferred_signal_interrupts_at_the_end_of_the_block():
-    restore = heed_interrupts()
     kept = ""
-    try:
-        with pytest.raises(KeyboardInterrupt), INTERRUPTS.deferred():  # noqa: PT012
-            signal.raise_signal(signal.SIGTERM)
-            time.sleep(0.2)
-            kept = "whole"
-    finally:
-        restore()
+    with heeded(), pytest.raises(KeyboardInterrupt), INTERRUPTS.deferred():  # noqa: PT012
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(0.2)
+        kept = "whole"
     assert kept == "whole"
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -525,16 +543,12 @@ def test_a_signal_within_a_weak_reference_callback_is_not_lost(capsys: pytest.Ca
     class Thing:
         pass
 
-    restore = heed_interrupts()
-    try:
-        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
-            thing = Thing()
-            callback = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGTERM))
-            del thing
-            assert callback() is None  # Python has ignored the exception
-            time.sleep(30)
-    finally:
-        restore()
+    with heeded(), pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        thing = Thing()
+        callback = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGTERM))
+        del thing
+        assert callback() is None  # Python has ignored the exception
+        time.sleep(30)
     assert not capsys.readouterr().err
 
 
@@ -547,27 +561,26 @@ def test_a_signal_within_a_conversion_of_casadi_is_not_lost():
             sent.append(signal.SIGTERM)
             signal.raise_signal(signal.SIGTERM)
 
-    restore = heed_interrupts()
     profiled = sys.getprofile()
     try:
-        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        with heeded(), pytest.raises(KeyboardInterrupt):  # noqa: PT012
             sys.setprofile(send_once)
             _ = ca.SX.sym("x") * np.array([2.0])  # in which CasADi ignores exceptions
             sys.setprofile(profiled)
             time.sleep(5)
     finally:
         sys.setprofile(profiled)
-        restore()
     assert sent
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_signal_that_is_still_deferred_at_the_end_is_not_lost():
-    restore = heed_interrupts()
     code = compile("import signal; signal.raise_signal(signal.SIGINT)", LOSING[0], "exec")
-    exec(code)
-    with pytest.raises(KeyboardInterrupt):
-        restore()
+    with heeded():
+        exec(code)
+        with pytest.raises(KeyboardInterrupt):
+            ignore_interrupts()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
@@ -587,12 +600,7 @@ def test_an_interrupt_and_sigterm_leave_the_best_result(
             time.sleep(0.5)  # until it is heard, on the main thread
 
     monkeypatch.setattr(Recorder, "add", interrupted)
-    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        outcome = run_command("solve", "problem.toml", "--method", method, "--out", "run", "-q")
-    finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+    outcome = run_command("solve", "problem.toml", "--method", method, "--out", "run", "-q")
     assert outcome.code == 128 + number
     assert '"status": "interrupted"' in (tiny / "run" / "result.json").read_text()
     assert "Traceback" not in outcome.err
