@@ -181,6 +181,8 @@ def run(
     began_s = time.perf_counter()
     if not isinstance(problem, Problem):
         problem = Problem.read(problem)
+    solver = problem.solver(method)
+    limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else np.inf
     solution = solve(problem, method, watch=watch, start=start, scheduler=scheduler)
     searched_s = time.perf_counter()
 
@@ -190,13 +192,12 @@ def run(
         checks_s = time.perf_counter() - searched_s - finer_s
         return replace(answer, elapsed_s=Elapsed(searched_s - began_s + finer_s, checks_s))
 
-    problem = _with_estimated_lengths(problem, solution)
     answer = Run(problem, solution, rollouts={}, uncertainty=None)
     missing = "the result has no error bars and was not checked by a forward simulation"
-    solver = problem.solver(method)
-    limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else np.inf
     with time_limit(max(0.0, limit_s - (searched_s - began_s))):
         try:
+            problem = _with_estimated_lengths(problem, solution)
+            solution.unless_interrupted()
             answer, fit, steps = _checked(problem, answer.solution, say=say)
             missing = (
                 "the steps after the error bars were skipped: a finer time step, and causes "
@@ -213,8 +214,6 @@ def run(
                 answer = replace(answer, profiles=profiles)
                 answer = _with_added_measurements(answer, say)
                 answer = _with_offset_notes(answer, fit)
-            if answer.solution.status is Status.INTERRUPTED:
-                return timed(answer)
             if seek_causes:
                 from .judge.engine import cause_notes, find_misspecifications
 

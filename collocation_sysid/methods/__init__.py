@@ -15,8 +15,8 @@ Start
     parameters, and searches of the first samples.
 Common
     `solution` defines the protocol of methods and the result, `solve_recorder` the history,
-    `options` the construction of methods from options by name, `nlpsol` and `callbacks` the
-    interface to CasADi's solvers.
+    `best_iterate` the answer after an interruption, `options` the construction of methods from
+    options by name, `nlpsol` and `callbacks` the interface to CasADi's solvers.
 """
 
 from __future__ import annotations

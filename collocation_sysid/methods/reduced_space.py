@@ -112,28 +112,29 @@ class ReducedSpace(SearchOptions):
         workers = workers or LocalExecutor(collocation.threads)
         recorder = Recorder(self.name, collocation, watch=watch)
         search = ReducedSearch(self, recorder, start=start, workers=workers)
+        status, message = Status.INTERRUPTED, Status.INTERRUPTED.sentence
+        recorder.answer = lambda: _solution_of_search(search, workers, status, message)
         try:
             with time_limit(self.max_time_s):
-                status = search.solve_from_start()
-                is_started = status is not None
-                for share in () if is_started else search.ladder:
+                found = search.solve_from_start()
+                for share in () if found else search.ladder:
                     horizon = search.horizon_of_share(share)
                     search.extend_to(horizon)
-                    status = search.minimise(horizon, share == search.ladder[-1])
-                    if status is Status.ITERATION_LIMIT:
+                    found = search.minimise(horizon, share == search.ladder[-1])
+                    if found is Status.ITERATION_LIMIT:
                         break
                     assert search.point is not None  # a solve accepts one
                     if share != search.ladder[-1] and search.point.loss > self.largest_loss:
-                        status = Status.STALLED
+                        found = Status.STALLED
                         break
-            status = status or Status.CONVERGED
+            status = found or Status.CONVERGED
             if search.ended_by_association:
                 recorder.notes.append(ENDED_BY_ASSOCIATION)
             message = status.explain(self.name, max_iterations=self.max_iterations)
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)
         with unlimited():
-            return _solution_of_search(search, workers, status=status, message=message)
+            return recorder.answer()
 
 
 def _solution_of_search(

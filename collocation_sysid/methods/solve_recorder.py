@@ -11,6 +11,7 @@ from ..common.time_limit import TimeLimitReached
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch
+from .best_iterate import Answer, keep
 from .solution import Iteration, Solution, Status, Timing, Watch
 from .starts.initial_trajectories import initial_variables
 
@@ -71,6 +72,8 @@ class Recorder:
         Remarks for the user.
     start_s : float
         `time.perf_counter()` at construction [s].
+    answer : callable or None
+        Returns the best iterate as a solution; it is kept with each entry, see `keep`.
 
     Parameters
     ----------
@@ -96,6 +99,7 @@ class Recorder:
         self.max_time_s = max_time_s
         self.history: list[Iteration] = []
         self.notes: list[str] = []
+        self.answer: Answer | None = None
         self.stopwatch = Stopwatch()
 
     def measure_elapsed_s(self) -> float:
@@ -155,6 +159,8 @@ class Recorder:
         `watch` are not caught.
         """
         self.history.append(line)
+        if self.answer is not None:
+            keep(self, self.answer, line.loss, share=line.share)
         if self.watch is not None:
             self.watch(line)
 
@@ -193,3 +199,19 @@ class Recorder:
             notes=tuple(self.notes),
             evaluations=evaluations,
         )
+
+
+def interrupted_solution(method: str, collocation: Collocation, z: Array) -> Solution:
+    """Return variables at which no search has ended as an interrupted solution; its history has one
+    entry, the evaluation there.
+    """
+    recorder = Recorder(method, collocation)
+    recorder.add_variables(0, z, collocation.objective(z))
+    return recorder.solution(
+        Status.INTERRUPTED,
+        Status.INTERRUPTED.sentence,
+        z=z,
+        multipliers=np.zeros(collocation.constraint_count),
+        iterations=0,
+        evaluations=0,
+    )

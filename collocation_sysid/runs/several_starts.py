@@ -15,7 +15,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Iteration, Method, Solution, Status, Watch
+from ..methods.solution import Iteration, Method, Solution, Watch
 from ..methods.starts.stiffness_scan import Scan, Start
 from ..program.collocation import Collocation
 
@@ -99,9 +99,7 @@ def follow_starts(
     """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
     The best start of the scan, `start`, is returned without a solution if the scan found only one start, if
-    the problem has no local minima, if no start converges, or after an interrupt; an interrupted
-    solution is returned with it if the method is reduced space. Exceptions of `solve` are not
-    caught.
+    the problem has no local minima, or if no start converges. Exceptions of `solve` are not caught.
 
     Parameters
     ----------
@@ -134,8 +132,6 @@ def follow_starts(
         except _KnownMinimum as known:
             candidates.append((robust_loss(known.solution), number, known.solution))
             continue
-        if solution.status is Status.INTERRUPTED:
-            return start, solution if is_own else None
         if solution.status.converged:
             candidates.append((robust_loss(solution), number, solution))
     if not candidates:

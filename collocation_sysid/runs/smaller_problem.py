@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
-
 from ..errors import SimulationError
 from ..methods.horizon import Horizon
 from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Solution, Status
-from ..methods.solve_recorder import Recorder
+from ..methods.solution import Solution
+from ..methods.solve_recorder import interrupted_solution
 from ..methods.starts.start import Start
 from ..problem import Problem
 from ..program.collocation import Collocation
@@ -104,21 +102,11 @@ class SmallerProblem(ABC):
 
     def interrupted(self, problem: Problem, first: Solution) -> Solution:
         """Return the present point of an interrupted search as an interrupted solution of the given
-        problem. Its history has one entry, the evaluation at that point.
+        problem.
         """
         start = self.interrupted_start(problem, first)
         assert start.variables is not None
-        recorder = Recorder(ReducedSpace.name, start.collocation)
-        objective = start.collocation.objective(start.variables)
-        recorder.add_variables(0, start.variables, objective)
-        solution = recorder.solution(
-            Status.INTERRUPTED,
-            Status.INTERRUPTED.sentence,
-            z=start.variables,
-            multipliers=np.zeros(start.collocation.constraint_count),
-            iterations=0,
-            evaluations=0,
-        )
+        solution = interrupted_solution(ReducedSpace.name, start.collocation, start.variables)
         timing = solution.timing + first.timing
         return replace(solution, notes=(start.note,), scan=first.scan, timing=timing)
 

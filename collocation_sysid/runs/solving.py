@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..features.measurements import lost_samples
 from ..features.registry import FEATURES
 from ..fem.laws.constants import without_region
+from ..methods.best_iterate import answers_as, best_iterate, keep
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch
@@ -43,7 +44,6 @@ FAILED_STATUSES = (
 )
 # Outcomes after which no other start is tried.
 FINAL_STATUSES = (
-    Status.INTERRUPTED,
     Status.REFUSED,
     Status.TIME_LIMIT,
     Status.CLUSTER_DISCONNECTED,
@@ -103,7 +103,8 @@ def solve(
     Returns
     -------
     Solution
-        Also if the search failed: see its `status`.
+        Also if the search failed: see its `status`. After an interruption it is the best iterate of all
+        searches and of the scan.
 
     Raises
     ------
@@ -114,17 +115,21 @@ def solve(
     SimulationError
         If the equations of motion are singular at a solution with a field whose correlation
         length is searched.
+    KeyboardInterrupt
+        After an interruption before the first simulation has ended.
     """
     if not isinstance(problem, Problem):
         problem = Problem.read(problem)
     for experiment in problem.experiments:
         experiment.require_measured_values()
     solver = problem.solver(method)
-    if not isinstance(solver, ReducedSpace):
-        return _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+    limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else float("inf")
     try:
-        with time_limit(solver.max_time_s):
-            solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+        with best_iterate() as best, time_limit(limit_s):
+            try:
+                solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+            except KeyboardInterrupt:
+                solution = best.solution()
     except TimeLimitReached:
         limit_s = _start_limit_s(problem, solver)
         raise InputError(
@@ -209,13 +214,12 @@ def _solve_from_smaller(
 ) -> Solution:
     """Count iterations on the given problem only, but the times of both solves."""
     rough = replace(solver, tolerance=max(solver.tolerance, COARSE_TOLERANCE))
-    with search_activity(smaller.activity):
+    as_given = partial(smaller.interrupted, problem)
+    with search_activity(smaller.activity), answers_as(as_given, of_given_problem=False):
         try:
             first = _solve_once(smaller.problem, None, rough, watch=watch, workers=workers)
         except InputError as error:
             raise NoStartError(error.message) from error
-    if first.status is Status.INTERRUPTED:
-        return smaller.interrupted(problem, first)
     search, size = smaller.search
     if not first.status.converged:
         raise NoStartError(f"the {search} {size} ended with: {first.message}")
@@ -267,40 +271,45 @@ def _solve_once(
     warm_start = WarmStart.read(given_start) if is_folder else given_start
     if warm_start is not None:
         problem = warm_start.apply_to_problem(problem)
+    scan: Scan | None = None
+
+    def finished(solution: Solution) -> Solution:
+        of_start = [scan.sentence] if scan else []
+        return replace(
+            solution,
+            scan=scan or solution.scan,
+            notes=(*notes, *of_start, *solution.notes, *_feature_notes(solution)),
+        )
+
     try:
         start = _program_and_start(problem, solver, warm_start=warm_start)
         scan = start.scan
         solver = with_workers(solver, workers)
         solution = None
-        if scan is not None:
-            solve_again = partial(solve_with_renewed_correspondences, watch=watch)
-            start, solution = follow_starts(solver, start, scan, solve=solve_again)
-            scan = start.scan
+        with answers_as(finished):
+            if scan is not None:
+                solve_again = partial(solve_with_renewed_correspondences, watch=watch)
+                start, solution = follow_starts(solver, start, scan, solve=solve_again)
+                scan = start.scan
+                if solution is None:
+                    start = replace(start, collocation=associated_at_guess(start.collocation))
+            notes += [start.note] if start.note else []
             if solution is None:
-                start = replace(start, collocation=associated_at_guess(start.collocation))
-        if solution is None:
-            solution = solve_with_renewed_correspondences(
-                solver, start.collocation, watch=watch, start=start.variables
-            )
-        if scan is None and solution.status in FAILED_STATUSES:
-            scan, solution = _solve_from_scan(solver, solution, watch=watch)
-        if warm_start is None and solution.method == ReducedSpace.name:
-            solution = best_of_second_start(solver, solution, watch=watch)
-        if warm_start is None:
-            solution = with_ascending_times(solution, problem.parameters)
+                solution = solve_with_renewed_correspondences(
+                    solver, start.collocation, watch=watch, start=start.variables
+                )
+            if scan is None and solution.status in FAILED_STATUSES:
+                scan, solution = _solve_from_scan(solver, solution, watch=watch)
+            if warm_start is None and solution.method == ReducedSpace.name:
+                solution = best_of_second_start(solver, solution, watch=watch)
+            if warm_start is None:
+                solution = with_ascending_times(solution, problem.parameters)
     except InputError as error:
         raise error.located(problem.path) from error
     if solution.status is Status.REFUSED:
         reasons = "; ".join(solution.notes)
         raise InputError(f"{solution.message} {reasons}".strip(), problem.path, where="solver")
-    if scan is not None:
-        notes.append(scan.sentence)
-    notes += [start.note] if start.note else []
-    return replace(
-        solution,
-        scan=scan or solution.scan,
-        notes=(*notes, *solution.notes, *_feature_notes(solution)),
-    )
+    return finished(solution)
 
 
 def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart | None) -> Start:
@@ -350,16 +359,12 @@ def _solve_from_scan(
     """Solve from the result of a scan after a search from the guess failed."""
     reason = f"the search from the guess failed ({failed.status.value})"
     needs_complete_start = getattr(solver, "needs_complete_start", False)
-    try:
-        scan = rescue(failed.collocation, reason, is_complete=needs_complete_start)
-        if scan is None:
-            return None, failed
-        again = associated_at_guess(failed.collocation.with_parameters(scan.parameters))
-        solution = solve_with_renewed_correspondences(solver, again, watch=watch)
-    except KeyboardInterrupt:
-        return None, _as_interrupted(failed)
-    ended = solution.status.converged or solution.status is Status.INTERRUPTED
-    return (scan, solution) if ended else (None, failed)
+    scan = rescue(failed.collocation, reason, is_complete=needs_complete_start)
+    if scan is None:
+        return None, failed
+    again = associated_at_guess(failed.collocation.with_parameters(scan.parameters))
+    solution = solve_with_renewed_correspondences(solver, again, watch=watch)
+    return (scan, solution) if solution.status.converged else (None, failed)
 
 
 def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
@@ -368,11 +373,10 @@ def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -
 
     Another solution is better if it converges, and the one before did not or has a χ² that is
     higher by more than `LEAST_GAIN`, an absolute difference. There is no other search after one
-    that was interrupted, refused, or ended at the limit of time.
+    that was refused, or ended at the limit of time.
 
-    Otherwise `first` itself is returned; after an interrupt of another search a copy of the best
-    one with the status and message of the interrupt. The history, counts and times of the result
-    are those of its own search alone. Exceptions of the method are not caught.
+    Otherwise `first` itself is returned. The history, counts and times of the result are those of its
+    own search alone. Exceptions of the method are not caught.
 
     Parameters
     ----------
@@ -401,7 +405,7 @@ def continued_beyond_bounds(solver: Method, first: Solution, watch: Watch | None
     limited = without_limitless_shares(best) if best.status.converged else None
     if limited is None:
         return best
-    again = solver(best.collocation.with_parameters(limited), watch, None)
+    again = _search(solver, best.collocation.with_parameters(limited), watch)
     if not again.history or again.history[-1].loss > best.history[-1].loss + LEAST_GAIN:
         return best
     # A restart at the optimum may find no decrease that exceeds rounding.
@@ -414,16 +418,11 @@ def _better_of(
     """Return the better of a solution and of that from the start chosen for it."""
     if first.status in FINAL_STATUSES or not first.history:
         return first
-    try:
-        other = choose(first)
-        if other is None:
-            return first
-        again = associated_at_guess(other.collocation)
-        second = solve_with_renewed_correspondences(solver, again, watch=watch)
-    except KeyboardInterrupt:
-        return _as_interrupted(first)
-    if second.status is Status.INTERRUPTED:
-        return replace(first, status=second.status, message=second.message)
+    other = choose(first)
+    if other is None:
+        return first
+    again = associated_at_guess(other.collocation)
+    second = solve_with_renewed_correspondences(solver, again, watch=watch)
     gain = first.history[-1].loss - second.history[-1].loss if second.history else 0.0
     if first.status.converged and not second.status.converged and gain > LEAST_GAIN:
         note = (
@@ -437,10 +436,6 @@ def _better_of(
     if not first.status.converged:
         note = f"{other.note} converged, after a first search that did not"
     return replace(second, notes=(note, *second.notes))
-
-
-def _as_interrupted(solution: Solution) -> Solution:
-    return replace(solution, status=Status.INTERRUPTED, message=Status.INTERRUPTED.sentence)
 
 
 def solve_with_renewed_correspondences(
@@ -463,8 +458,13 @@ def solve_with_renewed_correspondences(
         Called with every iteration.
     start : (variables,) array, optional
         Start of the first solve; by default the method chooses it from the guesses.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If a solve was interrupted; its best iterate is kept, see `best_iterate`.
     """
-    solution = solver(collocation, watch, start)
+    solution = _search(solver, collocation, watch, start)
     for _ in range(MOST_REREADINGS):
         if not solution.status.converged:
             break
@@ -472,5 +472,16 @@ def solve_with_renewed_correspondences(
         collocation, moved = solution.collocation.follow_estimates(p, positions)
         if collocation is solution.collocation:
             break
-        solution = solver(collocation, watch, collocation.pack(moved, positions))
+        solution = _search(solver, collocation, watch, collocation.pack(moved, positions))
     return solution
+
+
+def _search(
+    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
+) -> Solution:
+    solution = solver(collocation, watch, start)
+    loss, share = float("inf"), 0.0
+    if solution.history:
+        loss, share = solution.history[-1].loss, solution.history[-1].share
+    keep(solution, lambda: solution, loss, share)
+    return solution.unless_interrupted()

@@ -13,7 +13,6 @@ import tempfile
 import threading
 import time
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -40,6 +39,7 @@ from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sourc
 from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.judge import engine
 from collocation_sysid.methods.solution import Iteration, Status
+from collocation_sysid.methods.starts import stiffness_scan
 from collocation_sysid.methods.starts.start import Start
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
@@ -369,6 +369,46 @@ def test_an_interruption_of_the_scan_is_reported(tiny, monkeypatch):
     assert contents(tiny) == before
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_interrupted_scan_keeps_its_best_stiffness(tiny, monkeypatch, count):
+    simulated = {}
+    evaluate_at = stiffness_scan.TrialSimulation.evaluate_at
+
+    def evaluated(self, young_pa, guess):
+        misfit, positions = evaluate_at(self, young_pa, guess)
+        simulated[young_pa] = misfit
+        if len(simulated) == count:
+            signal.raise_signal(signal.SIGTERM)
+        return misfit, positions
+
+    monkeypatch.setattr(stiffness_scan.TrialSimulation, "evaluate_at", evaluated)
+    unguessed = settings("parameters.mu_pa={}", "parameters.lambda_pa={}")
+    outcome = run_command("solve", "problem.toml", *unguessed, "--out", "run")
+    assert outcome.code == 143, outcome.err
+    result = result_in(tiny / "run")
+    assert result["status"] == "interrupted"
+    assert [each["code"] for each in result["trust"]["concerns"]] == ["solve/interrupted"]
+    best = min(simulated, key=lambda young: simulated[young])
+    assert result["parameters"]["mu_pa"]["value"] == pytest.approx(best / 2.6, rel=1e-6)
+    assert run_command("report", "run").code == 0
+
+
+def test_an_interrupted_first_rung_keeps_its_iterate(tiny, monkeypatch):
+    shown = []
+
+    def interrupt(self: progress_shown.SolveProgress, line: Iteration) -> None:
+        shown.append(line)
+        if line.number >= 2:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
+    assert run_command("solve", "problem.toml", "--out", "run").code == 130
+    result = result_in(tiny / "run")
+    assert result["status"] == "interrupted"
+    assert shown[-1].share < 1
+    assert result["parameters"]["mu_pa"]["value"] == shown[-1].parameters["mu_pa"]
+
+
 def test_a_failed_search_survives_an_interrupt_of_the_scan_that_follows(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -417,19 +457,18 @@ def test_error_bars_survive_a_later_interrupt(tiny, monkeypatch, module, late):
 def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch):
     found = []
 
-    def solved(solver, collocation, watch, start=None):
-        solution = solving.ReducedSpace()(collocation, watch, start)
-        status = solution.status if not found else solving.Status.INTERRUPTED
-        found.append(replace(solution, status=status))
-        return found[-1]
+    def again(first):
+        found.append(first)
+        return Start(first.collocation, note="again")
 
-    monkeypatch.setattr(solving, "solve_with_renewed_correspondences", solved)
-    monkeypatch.setattr(
-        solving, "second_start", lambda first: Start(first.collocation, note="again")
-    )
+    def interrupt(self: progress_shown.SolveProgress, line: Iteration) -> None:
+        if found:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(solving, "second_start", again)
+    monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
     method = settings("solver.method=reduced-space")
-    outcome = run_command("solve", "problem.toml", *method, "--out", "run")
-    assert (outcome.code, len(found)) == (130, 2)
+    assert run_command("solve", "problem.toml", *method, "--out", "run").code == 130
     result = result_in(tiny / "run")
     assert result["status"] == "interrupted"
     assert result["parameters"]["mu_pa"]["value"] == found[0].parameters["mu_pa"]
@@ -460,10 +499,10 @@ def test_a_terminal_shows_each_iteration(tiny):
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100)
     with progress_shown.SolveProgress(console, cs.Problem.read("problem.toml")) as progress:
-        progress.iteration(Iteration(3, 1.0, 2.5e-3, 1e-4, TRUTH, 0.5))
+        progress.iteration(Iteration(3, 1.0, 2.5, 1e-4, TRUTH, 0.5))
         progress.say("checking")
-    assert "violation N" in screen.getvalue()
-    assert "2.5000" in screen.getvalue()
+    assert "misfit σ" in screen.getvalue()
+    assert " 2.5 " in screen.getvalue()
     assert "checking" in screen.getvalue()
 
 
@@ -479,11 +518,11 @@ def test_elsewhere_long_work_leaves_a_line_now_and_then(monkeypatch):
 
     with progress_shown.SolveProgress(Console(file=Log())) as progress:
         progress.say("simulating the first samples")
+        progress.iteration(Iteration(3, 1.0, 2.5, 1e-4, {"young_pa": 3e4}, 0.5, share=0.25))
+        told.clear()
         assert told.wait(30.0)
-    assert (
-        "searching for an initial guess" in lines[0] or "simulating the first samples" in lines[0]
-    )
-    assert "s so far)" in lines[0]
+    said = "solving, iteration 3: misfit 2.5 σ of the first 25%, E = 3e+04 Pa ("
+    assert any(said in line and "s so far)" in line for line in lines)
     with progress_shown.SolveProgress(Console(file=Log()), quiet=True) as progress:
         assert progress._heartbeat is None
     assert not any(thread.name == Heartbeat.NAME for thread in threading.enumerate())

@@ -20,6 +20,7 @@ COMMANDS = (
     "study_effects --twins 1",
     "study_faults --twins 2 --only none",
     "study_hidden_errors --twins 1 --only none",
+    "study_interruptions --solves 4",
     "study_starts --methods --starts 1 --factor 2",
     "study_mistakes --groups tracks --only wxyz --seeds 1",
     "study_mistakes --groups video --only turned --seeds 1 --check-only",

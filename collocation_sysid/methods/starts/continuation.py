@@ -20,6 +20,7 @@ from ...program.collocation import Collocation
 from ...recording.experiment import Experiment
 from ...recording.measurement_selection import shortened_experiment
 from ...recording.time_tables import FEWEST_SHARED_SAMPLES
+from ..best_iterate import best_iterate
 from ..comparison.casadi_nlp import Sleqp, SqpMethod
 from ..comparison.penalty import AugmentedLagrangian, Penalty
 from ..comparison.shooting import Shooting
@@ -147,7 +148,8 @@ class _ContinuationState:
             time_s = line.time_s + elapsed_s
             recorder.add(replace(line, number=number, time_s=time_s, share=share * line.share))
 
-        solution = self.method(part, record, start)
+        with best_iterate():  # an iterate of a part is none of the whole
+            solution = self.method(part, record, start)
         self._add(solution, share)
         return solution.status not in (Status.INTERRUPTED, Status.REFUSED)
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import groupby
 
 import numpy as np
@@ -30,8 +30,12 @@ from ...model.parameters import Parameter, Parameters, with_widest_bounds
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.forward.newton_solver import NewtonOptions
 from ...program.transcription import Transcription
+from ..best_iterate import keep
 from ..options import SHARES, samples_in_share
-from .initial_trajectories import simulate_trajectories
+from ..reduced_space import ReducedSpace
+from ..solution import Solution
+from ..solve_recorder import interrupted_solution
+from .initial_trajectories import complete_variables, simulate_trajectories
 from .memory import memory_start
 from .power_law import power_law_start
 from .start import Scan, Start
@@ -378,6 +382,17 @@ def _residuals(iterate: ExperimentIterate) -> Array:
     )
 
 
+def _answer(collocation: Collocation, p: Array, positions: Sequence[Array]) -> Solution:
+    """Return a simulation of the first rows as a solution."""
+    parameters = collocation.parameters
+    values = parameters.values(p[: collocation.nq])
+    guesses = {item.name: values[item.name] for item in parameters.free}
+    collocation = collocation.with_parameters(parameters.with_estimates(guesses))
+    collocation, p = collocation.place_unknown_markers(p, positions)
+    z = complete_variables(collocation, p, known_rows=positions)
+    return interrupted_solution(ReducedSpace.name, collocation, z)
+
+
 def _compared_samples(transcription: Transcription, share: float) -> int:
     """Return a share of the samples, at least one of each measurement; at most all."""
     t_s = transcription.experiment.t_s
@@ -499,7 +514,10 @@ class TrialSimulation:
         """Return the misfit of the first part; NaN if it is not finite."""
         first = [x[:rows] for x, rows in zip(positions, self.rows, strict=True)]
         misfit = _misfit(self.collocation, p, positions=first)
-        return misfit if np.isfinite(misfit) else np.nan
+        if not np.isfinite(misfit):
+            return np.nan
+        keep(self, partial(_answer, self.collocation, p, first), misfit, share=0.0)
+        return misfit
 
 
 class ScanState:
