@@ -23,12 +23,12 @@ from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
 from .experiment_executors import ExperimentExecutor, LocalExecutor
 from .trajectory_sweeps import (
-    FitSummary,
+    Feasibility,
     LinearisedTrajectory,
     SimulationResult,
     SweepReport,
     extrapolate,
-    fit_summary,
+    feasibility,
     reassociate,
     simulate_rows,
     sweep,
@@ -293,16 +293,16 @@ class Horizon:
             extrapolate, self.transcriptions, iterate.trajectories, self._by_experiment(step)
         )
 
-    def fit_summaries(self, p: Array, trajectories: Sequence[Any]) -> list[FitSummary]:
-        """Return the fit of trajectories, as the workers store them, at parameters p (np,), without
-        a sweep; one summary for each experiment.
+    def feasibilities(self, p: Array, trajectories: Sequence[Any]) -> list[Feasibility]:
+        """Return how well trajectories, as the workers store them, satisfy the equations of motion at
+        parameters p (np,), without a sweep; one for each experiment.
 
         `SearchEnded` is raised if the workers are lost.
         """
-        summaries = self.workers.map_experiments(
-            fit_summary, self.transcriptions, self._by_experiment(p), trajectories
+        found = self.workers.map_experiments(
+            feasibility, self.transcriptions, self._by_experiment(p), trajectories
         )
-        return self.workers.fetch(summaries)
+        return self.workers.fetch(found)
 
     def row_counts(self, trajectories: Sequence[Any]) -> list[int]:
         """Return the number of rows of each trajectory.

@@ -23,8 +23,8 @@ from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
 from .options import FEWEST, SHARES, MethodOptions, Shares, samples_in_share
 from .solution import Iteration, Status
-from .solve_recorder import Recorder
-from .trajectory_sweeps import FitSummary
+from .solve_recorder import Recorder, misfit_of
+from .trajectory_sweeps import Feasibility
 
 if TYPE_CHECKING:
     from ..program.collocation import Collocation
@@ -424,13 +424,13 @@ class ReducedSearch:
             rate = min(1.0, length / previous) if 0.0 < previous < np.inf else 1.0
             if is_last and is_full_step and length * rate <= SAFETY * tolerance:
                 final_positions = horizon.extrapolate(point, step)
-                summaries = horizon.fit_summaries(point.p + step, final_positions)
-                if self._are_feasible(summaries):
+                reached = horizon.feasibilities(point.p + step, final_positions)
+                if self._are_feasible(reached):
                     self._record(
                         point.p + step,
                         final_positions,
                         loss=point.predicted_loss(step),
-                        summaries=summaries,
+                        reached=reached,
                     )
                     return Status.CONVERGED
             predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
@@ -569,8 +569,8 @@ class ReducedSearch:
         if not self.refines_solutions:
             return ACCURACY
         assert self.trajectories is not None
-        summaries = horizon.fit_summaries(self.p, self.trajectories)
-        is_exact = self._are_feasible(summaries)
+        reached = horizon.feasibilities(self.p, self.trajectories)
+        is_exact = self._are_feasible(reached)
         return self._accuracy_after(0.0 if is_exact else np.inf)
 
     def _is_final_accuracy(self, accuracy: float) -> bool:
@@ -617,11 +617,11 @@ class ReducedSearch:
             return point
         return self._accept(horizon, resimulated)
 
-    def _are_feasible(self, summaries: list[FitSummary]) -> bool:
+    def _are_feasible(self, reached: list[Feasibility]) -> bool:
         """Whether each largest residual is at most `FEASIBLE_FORCE` times its unit of force."""
         return all(
             each.violation_n <= FEASIBLE_FORCE * transcription.force_n
-            for each, transcription in zip(summaries, self.collocation.transcriptions, strict=True)
+            for each, transcription in zip(reached, self.collocation.transcriptions, strict=True)
         )
 
     # Association of the measurements ----------------------------------------------------------
@@ -696,26 +696,25 @@ class ReducedSearch:
         """Make a point the best so far: associate its measurements, store and record it."""
         self.point = point = self._reassociate(horizon, point)
         self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
-        self._record(point.p, point.trajectories, loss=point.loss, summaries=point.reports)
+        self._record(point.p, point.trajectories, loss=point.loss, reached=point.reports)
         return point
 
-    def _record(self, p: Array, x: list[Any], loss: float, summaries: Sequence[FitSummary]) -> None:
+    def _record(self, p: Array, x: list[Any], loss: float, reached: Sequence[Feasibility]) -> None:
         """Store the best so far, and add an entry to the history."""
         self.p = p
         self.trajectories = x
-        squares_m2 = sum(each.squares_m2 for each in summaries)
-        rms_m = float(np.sqrt(squares_m2 / max(1, sum(each.samples for each in summaries))))
-        violation_n = max(each.violation_n for each in summaries)
+        violation_n = max(each.violation_n for each in reached)
         values = self.collocation.parameters.scalar_values(p[: self.collocation.nq])
         time_s = self.recorder.measure_elapsed_s()
-        share = sum(each.rows for each in summaries) / sum(
+        share = sum(each.rows for each in reached) / sum(
             s.grid_times for s in self.collocation.transcriptions
         )
+        misfit = misfit_of(self.collocation, loss, share)
         self.recorder.add(
             Iteration(
                 self.sweeps,
                 loss,
-                rms_m=rms_m,
+                misfit,
                 violation_n=violation_n,
                 parameters=values,
                 time_s=time_s,

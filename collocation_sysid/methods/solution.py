@@ -119,8 +119,9 @@ class Iteration:
         Number of the iteration, from 0.
     loss : float
         Loss L of the measurements and priors, without the scaling of the NLP.
-    rms_m : float
-        Root mean square distance of markers from their measurements [m].
+    misfit : float
+        Root mean square of the residuals of all measurements and priors per measured number, in
+        standard deviations.
     violation_n : float
         Largest residual of the equations of motion [N].
     parameters : dict of str to float
@@ -133,7 +134,7 @@ class Iteration:
 
     number: int
     loss: float
-    rms_m: float
+    misfit: float
     violation_n: float
     parameters: dict[str, float]
     time_s: float

@@ -129,9 +129,8 @@ class Recorder:
     def add_variables(self, number: int, z: Array, loss: float) -> None:
         """Evaluate the problem at variables z, and add the result to the history, see `add`.
 
-        The entry contains the parameters, the root mean square distance of the markers [m], the
-        largest residual of the equations of motion [N] and the time since the recorder was made
-        [s].
+        The entry contains the parameters, the misfit, the largest residual of the equations of motion
+        [N] and the time since the recorder was made [s].
 
         Parameters
         ----------
@@ -147,7 +146,7 @@ class Recorder:
         line = Iteration(
             number,
             loss,
-            rms_m=collocation.rms_marker_distance_m(z),
+            misfit_of(collocation, loss),
             violation_n=violation_n,
             parameters=collocation.parameters.scalar_values(z[: collocation.nq]),
             time_s=self.measure_elapsed_s(),
@@ -199,6 +198,13 @@ class Recorder:
             notes=tuple(self.notes),
             evaluations=evaluations,
         )
+
+
+def misfit_of(collocation: Collocation, loss: float, share: float = 1.0) -> float:
+    """Return the root mean square of the residuals in standard deviations, from the loss of a share of
+    the time steps.
+    """
+    return float(np.sqrt(loss / max(1.0, share * collocation.measurement_count)))
 
 
 def interrupted_solution(method: str, collocation: Collocation, z: Array) -> Solution:

@@ -38,38 +38,17 @@ SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, checks_stability=False)
 
 
 @dataclass(frozen=True)
-class FitSummary:
-    """Fit of one trajectory to its measurements."""
+class Feasibility:
+    """How well one trajectory satisfies the equations of motion."""
 
     rows: int  # number of grid rows
     violation_n: float  # largest residual of the equations of motion, |c| [N]
-    squares_m2: float  # sum of the squared distances between predicted and measured markers [m²]
-    samples: int  # number of these distances
-
-    @classmethod
-    def from_iterate(cls, iterate: ExperimentIterate, x: Array, violation_n: float) -> FitSummary:
-        """Return the fit of positions x (rows, 3n) [m] to the markers at the parameters of an
-        experiment; other measurements do not count.
-
-        Parameters
-        ----------
-        iterate : ExperimentIterate
-            Experiment with its parameters; its positions are not used.
-        x : (rows, 3n) array
-            Positions at which the markers are evaluated [m].
-        violation_n : float
-            Largest residual of the equations of motion [N], as the caller knows it.
-        """
-        squares = iterate.transcription.markers.squared_distances_m2(x, iterate.phi)
-        return cls(len(x), violation_n, squares_m2=float(squares.sum()), samples=len(squares))
 
 
 @dataclass(frozen=True, eq=False)
-class SweepReport(FitSummary):
+class SweepReport(Feasibility):
     """Result of a sweep that the search needs; its size does not depend on the number of time
     steps.
-
-    The fit to the measurements is that of the positions after the feasibility step.
     """
 
     fit: SquareRootInformation  # residuals linearised in a step of the k parameters
@@ -318,14 +297,12 @@ def simulate_rows(
     return SimulationResult(x, failure, times_s=solver.stopwatch.read_and_reset())
 
 
-def fit_summary(transcription: Transcription, p: Array, x: Array) -> FitSummary:
-    """Return the fit of an array of positions x (rows, 3n) [m] to the markers at the experiment's
-    parameters p (k,), with residuals of the equations of motion evaluated at x.
+def feasibility(transcription: Transcription, p: Array, x: Array) -> Feasibility:
+    """Return how well an array of positions x (rows, 3n) [m] satisfies the equations of motion at the
+    experiment's parameters p (k,).
     """
     part = _iterate(transcription, p, x=x)
-    return FitSummary.from_iterate(
-        part, x, violation_n=float(np.abs(part.compute_residual_n()).max())
-    )
+    return Feasibility(len(x), violation_n=float(np.abs(part.compute_residual_n()).max()))
 
 
 def _iterate(transcription: Transcription, p: Array, x: Array) -> ExperimentIterate:
@@ -348,11 +325,9 @@ def _linearised_trajectory(
     slope = np.concatenate(
         [by.reshape(values.size, by.shape[-1]) for values, by in residuals_and_slopes]
     )
-    summary = FitSummary.from_iterate(
-        iterate, iterate.x + swept.step, violation_n=swept.violation_n
-    )
     report = SweepReport(
-        **vars(summary),
+        len(iterate.x),
+        swept.violation_n,
         fit=SquareRootInformation.empty(slope.shape[1]).with_rows(residual, slope),
         previous_slopes_residual=np.zeros(slope.shape[1])
         if previous is None

@@ -20,7 +20,7 @@ from rich.text import Text
 from ..common.console import Watched
 from ..common.display import Shown, Table, on_terminal
 from ..common.step_counting import SEARCH, listen_to_activities, listen_to_shares, listen_to_states
-from ..fem.laws.constants import symbol_of
+from ..fem.laws.constants import symbol_of, unit_of
 from ..methods.solution import Iteration
 from ..problem import Problem
 
@@ -157,7 +157,7 @@ class SolveProgress(Watched):
             Numbers of the iteration, stored for the table.
         """
         self._lines.append(line)
-        self._update_activity(self._search, "  ".join(_iteration_row(line)))
+        self._update_activity(self._search, _iteration_text(line))
 
     def activity(self, name: str) -> None:
         """Show the name of the search that begins or resumes, such as that of a coarse start; its
@@ -241,8 +241,8 @@ class SolveProgress(Watched):
         return f"{self._doing}{state}{elapsed}"
 
     def _activity_with_iterations(self) -> str:
-        """Return the current activity with the number of iterations so far, for the `Heartbeat`."""
-        done = f", {len(self._lines)} iterations" if self._lines else ""
+        """Return the current activity with the last iteration, for the `Heartbeat`."""
+        done = f", {_iteration_text(self._lines[-1])}" if self._lines else ""
         return f"{self._doing}{self._remaining}{done}{self._state_in_words()}"
 
     def _state_in_words(self) -> str:
@@ -273,13 +273,21 @@ def _remaining_time(elapsed_s: float, share: float) -> str:
 def _iteration_table(lines: list[Iteration]) -> Shown:
     if not lines:
         return ""
-    heads = ("", "RMS mm", "violation N", *map(symbol_of, lines[-1].parameters), "s")
+    heads = ("", "misfit σ", "violation N", *map(symbol_of, lines[-1].parameters), "s")
     return Table("", heads, rows=tuple(map(_iteration_row, lines[-SHOWN_ITERATIONS:])), names=0)
 
 
 def _iteration_row(line: Iteration) -> tuple[str, ...]:
-    """Return number, marker error [mm], violation [N], parameters and time [s]."""
+    """Return number, misfit, violation [N], parameters and time [s]."""
     values = (f"{value:.4g}" for value in line.parameters.values())
-    rms_mm = f"{line.rms_m * 1e3:.4f}"
     violation = f"{line.violation_n:.1e}"
-    return str(line.number), rms_mm, violation, *values, f"{line.time_s:.1f}"
+    return str(line.number), f"{line.misfit:.4g}", violation, *values, f"{line.time_s:.1f}"
+
+
+def _iteration_text(line: Iteration) -> str:
+    values = (
+        f"{symbol_of(name)} = {value:.4g} {unit_of(name)}".rstrip()
+        for name, value in line.parameters.items()
+    )
+    part = "" if line.share == 1 else f" of the first {line.share:.0%}"
+    return ", ".join((f"iteration {line.number}: misfit {line.misfit:.3g} σ{part}", *values))

@@ -14,20 +14,21 @@ from ..common.validated_classes import validated
 from ..errors import InputError
 from ..features.measurements import lost_samples
 from ..features.registry import FEATURES
-from ..fem.laws.constants import without_region
+from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..methods.best_iterate import answers_as, best_iterate, keep
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch
 from ..methods.starts.initial_trajectories import associated_at_guess
 from ..methods.starts.start import Scan, Start
-from ..methods.starts.stiffness_scan import rescue, start_problem
+from ..methods.starts.stiffness_scan import EXPLAINED, rescue, start_problem
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from .branch_order import with_ascending_times
 from .check.cost import require_memory
 from .coarse_start import CoarseStart
+from .prediction import fit_misfits
 from .second_start import second_start, start_beyond_bounds, without_limitless_shares
 from .several_starts import follow_starts
 from .smaller_problem import NoStartError, SmallerProblem
@@ -141,7 +142,26 @@ def solve(
     if solution.status is Status.TIME_LIMIT:
         remedy = _incompressible_remedy(problem)
         solution = replace(solution, message=solution.message.rstrip(".") + f"{remedy}.")
+    if solution.status in (Status.STALLED, Status.ITERATION_LIMIT):
+        solution = replace(solution, message=f"{solution.message} {_end_of(solution)}")
     return solution
+
+
+def _end_of(solution: Solution) -> str:
+    """Return where a search ended, and which measurements it cannot explain there."""
+    estimated = [item.name for item in solution.collocation.parameters.free_scalars]
+    values = [
+        f"{symbol_of(name)} = {solution.parameters[name]:.4g} {unit_of(name)}".rstrip()
+        for name in estimated
+    ]
+    misfits = [each for own in fit_misfits(solution).values() for each in own]
+    unexplained = [
+        f"{each.what} ({each.sigmas:.2g} standard deviations)"
+        for each in sorted(misfits, key=lambda each: -each.sigmas)
+        if each.sigmas > EXPLAINED
+    ]
+    measurements = f", where it does not explain {', '.join(unexplained)}" if unexplained else ""
+    return f"It ended at {', '.join(values)}{measurements}."
 
 
 def _start_limit_s(problem: Problem, solver: Method) -> float:

@@ -79,7 +79,7 @@ def history(count=5):
         Iteration(
             number=k,
             loss=10.0 ** (3 - k),
-            rms_m=10.0 ** (-2 - k),
+            misfit=10.0 ** (1 - k),
             violation_n=0.0 if k == 0 else 10.0**-k,
             parameters={**TRUTH, "lambda_pa": 200.0 * 2 ** (count - 1 - k)},
             time_s=float(k),
@@ -125,12 +125,12 @@ def test_margins_do_not_depend_on_the_layout_that_matplotlib_is_configured_with(
     assert framed.subplotpars.left == pytest.approx(10 / 80)
 
 
-def test_convergence_draws_errors_in_millimetres_and_newtons_on_logarithmic_axes():
-    rms, loss, violation, _ = convergence(history()).axes
-    assert {axes.get_yscale() for axes in (rms, loss, violation)} == {"log"}
-    np.testing.assert_allclose(rms.lines[0].get_ydata(), [10.0 ** (1 - k) for k in range(5)])
+def test_convergence_draws_the_misfit_in_deviations_and_newtons_on_logarithmic_axes():
+    misfit, loss, violation, _ = convergence(history()).axes
+    assert {axes.get_yscale() for axes in (misfit, loss, violation)} == {"log"}
+    np.testing.assert_allclose(misfit.lines[0].get_ydata(), [10.0 ** (1 - k) for k in range(5)])
     np.testing.assert_allclose(loss.lines[0].get_ydata(), [10.0 ** (3 - k) for k in range(5)])
-    assert "mm" in rms.get_ylabel()
+    assert "σ" in misfit.get_ylabel()
     assert "N" in violation.get_ylabel()
 
 

@@ -35,7 +35,7 @@ _STAGE_COLOUR = "#808080"
 
 
 def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None) -> Figure:
-    """Return a figure of marker error, loss, violation of the equations of motion, and parameters
+    """Return a figure of misfit, loss, violation of the equations of motion, and parameters
     against the iteration number; values that are not positive are left out.
 
     Parameters
@@ -56,7 +56,7 @@ def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None
     panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
     numbers = [iteration.number for iteration in history]
     curves = (
-        ("RMS [mm]", [1e3 * i.rms_m for i in history], BLUE),
+        ("misfit [σ]", [i.misfit for i in history], BLUE),
         ("loss", [i.loss for i in history], BLUE),
         ("violation [N]", [i.violation_n for i in history], VERMILION),
     )
