@@ -12,7 +12,7 @@ from collocation_sysid.errors import InputError
 from collocation_sysid.fem.meshes import surface
 from collocation_sysid.fem.meshes.files import read_triangles
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
 from collocation_sysid.fem.meshes.surface import merge_coincident, tetrahedralize_surface
 
 
@@ -96,6 +96,35 @@ def test_pytetwild_fills_a_surface_and_the_cache_repeats_the_mesh(tmp_path, monk
     assert again.sha256 == mesh.sha256
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["cache", "cube.stl"]
     assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_the_mesher_respects_the_edge_length_of_a_round_body():
+    pytest.importorskip("pytetwild")
+    scan = cylinder_mesh(0.01, 0.1, 5, 40)
+    edges_m = []
+    for edge_length_m in (0.012, 0.006):
+        mesh = TetMesh.from_surface((scan.points_m, scan.surface), edge_length_m)
+        edges_m.append(mesh.quality().edge_mean_m / edge_length_m)
+        assert mesh.volume_m3 == pytest.approx(scan.volume_m3, rel=0.02)
+    assert all(0.65 < each < 1.5 for each in edges_m)
+
+
+def test_a_coarse_mesh_has_the_volume_of_a_round_surface():
+    scan = cylinder_mesh(0.01, 0.1, 5, 40)
+    coarse = cylinder_mesh(0.01, 0.1, 1, 8)
+    points, tetrahedra = coarse.points_m.copy(), coarse.tetrahedra
+    radius_m = np.hypot(points[:, 0], points[:, 1])
+    points[radius_m > 0.001, :2] *= (0.01 / radius_m[radius_m > 0.001])[:, None]
+    assert TetMesh(points, tetrahedra).volume_m3 < 0.85 * scan.volume_m3
+    moved = surface.with_volume_of(scan.points_m, scan.surface, points, tetrahedra)
+    assert TetMesh(moved, tetrahedra).volume_m3 == pytest.approx(scan.volume_m3, rel=0.015)
+    np.testing.assert_allclose(np.ptp(moved[:, 2]), 0.1, rtol=1e-9)
+
+
+def test_a_mesh_of_plane_faces_is_kept():
+    box = box_mesh((0.1, 0.04, 0.04), (5, 2, 2))
+    moved = surface.with_volume_of(*cube_surface(), box.points_m, box.tetrahedra)
+    np.testing.assert_allclose(moved, box.points_m, atol=1e-12)
 
 
 def test_a_cache_folder_that_cannot_be_made_is_refused(tmp_path, monkeypatch):

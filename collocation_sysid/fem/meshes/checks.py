@@ -17,6 +17,9 @@ from ...common.checked_arrays import float_array
 from ...errors import InputError
 from ..elements import EDGES
 
+# Faces of a tetrahedron, counter-clockwise as seen from outside.
+OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+
 # Volume over mean edge length cubed; 0.118 for the regular tetrahedron. Below this a
 # single-precision file cannot tell the element from a flat one.
 DEGENERATE_RATIO = 1e-6
@@ -197,6 +200,19 @@ def unique_edges(tetrahedra: np.ndarray) -> np.ndarray:
     sorted.
     """
     return np.unique(np.sort(tetrahedra[:, EDGES].reshape(-1, 2), axis=1), axis=0)
+
+
+def boundary_of(tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the boundary faces (F, 3) of tetrahedra and the index (F,) of the element of each.
+
+    A boundary face belongs to one element only; it is counter-clockwise as seen from outside.
+    """
+    faces = tetrahedra[:, OUTWARD_FACES].reshape(-1, 3)
+    _, first, count = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    boundary_faces = np.sort(first[count == 1])
+    return faces[boundary_faces], boundary_faces // 4
 
 
 @dataclass(frozen=True)

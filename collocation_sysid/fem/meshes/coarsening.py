@@ -17,8 +17,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from .checks import edge_lengths, mean_ratios, signed_volumes, unique_edges
-from .mesh import TetMesh, boundary_of
+from .checks import boundary_of, edge_lengths, mean_ratios, signed_volumes, unique_edges
+from .mesh import TetMesh
 
 # Smallest mean ratio of a new element; where the old ones are worse, they must not deteriorate.
 LEAST_QUALITY = 0.15

@@ -21,6 +21,7 @@ from ...errors import InputError
 from ..elements import Element
 from .checks import (
     MeshQuality,
+    boundary_of,
     checked_arrays,
     checked_faces,
     checked_points,
@@ -40,9 +41,6 @@ class NodeSelection(Protocol):
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the indices of the selected nodes, sorted."""
         ...
-
-
-_OUTWARD_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,19 +324,6 @@ class TetMesh:
             quality_min=float(ratios.min()),
             quality_median=float(np.median(ratios)),
         )
-
-
-def boundary_of(tetrahedra: Index) -> tuple[Index, Index]:
-    """Return the boundary faces (F, 3) of tetrahedra and the index (F,) of the element of each.
-
-    A boundary face belongs to one element only; it is counter-clockwise as seen from outside.
-    """
-    faces = tetrahedra[:, _OUTWARD_FACES].reshape(-1, 3)
-    _, first, count = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    boundary_faces = np.sort(first[count == 1])
-    return faces[boundary_faces], boundary_faces // 4
 
 
 def _read_only(array: np.ndarray) -> np.ndarray:

@@ -15,19 +15,27 @@ from scipy.spatial import KDTree
 from ...common.files import replaced_file
 from ...common.isolated_process import Failed, run_isolated
 from ...errors import InputError
-from .checks import clean_mesh
+from .checks import boundary_of, clean_mesh, orient_elements, signed_volumes
 from .files import read_tetrahedra, write_tetrahedra
 
 # Edge length passed to fTetWild, as a fraction of the desired one. fTetWild stops as soon as its
 # elements are well shaped, however small; coarsening then merges edges up to about the length
 # passed, which gives a mean length about a quarter above it.
 ASKED_LENGTH = 0.8
-# Largest distance of the new surface from the old one, in edge lengths; it limits coarsening.
-TOLERANCE = 0.02
-_RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}"
+# Largest distance of the new surface from the old one, in edge lengths: that of a chord of such a
+# length from an arc with a radius of as much.
+TOLERANCE = 0.13
+_RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}, volume of the surface"
 
 # Largest accepted number of tetrahedra; more suggest a wrong edge length or length unit.
 MOST_ELEMENTS = 2_000_000
+
+# Number of triangles from which the surface is divided no further where distances from it are measured.
+MOST_SAMPLES = 200_000
+
+# Largest ratio of the way of a node to the mean distance of its faces from the surface: it is 1.5 on a
+# cylinder.
+LARGEST_FACTOR = 3.0
 
 # Program of a separate process: fTetWild writes a file to its working directory and cannot be
 # interrupted.
@@ -50,9 +58,9 @@ def tetrahedralize_surface(
     """Fill a closed surface with tetrahedra.
 
     fTetWild keeps neither the vertices nor the triangles of the surface: the new surface stays
-    within 2 % of `edge_length_m` of the old one, for which it uses shorter edges where the surface
-    is curved. So give a selection by coordinates that margin. fTetWild is not deterministic either:
-    keep the mesh, by `cache_dir` or `TetMesh.write`, to reproduce a result.
+    within 13 % of `edge_length_m` of the old one and encloses the same volume. So give a selection
+    by coordinates that margin. fTetWild is not deterministic either: keep the mesh, by `cache_dir`
+    or `TetMesh.write`, to reproduce a result.
 
     Parameters
     ----------
@@ -209,4 +217,61 @@ def run_ftetwild(
             "pytetwild found no interior: the surface encloses no volume; expected triangles that "
             "close around the body: check the surface in a mesh editor"
         )
-    return mesh["points_m"], mesh["tetrahedra"].astype(np.int64)
+    tetrahedra = mesh["tetrahedra"].astype(np.int64)
+    return with_volume_of(points, triangles, mesh["points_m"], tetrahedra), tetrahedra
+
+
+def with_volume_of(
+    scan_m: np.ndarray, scan: np.ndarray, points_m: np.ndarray, tetrahedra: np.ndarray
+) -> np.ndarray:
+    """Return the nodes (n, 3) with those of the surface moved so that it encloses the volume of the
+    scan: chords of a round body lie within it, which is then too slender.
+
+    A node moves with the mean distance of its faces from the scan, each along its normal, so that
+    nodes of plane faces stay in their plane.
+    """
+    tetrahedra, _ = orient_elements(points_m, tetrahedra)
+    faces, _ = boundary_of(tetrahedra)
+    corners = points_m[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    areas = np.linalg.norm(normals, axis=1)
+    normals /= areas[:, None]
+    middles = (corners + np.roll(corners, -1, axis=1)) / 2  # their mean is exact for arcs
+    samples, planes = _samples_of(scan_m[scan], np.sqrt(areas.min()) / 2)
+    nearest = KDTree(samples).query(middles)[1]
+    heights = np.einsum("fki,fki->fk", samples[nearest] - middles, planes[nearest])
+    gaps = np.einsum("fk,fki,fi->f", heights, planes[nearest], normals) / 3
+    missing_m3 = (areas * gaps).sum()
+    move = np.zeros_like(points_m)
+    weight = np.zeros(len(points_m))
+    for corner in faces.T:
+        np.add.at(move, corner, (areas * gaps)[:, None] * normals)
+        np.add.at(weight, corner, areas)
+    move[weight > 0] /= weight[weight > 0, None]
+    volumes = signed_volumes(points_m, tetrahedra)
+    for _ in range(3):  # the volume is nearly linear in the distance
+        gained_m3 = (signed_volumes(points_m + move, tetrahedra) - volumes).sum()
+        if not missing_m3 * gained_m3 > 0:
+            return points_m
+        move *= min(missing_m3 / gained_m3, LARGEST_FACTOR)
+    while (signed_volumes(points_m + move, tetrahedra)[volumes > 0] <= 0).any():
+        move /= 2
+    return points_m + move
+
+
+def _samples_of(triangles_m: np.ndarray, spacing_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (m, 3) of triangles (F, 3, 3), with about a spacing, and their normals (m, 3)."""
+    while len(triangles_m) < MOST_SAMPLES:
+        ends = np.roll(triangles_m, -1, axis=1)
+        is_long = np.linalg.norm(ends - triangles_m, axis=2).max(axis=1) > spacing_m
+        if not is_long.any():
+            break
+        a, b, c = triangles_m[is_long].swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        parts = [np.stack(each, axis=1) for each in quarters]
+        triangles_m = np.concatenate([triangles_m[~is_long], *parts])
+    a, b, c = triangles_m.swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    return triangles_m.mean(axis=1), normals

@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator
 
 from ...common.array_types import Array
 from ...fem.laws.constants import symbol_with_unit
-from ...fem.meshes.mesh import boundary_of
+from ...fem.meshes.checks import boundary_of
 from ..figure_style import PAGE_MM, SMALL_PT
 from ..replay import MotionRecord
 from .projection import ParallelCamera

@@ -28,7 +28,7 @@ from ...fem.body import Body
 from ...fem.laws.constants import GAMMA_M, GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
-from ...fem.meshes.mesh import boundary_of
+from ...fem.meshes.checks import boundary_of
 from ...model.contact.summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
