@@ -83,6 +83,14 @@ def _check_verdict(findings: CheckResult) -> Line:
             "materials, forces and sensors with the functions of collocation_sysid.testing.",
             "doubtful",
         )
+    if findings.omitted and not findings.causes:
+        edge_m = findings.edge_of_a_minute_m
+        edges = f" with edges of {1e3 * edge_m:.2g} mm" if edge_m is not None else ""
+        return Line(
+            "No mistake was found. Left out, because check would take longer than half a minute: "
+            f"{', '.join(findings.omitted)}. Use a coarser mesh{edges}, or check --full.",
+            "check",
+        )
     if findings.causes:
         likeliest = findings.causes[0].message
         sentence = (
@@ -296,6 +304,9 @@ def _solve_brief(findings: CheckResult) -> Table:
     for cost in findings.costs:
         if cost.method == findings.method:
             rows["solve"] = f"{_cost_text(cost)} by {cost.method} (rough estimates, without checks)"
+            edge_m = findings.edge_of_a_minute_m
+            if edge_m is not None:
+                rows["solve"] += f"; edges of {1e3 * edge_m:.2g} mm would take about a minute"
     return labelled("", rows)
 
 
@@ -306,7 +317,11 @@ def _solve_section(findings: CheckResult) -> Table:
         rows[f"determined{which}"] = each.statement()
     rows |= {
         "program": f"{findings.variables:,} variables, {findings.constraints:,} constraints, "
-        f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
+        + (
+            "nonzeros not counted"
+            if findings.jacobian_nonzeros is None or findings.hessian_nonzeros is None
+            else f"{findings.jacobian_nonzeros + findings.hessian_nonzeros:,} nonzeros"
+        )
     }
     rows |= findings.lifted_texts
     for cost in findings.costs:
@@ -316,8 +331,9 @@ def _solve_section(findings: CheckResult) -> Table:
         rows["times"] = (
             f"rough estimates for {findings.timesteps:,} time steps or equilibria, without checks"
         )
-    rows["derivatives"] = (
-        f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "
-        f"{findings.hessian_error:.0e}"
-    )
+    if np.isfinite(findings.jacobian_error):
+        rows["derivatives"] = (
+            f"relative errors of Jacobian and Hessian: {findings.jacobian_error:.0e}, "
+            f"{findings.hessian_error:.0e}"
+        )
     return labelled("Solve", rows)

@@ -467,6 +467,39 @@ def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, mon
     assert short.jacobian_nonzeros == whole.jacobian_nonzeros
 
 
+@pytest.mark.parametrize("limit", ["LONGEST_START_S", "LONGEST_CHECK_S"])
+def test_a_check_leaves_out_what_takes_too_long_with_the_remedy(tiny: Path, monkeypatch, limit):
+    monkeypatch.setattr(f"collocation_sysid.runs.check.{limit}", 0.0)
+    problem = Problem.read(
+        tiny / "problem.toml", ["parameters.mu_pa={}", "parameters.lambda_pa={}"]
+    )
+    found = check_problem(problem)
+    assert len(found.omitted) == 3
+    assert not found.costs
+    assert not found.motions
+    shown = " ".join(plain_text(full_check_tables(found)).split())
+    assert "Left out, because check would take longer than half a minute: time and memory" in shown
+    assert "Use a coarser mesh, or check --full." in shown
+    assert "nonzeros not counted" in plain_text(full_check_tables(found, details=True))
+    assert found.as_dict()["jacobian_error"] is None
+    whole = check_problem(problem, full=True)
+    assert not whole.omitted
+    assert whole.derivatives_agree
+
+
+def test_an_edge_length_is_proposed_with_which_a_search_takes_a_minute(tiny: Path, monkeypatch):
+    problem = Problem.read(tiny / "problem.toml")
+    assert check_problem(problem).edge_of_a_minute_m is None
+    monkeypatch.setattr("collocation_sysid.runs.check.LONG_SOLVE_S", 1e-3)
+    found = check_problem(problem)
+    edge_m = found.edge_of_a_minute_m
+    assert edge_m is not None
+    assert edge_m > found.bodies[0].edges_m[1]
+    assert f"; edges of {1e3 * edge_m:.2g} mm would take about a minute" in plain_text(
+        full_check_tables(found)
+    )
+
+
 def test_three_samples_of_equilibria_have_all_kinds_of_rows():
     static = shortened_problem(Problem([block(t_s=np.arange(6.0), z_m=np.zeros(6))], TRUTH))
     assert len(static.experiments[0].t_s) == 3

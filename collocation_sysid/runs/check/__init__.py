@@ -14,11 +14,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
+
 from ...common.array_types import Array
 from ...common.serialisation import content
+from ...common.time_limit import TimeLimitReached, time_limit
 from ...errors import SimulationError
 from ...features.measurements import lost_samples
 from ...features.registry import FEATURES
+from ...methods.best_iterate import best_iterate
 from ...methods.reduced_space import ReducedSpace
 from ...methods.starts.initial_trajectories import initial_variables
 from ...methods.starts.stiffness_scan import (
@@ -43,7 +47,15 @@ from ...statistics.scale_identifiability import scale_concerns, scale_reference,
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
 from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
-from .cost import MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
+from .cost import (
+    LONG_SOLVE_S,
+    TYPICAL_SWEEPS,
+    MethodCost,
+    cost_concerns,
+    cost_notes,
+    method_costs,
+    nonzeros,
+)
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
@@ -65,8 +77,19 @@ __all__ = [
 ]
 
 
-# Longest computation, a simulation of the whole recordings for one, that needs no request [s].
+# Longest simulation of the whole recordings that needs no request [s].
 LONGEST_SIMULATION_S = 10.0
+# Longest check without a request, and longest search for initial values and simulation of the first
+# samples in it [s].
+LONGEST_CHECK_S = 25.0
+LONGEST_START_S = 8.0
+# Times of parts of a check over that of the simulation of the first samples, at most: of bodies with
+# 600 and 3,300 nodes.
+COST_FACTOR = 1.2
+DESCRIPTION_FACTOR = 3.0
+DERIVATIVE_FACTOR = 5.0
+# Power of the edge length in the time of a sweep: that of a finger with 600 and 3,300 nodes.
+EDGE_POWER = 4.5
 # Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
 # Largest relative deviation from fourth-order central differences that rounding explains.
@@ -98,7 +121,7 @@ LIFTED_KINDS = (
 class CheckResult(QuickCheck):
     """All findings of `check`."""
 
-    SERIALISED_PROPERTIES: ClassVar = ("warnings",)
+    SERIALISED_PROPERTIES: ClassVar = ("memory_mb", "warnings")
 
     # Numbers of experiments, and of time steps of all fitted experiments.
     experiments: int
@@ -118,14 +141,13 @@ class CheckResult(QuickCheck):
     # interior point and other methods that need the whole program.
     overstresses: int
     wrenches: int
-    # With lifted variables.
-    jacobian_nonzeros: int
-    hessian_nonzeros: int
+    # With lifted variables; None if they were not counted.
+    jacobian_nonzeros: int | None
+    hessian_nonzeros: int | None
     method: str  # the chosen method
-    # Estimated memory of the chosen method; None if it is not among the `costs`.
-    memory_mb: float | None
     costs: tuple[MethodCost, ...]
-    # Largest relative deviation from central differences along random directions.
+    # Largest relative deviation from central differences along random directions; NaN if they were not
+    # compared.
     jacobian_error: float
     hessian_error: float
     # Likely errors in the description; their sentences are the first warnings.
@@ -134,6 +156,10 @@ class CheckResult(QuickCheck):
     # is not determined; empty unless the complete recordings were simulated.
     combinations: tuple[Combination, ...] = ()
     notes: tuple[str, ...] = ()  # sentences for information, without a remedy
+    omitted: tuple[str, ...] = ()  # parts of the check that would take too long
+    # Mean edge length of a mesh with which the search takes about a minute; None if it takes no
+    # longer.
+    edge_of_a_minute_m: float | None = None
     # Expected problems, with the remedy; `warnings` are their sentences.
     concerns: tuple[Concern, ...] = ()
 
@@ -141,6 +167,11 @@ class CheckResult(QuickCheck):
     def chosen_cost(self) -> MethodCost | None:
         """Cost of the chosen method; None if it is not known."""
         return next((cost for cost in self.costs if cost.method == self.method), None)
+
+    @property
+    def memory_mb(self) -> float | None:
+        """Estimated memory of the chosen method [MB]; None if it is not among the `costs`."""
+        return self.chosen_cost.memory_mb if self.chosen_cost else None
 
     @property
     def lifted_texts(self) -> dict[str, str]:
@@ -156,8 +187,8 @@ class CheckResult(QuickCheck):
 
     @property
     def derivatives_agree(self) -> bool:
-        """Whether the errors of both derivative checks are below `DERIVATIVE_TOLERANCE`."""
-        return max(self.jacobian_error, self.hessian_error) < DERIVATIVE_TOLERANCE
+        """Whether no error of the derivative checks is above `DERIVATIVE_TOLERANCE`."""
+        return not max(self.jacobian_error, self.hessian_error) >= DERIVATIVE_TOLERANCE
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -211,8 +242,8 @@ def check_problem(
     report_progress : callable, optional
         Called with progress messages.
     full : bool
-        Whether the whole recordings are simulated at the guess however long that takes; by default
-        only their first samples if it would take more than some ten seconds.
+        Whether everything is done, and the whole recordings are simulated at the guess, however long
+        that takes; by default a check ends within half a minute, and a note says what it leaves out.
 
     Raises
     ------
@@ -226,83 +257,102 @@ def check_problem(
     from ...judge.source import SimulatedCheck
 
     report_progress = report_progress or (lambda _: None)
+    began_s = time.perf_counter()
     lost = [note for each in problem.experiments for note in lost_samples(each)]
     collocation = problem.collocation()
     notes = []
     if problem.parameters.names_without_guess:
         report_progress("searching for initial values, because no guess is given")
-        start = start_problem(collocation)
-        collocation, scan = start.collocation, start.scan
+        collocation, found_notes = _started(collocation, full)
         problem = replace(problem, parameters=collocation.parameters)
-        notes = [each for each in (scan.sentence if scan else "", start.note) if each]
+        notes += found_notes
     report_progress("simulating the first samples at the guess")
     started_s = time.perf_counter()
     first = shortened_problem(problem).collocation()
-    first_z, start_notes = initial_variables(first)
-    total_s = (time.perf_counter() - started_s) * _grid_rows(collocation) / _grid_rows(first)
-    report_progress("comparing derivatives with differences")
-    jacobian_error, hessian_error = derivative_errors(first, first_z)
-    report_progress("estimating time and memory of the methods")
-    program = _program_fields(problem, collocation, first=first, first_z=first_z)
-    simulated = first
-    z = first_z
-    if full or total_s <= LONGEST_SIMULATION_S:
+    omitted: list[str] = []
+    try:
+        with time_limit(np.inf if full else LONGEST_START_S):
+            first_z, start_notes = initial_variables(first)
+        first_s = time.perf_counter() - started_s
+    except TimeLimitReached:
+        first_z, start_notes, first_s = _rigid_variables(first), [], np.inf
+
+    def is_possible(factor: float, what: str) -> bool:
+        """Whether the time is sufficient for a part of the check."""
+        left_s = LONGEST_CHECK_S - (time.perf_counter() - began_s)
+        if full or factor * first_s <= left_s:
+            return True
+        omitted.append(what)
+        return False
+
+    total_s = first_s * _grid_rows(collocation) / _grid_rows(first)
+    program = _program_size(problem, collocation)
+    if is_possible(COST_FACTOR, "time and memory of a solve"):
+        report_progress("estimating time and memory of the methods")
+        program |= _program_costs(problem, collocation, first=first, first_z=first_z)
+    simulated, z = first, first_z
+    if full or (not omitted and total_s <= LONGEST_SIMULATION_S):
         report_progress(f"simulating the recordings at the guess, about {max(1, round(total_s))} s")
         simulated = collocation
         (z, start_notes) = initial_variables(collocation)
-    report_progress("computing natural modes and testing the description")
-    causes = misspecification_hypotheses(problem)
-    check = SimulatedCheck(
-        problem,
-        collocation,
-        parts=simulated.iterates(z),
-        causes=causes,
-        is_full=full,
-        fit_s=partial(_fit_to_markers_s, collocation, total_s),
-        report_progress=report_progress,
-        is_simulated=not start_notes,
-    )
-    # In reverse order, because comparisons that need a fit are made only if no other is likely.
-    for source in reversed(SOURCES):
-        found, found_notes = source.simulated(check)
-        if found:
-            causes = rank((*causes, *found))
-            check = replace(check, causes=causes)
-        notes += found_notes
-    combinations = ()
+    causes: tuple[Hypothesis, ...] = ()
+    combinations: tuple[Combination, ...] = ()
+    motions: tuple[ModesCheck, ...] = ()
+    unstable: Sequence[Instability] = ()
+    at_guess: list[Concern] = []
+    if is_possible(DESCRIPTION_FACTOR, "natural modes and tests of the description"):
+        report_progress("computing natural modes and testing the description")
+        causes = misspecification_hypotheses(problem)
+        parts = simulated.iterates(z)
+        check = SimulatedCheck(
+            problem,
+            collocation,
+            parts=parts,
+            causes=causes,
+            is_full=full,
+            fit_s=partial(_fit_to_markers_s, collocation, total_s),
+            report_progress=report_progress,
+            is_simulated=not start_notes,
+        )
+        # In reverse order, because comparisons that need a fit are made only if no other is likely.
+        for source in reversed(SOURCES):
+            found, found_notes = source.simulated(check)
+            if found:
+                causes = rank((*causes, *found))
+                check = replace(check, causes=causes)
+            notes += found_notes
+        motions = _natural_modes(problem, collocation)
+        unstable = find_instabilities(simulated, z)
+        at_guess += strain_stability_concerns(parts)
+        if not start_notes:  # forces on a body that was only carried by its grasps mean nothing
+            at_guess += branch_concerns(parts)
+            for feature in FEATURES:
+                at_guess += feature.guess_concerns(parts, simulated is not first)
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
         combinations = _expected_combinations(problem, collocation, z)
         notes += _views_notes(collocation, z)
+    jacobian_error = hessian_error = np.nan
+    if is_possible(DERIVATIVE_FACTOR, "the comparison of derivatives"):
+        report_progress("comparing derivatives with differences")
+        jacobian_error, hessian_error = derivative_errors(first, first_z)
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
         timesteps=_grid_rows(collocation),
         rms_at_guess_m=None if simulated is first else collocation.rms_marker_distance_m(z),
-        motions=_natural_modes(problem, collocation),
+        motions=motions,
         **program,
         jacobian_error=jacobian_error,
         hessian_error=hessian_error,
         causes=causes,
         combinations=combinations,
+        omitted=tuple(omitted),
     )
-    parts = simulated.iterates(z)
-    # Forces on a body that was only carried by its grasps mean nothing.
-    at_guess = [
-        concern
-        for feature in FEATURES
-        if not start_notes
-        for concern in feature.guess_concerns(parts, simulated is not first)
-    ]
-    concerns = (
-        *_concerns(problem, findings, unstable=find_instabilities(simulated, z)),
-        *strain_stability_concerns(parts),
-        *(branch_concerns(parts) if not start_notes else ()),
-        *at_guess,
-    )
+    concerns = (*_concerns(problem, findings, unstable=unstable), *at_guess)
     notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
     chosen_cost = findings.chosen_cost
     notes += cost_notes(chosen_cost, findings.costs) if chosen_cost else []
-    if simulated is first:
+    if simulated is first and not omitted:
         notes.append(
             "only the first samples of the recordings were simulated at the guess; check --full "
             f"simulates all of them, in about {total_s:.2g} s"
@@ -310,13 +360,51 @@ def check_problem(
     if problem.substeps == "auto" and findings.motions:
         steps = problem.choose_first_substeps()
         notes.append(SUBSTEPS_NOTE if steps == 1 else IMPACT_NOTE.format(steps))
-    findings = replace(findings, concerns=concerns)
+    least_s = TYPICAL_SWEEPS * LONGEST_START_S * _grid_rows(collocation) / _grid_rows(first)
+    search_s = least_s if first_s == np.inf else (chosen_cost and chosen_cost.time_s)
+    findings = replace(
+        findings, concerns=concerns, edge_of_a_minute_m=_edge_of_a_minute_m(findings, search_s)
+    )
     rests_on = scale_reference(
         problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
     )
     notes += [] if rests_on is None else [rests_on.sentence]
     known = [note for note in problem.notes if note not in findings.warnings]
     return replace(findings, notes=(*known, *lost, *notes))
+
+
+def _edge_of_a_minute_m(findings: QuickCheck, search_s: float | None) -> float | None:
+    meshed = [body for body in findings.bodies if not body.is_homogeneous]
+    if search_s is None or search_s <= LONG_SOLVE_S or len(meshed) != 1:
+        return None
+    return meshed[0].edges_m[1] * (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
+
+
+def _rigid_variables(collocation: Collocation) -> Array:
+    """Return the variables of bodies that move rigidly with their grasps."""
+    positions = [
+        each.experiment.rigid_positions(each.dynamics.t_s).reshape(each.grid_times, -1)
+        for each in collocation.transcriptions
+    ]
+    return collocation.pack(collocation.guess_p, positions)
+
+
+def _started(collocation: Collocation, full: bool) -> tuple[Collocation, list[str]]:
+    """Return the program with a guess of every parameter, and notes; at the limit of time those of the
+    best simulation so far, or usual ones.
+    """
+    with best_iterate() as best:
+        try:
+            with time_limit(np.inf if full else LONGEST_START_S):
+                start = start_problem(collocation)
+        except TimeLimitReached:
+            usual = typical_parameters(collocation.parameters, SOFT_PA)
+            parameters = best.solution().collocation.parameters if best.answer else usual
+            return collocation.with_parameters(parameters), [
+                f"the search for initial values was ended after {LONGEST_START_S:g} s"
+            ]
+    notes = [start.scan.sentence if start.scan else "", start.note]
+    return start.collocation, [note for note in notes if note]
 
 
 def _expected_combinations(
@@ -370,17 +458,29 @@ def _grid_rows(collocation: Collocation) -> int:
     return sum(transcription.grid_times for transcription in collocation.transcriptions)
 
 
-def _program_fields(
+def _program_size(problem: Problem, collocation: Collocation) -> dict[str, Any]:
+    """Return the size of the program, without what takes time."""
+    lifted = with_lifted_variables(collocation)
+    method = problem.method
+    return {
+        "variables": collocation.variable_count,
+        "constraints": collocation.constraint_count,
+        **{field: lifted_count(lifted, group) for group, field, _, _ in LIFTED_KINDS},
+        "jacobian_nonzeros": None,
+        "hessian_nonzeros": None,
+        "method": method if isinstance(method, str) else getattr(method, "name", repr(method)),
+        "costs": (),
+    }
+
+
+def _program_costs(
     problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
 ) -> dict[str, Any]:
-    """Return size of the program and cost of the methods."""
-    lifted = with_lifted_variables(collocation)
-    jacobian, hessian = nonzeros(problem, lifted)
+    """Return nonzeros of the program and cost of the methods."""
+    jacobian, hessian = nonzeros(problem, with_lifted_variables(collocation))
     # Reduced space as the file has it, whichever method is chosen.
     named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
     reduced = next(each for each in named if isinstance(each, ReducedSpace))
-    method = problem.method
-    name = method if isinstance(method, str) else getattr(method, "name", repr(method))
     counted = method_costs(
         collocation,
         first,
@@ -388,16 +488,7 @@ def _program_fields(
         nonzeros=jacobian + hessian,
         factorisation=reduced.factorisation,
     )
-    return {
-        "variables": collocation.variable_count,
-        "constraints": collocation.constraint_count,
-        **{field: lifted_count(lifted, group) for group, field, _, _ in LIFTED_KINDS},
-        "jacobian_nonzeros": jacobian,
-        "hessian_nonzeros": hessian,
-        "method": name,
-        "memory_mb": next((cost.memory_mb for cost in counted if cost.method == name), None),
-        "costs": counted,
-    }
+    return {"jacobian_nonzeros": jacobian, "hessian_nonzeros": hessian, "costs": counted}
 
 
 def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
