@@ -307,15 +307,12 @@ def _with_added_measurements(answer: Run, say: Log) -> Run:
     say("predicting the effect of another measurement")
     solution = answer.solution
     level = 1.0 if answer.uncertainty.noise == "given" else answer.uncertainty.level.pooled
-    names = (name for each in answer.vague_constants for name in each.determined.names)
-    lines = (answer.budget[name] for name in names if name in answer.budget)
     found = with_measurements(
         answer.vague_constants,
         solution.collocation,
         solution.z,
         answer.problem.assumed_deviations,
         noise=level,
-        dominant={next(iter(line.shares)) for line in lines},
     )
     added = {
         frozenset(new.determined.names): new.fixes[0]

@@ -8,7 +8,7 @@ and a new test is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,10 +89,7 @@ class ExpectedPrecision:
 
 
 def expected_precision(
-    collocation: Collocation,
-    z: Array,
-    deviations: Mapping[str, float | None],
-    exact: tuple[LinearisedFit, Uncertainty] | None = None,
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
 ) -> ExpectedPrecision:
     """Return the precision of the estimates if all residuals were zero at the variables z, which
     satisfy the equations of motion.
@@ -102,8 +99,6 @@ def expected_precision(
     z : (variables,) array
     deviations : mapping of str to float or None
         Standard deviations of the assumptions of the budget.
-    exact : (LinearisedFit, Uncertainty), optional
-        Known result of `_exact_fit`.
 
     Raises
     ------
@@ -113,7 +108,7 @@ def expected_precision(
     from ..judge.augmented_fit import is_learnt
     from ..judge.posterior import Effects, Posterior
 
-    fit, known = exact or _exact_fit(collocation, z)
+    fit, known = _exact_fit(collocation, z)
     parameters = collocation.parameters
     q = z[: collocation.nq]
     changes = changes_of_assumptions(collocation, z, deviations)
@@ -213,12 +208,12 @@ def with_measurements(
     z: Array,
     deviations: Mapping[str, float | None],
     noise: float = 1.0,
-    dominant: Collection[str] = (),
 ) -> tuple[Combination, ...]:
     """Return the combinations with the added sensor or test that would determine their constants
     best as the first of their `fixes`; unchanged where none would. Of specimens, the first test
     that determines all of them well (`NARROW`) is taken. Of motions that are sampled much faster
-    than they change, every n-th sample serves, with the noise of the mean of n.
+    than they change, every n-th sample serves, with the noise of the mean of n, and one time step
+    for each sample.
 
     Parameters
     ----------
@@ -228,15 +223,10 @@ def with_measurements(
         Standard deviations of the assumptions of the budget.
     noise : float
         Variance of the noise over that of the stated σ.
-    dominant : collection of str
-        Assumptions that dominate the variances. A measurement with which they alone leave all
-        constants undetermined is not evaluated with the others.
     """
     if not combinations:
         return ()
     found: list[list[Fix]] = [[] for _ in combinations]
-    few = {n: s if n in dominant else None for n, s in deviations.items()}
-    has_bound = bool(dominant)
     distance = min(sample_distance(each.experiment) for each in collocation.transcriptions)
     some, z = _with_some_samples(collocation, z, distance)
 
@@ -251,12 +241,7 @@ def with_measurements(
     for what, added in added_measurements(some, z, NOISE / np.sqrt(distance)):
         try:
             wide, at = _extended(some, z, added)
-            exact = _exact_fit(wide, at)
-            if has_bound:
-                least = effects(what, expected_precision(wide, at, few, exact))
-                if all(fix.factor >= WIDE for fix in least.values()):
-                    continue
-            fixes = effects(what, expected_precision(wide, at, deviations, exact))
+            fixes = effects(what, expected_precision(wide, at, deviations))
         except (InputError, SimulationError):
             continue  # the law or the body does not allow this test
         for k, fix in fixes.items():
@@ -273,18 +258,27 @@ def with_measurements(
 def _with_some_samples(
     collocation: Collocation, z: Array, distance: int
 ) -> tuple[Collocation, Array]:
-    """Keep every n-th sample, n being `distance`, with the noise of their mean."""
-    if distance == 1:
+    """Keep every n-th sample, n being `distance`, with the noise of their mean, and one time step from
+    each to the next.
+    """
+    if distance == collocation.substeps == 1:
         return collocation, z
     experiments = []
     for transcription in collocation.transcriptions:
-        few = with_some_samples(transcription.experiment, distance)
-        markers = replace(few.markers, sigma_m=few.markers.sigma_m / np.sqrt(distance))
-        experiments.append(few.with_measurements([markers]))
-    some = replace(collocation, experiments=experiments)
+        few = transcription.experiment
+        if distance > 1:
+            few = with_some_samples(few, distance)
+            markers = replace(few.markers, sigma_m=few.markers.sigma_m / np.sqrt(distance))
+            few = few.with_measurements([markers])
+        experiments.append(few)
+    some = replace(collocation, experiments=experiments, substeps=1)
     p, positions = collocation.unpack(z)
-    pairs = zip(some.transcriptions, positions, strict=True)
-    return some, some.pack(p, [x[::distance][: each.grid_times] for each, x in pairs])
+    motions = []
+    for few, each, x in zip(
+        some.transcriptions, collocation.transcriptions, positions, strict=True
+    ):
+        motions.append(x[:: distance * each.substeps][: few.grid_times])
+    return some, some.pack(p, motions)
 
 
 def added_measurements(

@@ -118,33 +118,6 @@ def test_a_swing_that_is_held_longer_begins_with_the_fitted_motion(substeps):
     np.testing.assert_allclose(longer, whole, atol=1e-9)
 
 
-@pytest.mark.parametrize(("wide", "evaluated"), [("scale", 1), ("drift", 2)])
-def test_other_assumptions_do_not_count_where_the_dominant_one_leaves_all_undetermined(
-    monkeypatch, wide, evaluated
-):
-    calls = []
-
-    def precision(collocation, z, deviations, exact):
-        calls.append(deviations)
-        large = sum(1.0 for name, size in deviations.items() if size and name == wide)
-        covariance = np.diag([0.01, 0.02 + large])
-        return expected_precision.ExpectedPrecision(NAMES, VALUES, 0 * covariance, covariance, {})
-
-    monkeypatch.setattr(expected_precision, "expected_precision", precision)
-    swing = short_swing("swing", np.random.default_rng(0), count=4)
-    monkeypatch.setattr(expected_precision, "added_measurements", lambda *_: [("none", [swing])])
-    collocation = cs.Problem([swing], TRUTH | UNKNOWN).collocation()
-    variables, _ = initial_variables(collocation)
-    covariance = np.diag([0.01, 0.8]) ** 2
-    found = lone_constants(NAMES, VALUES, covariance, covariance, {"gamma_m_1_s"}, ())
-    deviations = {"scale": 0.01, "drift": 0.05, "mass": None}
-    arguments = (found, collocation, variables, deviations)
-    assert expected_precision.with_measurements(*arguments, dominant={"scale"}) == found
-    assert calls[0] == {"scale": 0.01, "drift": None, "mass": None}
-    assert len(calls) == evaluated
-    assert expected_precision.with_measurements(*arguments) == found
-
-
 @pytest.mark.long
 def test_a_part_of_the_samples_of_a_smooth_motion_predicts_as_all(monkeypatch):
     swing = short_swing("swing", np.random.default_rng(0), count=4)
