@@ -3,30 +3,27 @@ made.
 
 Each hypothesis is one more column of the linearised fit: the change of the residuals along the
 motion of the fit if the body had another law, another width along an axis of the mesh, a round
-section in place of a square one or the reverse, a finer mesh, or if its mesh had been made under its
-weight. The decrease of χ² by one Gauss–Newton step says which are worth a refit (`screened_bodies`);
-of a finer mesh this step is the only test. Mirror images of the mesh are too different for a linear
-step.
+section in place of a square one or the reverse, or if its mesh had been made under its weight. The
+decrease of χ² by one Gauss–Newton step says which are worth a refit. Mirror images of the mesh are
+too different for a linear step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from ..common.array_types import Array
-from ..errors import InputError, SimulationError
+from ..errors import InputError
 from ..fem.body import Body
 from ..fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
 from ..fem.meshes.mesh import TetMesh
 from ..fem.rest_shape import UnderGravity
-from ..methods.solution import Solution
 from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
-from ..statistics.budget.mesh_error import LARGEST_NODE_COUNT, mesh_residual_changes
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
 from ..statistics.budget.systematic_effects import (
     Effect,
@@ -34,30 +31,17 @@ from ..statistics.budget.systematic_effects import (
     section_effect,
     shape_effect,
 )
-from ..statistics.hypothesis import Hypothesis
-from ..statistics.linearised import linearise_fit
-from ..statistics.thresholds import LEAST_DECREASE, LEAST_SIGMAS, WIDEST
+from ..statistics.thresholds import WIDEST
 from .doubt import Correction, Doubt
-from .fit import linear_step, projected_gram
 
 AXES = "xyz"
 # Distance of the nodes of a mirrored mesh from the mesh, over the largest extent, up to which they
 # are the same shape.
 SAME_SHAPE = 0.02
-# Prior of the error of a mesh over the change to half the edge lengths: with the order of convergence
-# n it is 2ⁿ / (2ⁿ − 1), 1.3 to 3.4 for the lowest orders, to first order.
-MESH_ERROR = (2.0, 1.0)
 # Relative change of the length of an edge below which no law is told from another.
 LEAST_STRAIN = 0.05
 # Share of the weight in a scan that is taken as the whole weight.
 WHOLE_WEIGHT = (0.4, 2.0)
-
-
-@dataclass(frozen=True)
-class LinearCorrection:
-    """Correction of the description whose effect is known to first order only."""
-
-    share: float  # χ² of the fit with the correction over that without
 
 
 def other_materials(body: Body) -> tuple[str, ...]:
@@ -112,10 +96,9 @@ def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
         for each in (body.nodes_m, part.x.reshape(len(part.x), -1, 3))
     )
     is_strained = np.abs(moved_m / rest_m - 1).max() > LEAST_STRAIN
-    materials = ("", *(other_materials(body) if is_strained else ()))
-    dampings = ("", *other_dampings(body))
-    for laws in [(m, d) for m in materials for d in dampings][1:]:
-        yield _other_laws(*laws)
+    for material in other_materials(body) if is_strained else ():
+        for damping in ("", *other_dampings(body)):
+            yield _other_laws(material, damping)
     if not _is_uniform(body):
         return
     if other_section(body.mesh, body.nodes.points_m) is not None:
@@ -135,8 +118,7 @@ def _other_laws(material: str, damping: str) -> Doubt:
         other = with_body(experiment, with_laws(experiment.body, *laws))
         return other and (other, {"material": material, "damping": damping})
 
-    which = "/both" if material and damping else "" if material else "/damping"
-    return Doubt(f"law{which}", "1", effect=effect, correct=corrected)
+    return Doubt("law/both" if damping else "law", "1", effect=effect, correct=corrected)
 
 
 def _other_width(axis: int) -> Doubt:
@@ -197,34 +179,6 @@ REST_SHAPE = Doubt(
 def _is_uniform(body: Body) -> bool:
     """Return whether the body has one part without a field, so that it can be made again."""
     return len(body.parts) == 1 and all(part.field is None for part in body.parts)
-
-
-def coarse_mesh_hypotheses(solution: Solution, of: str) -> Iterator[Hypothesis]:
-    """Yield the hypothesis, about the subject `of`, that a finer mesh explains the residuals, with a
-    `LinearCorrection`; nothing if it is smaller than noise or hardly decreases χ², for large bodies,
-    or if its effect cannot be computed.
-    """
-    collocation = solution.collocation
-    bodies = [each.body for each in collocation.transcriptions if each.experiment.specimen is None]
-    if max((len(body.nodes.points_m) for body in bodies), default=0) > LARGEST_NODE_COUNT:
-        return
-    try:
-        blocks = mesh_residual_changes(collocation, solution.z)
-    except (InputError, SimulationError, np.linalg.LinAlgError):
-        return
-    gram = projected_gram(linearise_fit(collocation, solution.z), blocks)
-    decrease, (amplitude,) = linear_step(gram, [1], *MESH_ERROR)
-    sigmas = float(amplitude * np.sqrt(gram[1, 1] / collocation.measurement_count))
-    if decrease > LEAST_DECREASE and sigmas > LEAST_SIGMAS:
-        linear = any(body.element.name == "tet4" for body in bodies)
-        data = {
-            "sigmas": sigmas,
-            "remedy": 'set object.element = "tet10", or refine the mesh'
-            if linear
-            else "refine the mesh",
-        }
-        corrected = LinearCorrection(1 - decrease / gram[0, 0])
-        yield Hypothesis("mesh-coarse", of, data=data, corrected=corrected)
 
 
 def mirrored_meshes(experiment: Experiment) -> Iterator[Doubt]:

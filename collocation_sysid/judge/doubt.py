@@ -1,6 +1,4 @@
-"""Rows of likely mistakes in the description of an experiment, and the test of hypotheses by the
-misfit that remains.
-"""
+"""Rows of likely mistakes in a description, and their test by the misfit that remains."""
 
 from __future__ import annotations
 
@@ -11,23 +9,21 @@ from typing import Any
 import numpy as np
 
 from ..common.array_types import Array, Index
-from ..common.step_counting import search_activity
-from ..recording.experiment import Experiment
 from ..statistics.budget.systematic_effects import Effect, ExperimentAtAnswer
 from ..statistics.hypothesis import Hypothesis
 
-# Experiment without a mistake, and data of its message; None if the mistake is impossible.
-Correction = tuple[Experiment, dict[str, object]] | None
+# Description without a mistake, and data of its message; None if the mistake is impossible.
+Correction = tuple[Any, dict[str, object]] | None
 
 
 @dataclass(frozen=True, eq=False)
 class Doubt:
-    """One likely mistake in the description of an experiment."""
+    """One likely mistake in a description: an experiment, or what a comparison needs of it."""
 
     name: str  # code of its concern, after "description/"
     unit: str  # of its size
-    # ``correct(experiment, size)``: the experiment without the mistake of a size (axes,).
-    correct: Callable[[Experiment, Array], Correction]
+    # ``correct(description, size)``: the description without the mistake of a size (axes,).
+    correct: Callable[[Any, Array], Correction]
     # ``effect(at, axis)``: linear change of the equations of motion by one unit along an axis.
     effect: Callable[[ExperimentAtAnswer, int], Effect | None] | None = None
     # Or else changes of each block of the residuals by one unit, (…, axes) in σ.
@@ -37,6 +33,15 @@ class Doubt:
     mean: float = 1.0
     wide: float = 0.0
     subject: str = ""  # what is described, as the beginning of the message
+    # Factor by which the row must fit better than one without fitted numbers or variants.
+    handicap: float = 1.0
+
+    @classmethod
+    def whole(
+        cls, name: str, without: Any, subject: str = "", handicap: float = 1.0, **data: Any
+    ) -> Doubt:
+        """Return the row of a mistake of one size, from the description without it."""
+        return cls(name, "1", lambda *_: (without, data), subject=subject, handicap=handicap)
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -48,71 +53,48 @@ class Doubt:
         """Whether the answer without the mistake is near the one with it."""
         return self.effect is not None or self.wide > 0
 
-    def hypothesis(self, experiment: Experiment, size: Array | None = None) -> Hypothesis | None:
-        """Return the hypothesis of this mistake, with the experiment without it as `corrected`;
+    def hypothesis(self, described: Any, size: Array | None = None) -> Hypothesis | None:
+        """Return the hypothesis of this mistake, with the description without it as `corrected`;
         None where it is impossible.
         """
         size = np.full(max(1, len(self.axes.split())), self.mean) if size is None else size
-        correction = self.correct(experiment, size)
+        correction = self.correct(described, size)
         if correction is None:
             return None
         other, data = correction
-        of = self.subject or f"'{experiment.name}'"
+        of = self.subject or f"'{described.name}'"
         return Hypothesis(self.name, of, data=data, corrected=other, doubt=self, size=size)
 
 
-@dataclass(frozen=True, eq=False)
-class HypothesisTest:
-    """Test of hypotheses by the misfit that remains."""
-
-    misfit: float  # misfit of the description as stated
-    # Returns the misfit of a corrected description; None if it is unknown.
-    misfit_of: Callable[[Any], float | None]
-    required_factor: float  # factor by which the misfit must decrease
-    smallest_misfit: float = 0.0  # smallest meaningful misfit; smaller ones count as this
-
-    def accepted(self, hypotheses: Iterable[Hypothesis]) -> Iterator[Hypothesis]:
-        """Yield copies of those hypotheses, with their strength, whose correction decreases the
-        misfit by more than the required factor.
-
-        The strength is the factor by which the misfit decreases, divided by the handicap. A
-        hypothesis whose misfit cannot be computed (None) is omitted. The misfits are computed one
-        after the other, as the iterator advances.
-        """
-        for number, each in enumerate(hypotheses, start=1):
-            with search_activity(f"testing hypothesis {number}"):
-                misfit = self.misfit_of(each.corrected)
-            if misfit is None:
-                continue
-            strength = self.misfit / max(self.smallest_misfit, misfit) / each.handicap
-            if strength > self.required_factor:
-                yield replace(each, strength=strength, remaining=misfit)
+def accepted(
+    rows: Iterable[Doubt],
+    described: Any,
+    misfit_of: Callable[[Any], float],
+    factor: float,
+    least: float = 0.0,
+) -> Iterator[Hypothesis]:
+    """Yield the mistakes whose correction decreases the misfit of a description by more than a
+    factor, with this decrease over the handicap as strength; misfits below `least` count as this.
+    """
+    stated = misfit_of(described)
+    for row in rows:
+        if (found := row.hypothesis(described)) is not None:
+            remaining = misfit_of(found.corrected)
+            strength = stated / max(least, remaining) / row.handicap
+            if strength > factor:
+                yield replace(found, strength=strength, remaining=remaining)
 
 
-def clock_hypothesis(
-    subject: str, lag_s: float, corrected: Any, handicap: float = 1.0
-) -> Hypothesis:
-    """Return the hypothesis that the markers' clock is late by `lag_s` [s] (negative: early)
-    compared with the poses.
-
-    Parameters
-    ----------
-    subject : str
-        Beginning of the message.
-    lag_s : float
-        Lag [s]; its sign selects the words of the message.
-    corrected : object
-        Description with the mistake corrected.
-    handicap : float
-        Divisor of the hypothesis' strength.
+def clock_data(lag_s: float) -> dict[str, Any]:
+    """Return the data of the message that the markers' clock is late by `lag_s` [s] (negative:
+    early) compared with the poses.
     """
     is_late = lag_s > 0
-    data = {
+    return {
         "when": "late" if is_late else "early",
         "by_ms": 1e3 * abs(lag_s),
         "do": "add this to" if is_late else "subtract this from",
     }
-    return Hypothesis("clock", subject, data=data, corrected=corrected, handicap=handicap)
 
 
 def exchanged_names(names: Sequence[str], real: Index) -> str:

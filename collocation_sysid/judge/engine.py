@@ -22,18 +22,8 @@ from ..methods.starts.initial_trajectories import associated_at_guess
 from ..recording.experiment import Experiment
 from ..recording.measurement_selection import measured_count
 from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
-from ..statistics.thresholds import (
-    BETTER,
-    CERTAIN,
-    FURTHER,
-    INDISTINGUISHABLE,
-    LINEAR,
-    PARTIAL,
-    PARTLY,
-    REPRODUCED,
-)
-from .bodies import LinearCorrection, coarse_mesh_hypotheses
-from .fit import TestedFit, discrepancy, has_trend, is_consistent, thinned
+from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL, REPRODUCED
+from .fit import TestedFit, discrepancy, has_trend, thinned
 from .modes import find_misspecifications_by_modes
 from .motion import motion_candidates, motion_rows
 from .registry import SOURCES
@@ -66,22 +56,23 @@ TESTED = {
 
 
 def find_misspecifications(
-    solution: Solution, is_noise: bool | None = None
+    solution: Solution, is_consistent: bool = False
 ) -> tuple[Hypothesis, ...]:
     """Return likely mistakes in the description of a solved problem, likeliest first, with the factor
-    by which the misfit decreases without them as `strength`; empty for a consistent fit.
+    by which the misfit decreases without them as `strength`.
 
     Parameters
     ----------
-    is_noise : bool, optional
-        Whether the posterior of the fit is consistent; by default the residuals decide.
+    is_consistent : bool
+        Whether the posterior is as expected of a true description: then only what such a fit does
+        not exclude is tested.
 
     Notes
     -----
     What the data show by themselves comes first: nothing is fitted again if it is nearly certain
-    (`CERTAIN`).
+    (`CERTAIN`), or if the residuals are noise.
     """
-    if is_consistent(solution) if is_noise is None else is_noise:
+    if is_consistent:
         return rank(each for source in SOURCES for each in source.consistent(solution))
     found = [each for source in SOURCES for each in source.fitted(solution)]
     for part in solution.parts:
@@ -89,10 +80,11 @@ def find_misspecifications(
         fitted = solution.fitted_values[experiment.name]
         found += [*same_tracks(experiment), *filtered_signals(experiment, fitted)]
         found += exchanged_places(part)
-    worst = int(np.argmax([discrepancy(part) for part in solution.parts]))
+    misfits = [discrepancy(part) for part in solution.parts]
+    worst = int(np.argmax(misfits))
     if _certainty(found) < CERTAIN:
         found += _shown_by_modes(solution, worst)
-    if _certainty(found) < CERTAIN:
+    if misfits[worst] > 1.0 and _certainty(found) < CERTAIN:
         found += _tested(solution, solution.parts[worst].transcription.experiment)
     return rank(found)
 
@@ -103,7 +95,7 @@ def _certainty(found: Sequence[Hypothesis]) -> float:
 
 def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, ...]:
     """Return a note that no cause of a misfit was found; empty if there is one, or no misfit."""
-    if causes or is_consistent(solution):
+    if causes or max(map(discrepancy, solution.parts)) <= 1.0:
         return ()
     is_static = all(each.experiment.is_static for each in solution.collocation.transcriptions)
     return (f"{NO_CAUSE} ({TESTED[is_static]})",)
@@ -151,16 +143,14 @@ def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
         return []
     fit = TestedFit(solution, stated)
     candidates = [each for source in SOURCES for each in source.candidates(fit)]
-    coarse: list[Hypothesis] = []
     if not is_specimen:
         candidates += [*fit.screened(motion_rows(fit)), *motion_candidates(fit)]
-        coarse += coarse_mesh_hypotheses(solution, f"'{experiment.name}'")
     candidates.sort(key=lambda each: each[0])
     best = [each for _, each in candidates[:MOST_REFITS]]
     tested = []
-    for count, each in enumerate([*coarse, *best], start=1):
+    for count, each in enumerate(best, start=1):
         with search_activity(f"testing hypothesis {count}"):
-            accepted = refits.accepted(each, PARTLY if each in coarse else BETTER)
+            accepted = refits.accepted(each)
             tested += [] if accepted is None else [accepted]
     if is_specimen:  # laws and toes also decrease the misfit of many corrections
         tested = [each for each in tested if (each.remaining or 0.0) <= 1.0]
@@ -182,26 +172,12 @@ def _named_alone_or_together(
     """Return the hypothesis that brings the residuals to the noise; as one of several if others do
     so with a loss that is larger by at most `INDISTINGUISHABLE`, of one cause the one that changes
     less; if none does, those that reduce them most, as one hypothesis.
-
-    A linear correction, such as a finer mesh, is of an error that is known, beside which other
-    corrections say little: it is named alone if it explains the residuals as far as a linear
-    correction can (`LINEAR`), or if nothing else brings them to the noise or decreases them far more
-    (`FURTHER`), else before the others.
     """
-    linear = [each for each in tested if isinstance(each.corrected, LinearCorrection)]
-    if any(each.strength >= LINEAR for each in linear):
-        return [each for each in linear if each.strength >= LINEAR]
-    sufficient = [
-        each
-        for each in tested
-        if each not in linear and each.remaining is not None and each.remaining <= 1.0
-    ]
+    sufficient = [each for each in tested if each.remaining is not None and each.remaining <= 1.0]
     if not sufficient:
-        least = max((FURTHER * each.strength for each in linear), default=0.0)
-        partial = [each for each in tested if each in linear or each.strength > least]
-        partial.sort(key=lambda each: -each.strength)
-        partial = [each for each in partial if each.strength > PARTIAL * partial[0].strength]
-        return _together("insufficient", partial)
+        least = PARTIAL * max((each.strength for each in tested), default=0.0)
+        partial = sorted(tested, key=lambda each: -each.strength)
+        return _together("insufficient", [each for each in partial if each.strength > least])
     losses = [loss_of(each.corrected) for each in sufficient]
     likely = [
         each
@@ -211,8 +187,8 @@ def _named_alone_or_together(
     simplest: dict[str, Hypothesis] = {}
     for each in sorted(likely, key=lambda each: each.code.endswith("/both")):
         simplest.setdefault(each.cause, each)
-    likely = [*linear, *rank(simplest.values())]
-    return likely if len(likely) == 1 else _together("several", likely)
+    likely = rank(simplest.values())
+    return [*likely] if len(likely) == 1 else _together("several", likely)
 
 
 def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -252,9 +228,9 @@ class _Refits:
             self.known[corrected] = self._fit(corrected, is_near)
         return self.known[corrected]
 
-    def accepted(self, tested: Hypothesis, factor: float) -> Hypothesis | None:
+    def accepted(self, tested: Hypothesis) -> Hypothesis | None:
         """Return the hypothesis with its strength and what remains, if it decreases the discrepancy
-        by a factor, or to the noise; None else. A size is estimated again at the refit.
+        by `BETTER`, or to the noise; None else. A size is estimated again at the refit.
         """
         stated = self.fit(None)
         remaining = self._remaining(tested)
@@ -277,7 +253,7 @@ class _Refits:
                 if other and left is not None and left < remaining:
                     tested, remaining = other, left
         strength = misfit / max(remaining, LEAST_MISFIT)
-        if strength > factor or remaining <= 1.0 < misfit:
+        if strength > BETTER or remaining <= 1.0 < misfit:
             return replace(tested, strength=strength, remaining=remaining)
         return None
 
@@ -285,11 +261,7 @@ class _Refits:
         """Return the discrepancy with a correction; None without a fit, or if its residuals follow
         the strain.
         """
-        corrected = tested.corrected
-        if isinstance(corrected, LinearCorrection):
-            stated = self.fit(None)
-            return stated and discrepancy(stated.parts[0]) * float(np.sqrt(corrected.share))
-        refit = self.fit(corrected, is_near=bool(tested.doubt and tested.doubt.is_small))
+        refit = self.fit(tested.corrected, is_near=bool(tested.doubt and tested.doubt.is_small))
         if refit is None or any(map(has_trend, refit.parts)):
             return None
         return max(map(discrepancy, refit.parts))

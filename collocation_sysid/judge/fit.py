@@ -28,11 +28,6 @@ from .doubt import Doubt
 Candidate = tuple[float, Hypothesis]
 
 
-def is_consistent(solution: Solution) -> bool:
-    """Return whether residuals and nuisance parameters of all experiments are noise."""
-    return max(map(discrepancy, solution.parts)) <= 1.0
-
-
 def discrepancy(part: ExperimentIterate) -> float:
     """Return the largest RMS residual of the measurements of a fitted experiment, or its largest
     nuisance parameter, over the largest one that noise causes.

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -23,14 +24,14 @@ from ..recording.experiment import Experiment
 from ..recording.placement import LocatedBody, place_markers
 from ..statistics.axes import with_other_axes
 from ..statistics.hypothesis import Hypothesis, rank
-from ..statistics.thresholds import FITTED, LARGEST_MISFIT, LEAST_IMPROVEMENT, ONE_OF_MANY
+from ..statistics.thresholds import FITTED, LEAST_IMPROVEMENT, ONE_OF_MANY
 from .contradictions import (
     load_sign_hypotheses,
     name_exchange_hypotheses,
     step_hypotheses,
     undriven_motion,
 )
-from .doubt import HypothesisTest, clock_hypothesis, exchanged_names
+from .doubt import Doubt, accepted, clock_data, exchanged_names
 from .initial_motion import initial_motion_hypotheses
 
 # Accuracy of small strains and a few modes, over the size of the body.
@@ -54,7 +55,6 @@ FRAME_CAUSES = (
     "markers-axes",
     "poses-inverted",
     "quaternion-order",
-    "unlike",
 )
 
 
@@ -74,8 +74,7 @@ def find_misspecifications_by_modes(
     -----
     Without markers only signs of loads are tested; in a static experiment, or where modes are of no
     use (`ModalComparison.from_experiment`), no modes are used. That the body was not at rest at the
-    beginning is only reported if no other hypothesis is. That no stiffness explains the
-    tracks is only reported if no other hypothesis is, and without obstacles.
+    beginning is only reported if no other hypothesis is.
     """
     if not experiment.markers.names:
         return rank(load_sign_hypotheses(experiment))
@@ -91,8 +90,6 @@ def find_misspecifications_by_modes(
     hypotheses += undriven_motion(experiment)
     if not hypotheses:
         hypotheses += initial_motion_hypotheses(experiment)
-    if comparison is not None and not hypotheses and not experiment.obstacles:
-        hypotheses += comparison.unlike()
     return rank(_with_stated_frames(experiment, hypotheses))
 
 
@@ -127,20 +124,15 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
         return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
     if markers.sample_count:
-        trial = HypothesisTest(
-            remaining_misfit(markers.positions_at_samples_m),
-            remaining_misfit,
-            required_factor=LEAST_IMPROVEMENT,
-        )
-        yield from trial.accepted(_axes(f"'{experiment.name}'", markers.positions_at_samples_m))
+        tracks_m = markers.positions_at_samples_m
+        rows = _axes(f"'{experiment.name}'", tracks_m)
+        yield from accepted(rows, tracks_m, remaining_misfit, LEAST_IMPROVEMENT)
 
 
-def _axes(name: str, tracks_m: Array) -> Iterator[Hypothesis]:
-    """Yield tracks with their axes in every other order and of either sign, untested."""
+def _axes(name: str, tracks_m: Array) -> Iterator[Doubt]:
+    """Yield the rows of tracks with their axes in another order and of either sign."""
     for axes, turned in with_other_axes(tracks_m):
-        yield Hypothesis(
-            "markers-axes", name, data={"axes": axes}, corrected=turned, handicap=ONE_OF_MANY
-        )
+        yield Doubt.whole("markers-axes", turned, name, handicap=ONE_OF_MANY, axes=axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,28 +228,13 @@ class ModalComparison:
         """Yield the hypotheses that fit far better than the description as stated, with their
         strength.
         """
-        misfit_m = self.misfit_m(self.declared)
-        yield from HypothesisTest(
-            misfit_m, self.misfit_at_implied_places_m, required_factor=LEAST_IMPROVEMENT
-        ).accepted(simple_hypotheses(self.declared))
-        yield from HypothesisTest(
-            misfit_m, self.misfit_m, required_factor=LEAST_IMPROVEMENT
-        ).accepted([*self._frame_hypotheses(), *self._clock_hypotheses()])
+        declared = self.declared
+        at_places = self.misfit_at_implied_places_m
+        yield from accepted(simple_rows(declared), declared, at_places, LEAST_IMPROVEMENT)
+        fitted = [*self._frame_rows(), *self._clock_rows()]
+        yield from accepted(fitted, declared, self.misfit_m, LEAST_IMPROVEMENT)
         yield from self._name_hypotheses()
         yield from self._other_axes()
-
-    def unlike(self) -> Iterator[Hypothesis]:
-        """Yield the hypothesis that no stiffness explains the tracks, if the misfit exceeds
-        `LARGEST_MISFIT` of the body's size.
-        """
-        misfit_m = self.misfit_m(self.declared)
-        size_m = self.response.size_m
-        strength = misfit_m / (LARGEST_MISFIT * size_m)
-        if strength > 1:
-            data = {"by_mm": 1e3 * misfit_m, "size_mm": 1e3 * size_m}
-            yield Hypothesis(
-                "unlike", self.declared.name, data=data, strength=strength, remaining=misfit_m
-            )
 
     def _other_axes(self) -> Iterator[Hypothesis]:
         predicted = self.response.predict(self.declared)
@@ -266,10 +243,9 @@ class ModalComparison:
             turned = replace(self.declared, tracks_m=tracks_m)
             return float(self._misfits_m(turned, predicted).min())
 
-        declared_m = self.declared.tracks_m
-        yield from HypothesisTest(
-            remaining_misfit(declared_m), remaining_misfit, required_factor=LEAST_IMPROVEMENT
-        ).accepted(_axes(self.declared.name, declared_m))
+        tracks_m = self.declared.tracks_m
+        rows = _axes(f"'{self.declared.name}'", tracks_m)
+        yield from accepted(rows, tracks_m, remaining_misfit, LEAST_IMPROVEMENT)
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
         """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared
@@ -282,8 +258,8 @@ class ModalComparison:
         used = max(1, int(np.ceil(USED * squares.shape[1])))
         return np.sqrt(squares[:, :used].mean(axis=1) + self.floor_m**2)
 
-    def _frame_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield fitted rigid motions before the poses and of the tracks, untested."""
+    def _frame_rows(self) -> Iterator[Doubt]:
+        """Yield the rows of fitted rigid motions before the poses and of the tracks."""
         declared = self.declared
         places_m = self.response.places_m
         if not _determines_rotation(places_m):
@@ -302,11 +278,11 @@ class ModalComparison:
                 moved_tracks.tracks_m, self.best_prediction(moved_tracks)
             )
             moved_tracks = replace(moved_tracks, tracks_m=moved_tracks.tracks_m @ turn.T + shift_m)
-        yield Hypothesis("gripper-frame", declared.name, corrected=moved_poses, handicap=FITTED)
-        yield Hypothesis("camera-frame", declared.name, corrected=moved_tracks, handicap=FITTED)
+        yield Doubt.whole("gripper-frame", moved_poses, handicap=FITTED)
+        yield Doubt.whole("camera-frame", moved_tracks, handicap=FITTED)
 
-    def _clock_hypotheses(self) -> Iterator[Hypothesis]:
-        """Yield that of the `LAGS_S` that fits best, untested."""
+    def _clock_rows(self) -> Iterator[Doubt]:
+        """Yield the row of that of the `LAGS_S` that fits best."""
         declared = self.declared
         predicted = self.response.predict(declared)
         allowed = LAGS_S[np.abs(LAGS_S) < LONGEST_LAG * np.ptp(declared.t_s)].tolist()
@@ -314,9 +290,8 @@ class ModalComparison:
         misfits = [self._misfits_m(declared, each).min() for each in delayed]
         if misfits:
             lag_s = allowed[int(np.argmin(misfits))]
-            yield clock_hypothesis(
-                declared.name, lag_s, corrected=replace(declared, lag_s=lag_s), handicap=FITTED
-            )
+            without = replace(declared, lag_s=lag_s)
+            yield Doubt.whole("clock", without, handicap=FITTED, **clock_data(lag_s))
 
     def _name_hypotheses(self) -> Iterator[Hypothesis]:
         declared = self.declared
@@ -335,11 +310,9 @@ class ModalComparison:
             _with_markers(declared, declared.tracks_m[:, order], markers=exchanged)
             for order in (np.arange(len(chosen)), np.argsort(chosen))
         )
-        data = {"names": exchanged_names(names, chosen)}
-        hypothesis = Hypothesis("markers-exchanged", declared.name, data=data, corrected=renamed)
-        yield from HypothesisTest(
-            self.misfit_m(few), self.misfit_m, required_factor=LEAST_IMPROVEMENT
-        ).accepted([hypothesis])
+        shown = exchanged_names(names, chosen)
+        row = Doubt.whole("markers-exchanged", renamed, names=shown)
+        yield from accepted([row], few, self.misfit_m, LEAST_IMPROVEMENT)
 
 
 def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:
@@ -372,34 +345,32 @@ UNITS = {1e-3: "mm", 1e-2: "cm", 0.0254: "in", 1e3: "", 1e2: ""}
 SAME_DIRECTION = 0.94
 
 
-def simple_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Yield the hypotheses without fitted numbers, untested, each with the description that
-    corrects it: poses (unless all are the identity), units of length and the direction of
-    gravity.
+def simple_rows(declared: DeclaredMotion) -> Iterator[Doubt]:
+    """Yield the rows without fitted numbers: poses (unless all are the identity), units of length and
+    the direction of gravity.
     """
     moving = (
         np.ptp(declared.rotations, axis=0).any() or np.ptp(declared.translations_m, axis=0).any()
     )
     if moving or np.abs(declared.translations_m).any():
-        yield from _pose_hypotheses(declared)
-        yield from _unit_hypotheses(
+        yield from _pose_rows(declared)
+        yield from _unit_rows(
             declared, "translations_m", who="the poses would fit if they", section="grasp"
         )
-    yield from _unit_hypotheses(
+    yield from _unit_rows(
         declared, "tracks_m", who="the markers would fit if they", section="markers"
     )
-    yield from _unit_hypotheses(
-        declared, "mesh_scale", who="the mesh would fit if it", section="object"
-    )
-    yield from gravity_hypotheses(declared)
+    yield from _unit_rows(declared, "mesh_scale", who="the mesh would fit if it", section="object")
+    for other_m_s2, data in other_gravity(declared.gravity_m_s2):
+        yield Doubt.whole("gravity", replace(declared, gravity_m_s2=other_m_s2), **data)
 
 
-def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
+def _pose_rows(declared: DeclaredMotion) -> Iterator[Doubt]:
     poses = declared.without_first_motion()
     inverse = poses.rotations.transpose(0, 2, 1)
     shift = -np.einsum("tij,tj->ti", inverse, poses.translations_m)
     inverted = replace(poses, rotations=inverse, translations_m=shift)
-    yield Hypothesis("poses-inverted", declared.name, corrected=inverted.with_first_motion())
+    yield Doubt.whole("poses-inverted", inverted.with_first_motion())
     quaternions = Rotation.from_matrix(poses.rotations).as_quat()
     # Signs are free; neighbours of one sign keep the reordered ones continuous.
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
@@ -407,31 +378,24 @@ def _pose_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
     for order, turn in (("wxyz", -1), ("xyzw", 1)):
         reordered = Rotation.from_quat(np.roll(quaternions, turn, axis=1)).as_matrix()
         without = replace(poses, rotations=reordered).with_first_motion()
-        yield Hypothesis(
-            "quaternion-order", declared.name, data={"order": order}, corrected=without
-        )
+        yield Doubt.whole("quaternion-order", without, order=order)
 
 
-def _unit_hypotheses(
-    declared: DeclaredMotion, what: str, who: str, section: str
-) -> Iterator[Hypothesis]:
+def _unit_rows(declared: DeclaredMotion, what: str, who: str, section: str) -> Iterator[Doubt]:
     key = f"{section}.length_unit"
     for factor, unit in UNITS.items():
         remedy = f'set {key} = "{unit}"' if unit else f"check {key}"
-        data = {"who": who, "factor": factor, "remedy": remedy}
         without = replace(declared, **{what: factor * getattr(declared, what)})
-        yield Hypothesis("length-unit", declared.name, data=data, corrected=without)
+        yield Doubt.whole("length-unit", without, who=who, factor=factor, remedy=remedy)
 
 
-def gravity_hypotheses(declared: DeclaredMotion) -> Iterator[Hypothesis]:
-    """Yield untested hypotheses of gravity along the axes, with either sign, except those within
-    some 20 degrees of the stated direction; nothing without gravity.
+def other_gravity(stated_m_s2: Array) -> Iterator[tuple[Array, dict[str, Any]]]:
+    """Yield gravity along the axes, with either sign, and data of its message, except within some 20
+    degrees of the stated direction; nothing without gravity.
     """
-    size = float(np.linalg.norm(declared.gravity_m_s2))
+    size = float(np.linalg.norm(stated_m_s2))
     for axis, name in enumerate("xyz"):
         for sign, plus in ((1.0, "+"), (-1.0, "−")):
             other: Array = np.where(np.arange(3) == axis, sign * size, 0.0)
-            if size and other @ declared.gravity_m_s2 <= SAME_DIRECTION * size**2:
-                data = {"axis": plus + name, "vector": ", ".join(f"{x:g}" for x in other)}
-                without = replace(declared, gravity_m_s2=other)
-                yield Hypothesis("gravity", declared.name, data=data, corrected=without)
+            if size and other @ stated_m_s2 <= SAME_DIRECTION * size**2:
+                yield other, {"axis": plus + name, "vector": ", ".join(f"{x:g}" for x in other)}

@@ -22,9 +22,9 @@ from ..recording.poses import PoseSequence
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.thresholds import ESTIMATED_LAGS, FAR, SLIP
 from .bodies import body_rows, mirrored_meshes
-from .doubt import Correction, Doubt, clock_hypothesis
+from .doubt import Correction, Doubt, clock_data
 from .fit import Candidate, TestedFit
-from .modes import ModalComparison, gravity_hypotheses
+from .modes import ModalComparison, other_gravity
 from .sensors import sensor_rows
 
 # Most samples of a loading branch that is fitted.
@@ -68,13 +68,14 @@ def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
     if np.abs(fit.part.phi[rows]).max(initial=0.0) < FAR:
         return
     stated = ModalComparison.from_experiment(experiment, fit.whole.parameters)
-    others = [] if stated is None else [*gravity_hypotheses(stated.declared)]
+    others = [*other_gravity(experiment.gravity_m_s2)]
     if stated is not None and others:
-        misfits_m = [stated.misfit_m(each.corrected) for each in others]
-        nearest = others[int(np.argmin(misfits_m))]
-        other = replace(experiment, gravity_m_s2=nearest.corrected.gravity_m_s2)
-        share = (min(misfits_m) / stated.misfit_m(stated.declared)) ** 2
-        yield share, replace(nearest, corrected=other)
+        motion = stated.declared
+        misfits_m = [stated.misfit_m(replace(motion, gravity_m_s2=each)) for each, _ in others]
+        nearest, data = others[int(np.argmin(misfits_m))]
+        without = replace(experiment, gravity_m_s2=nearest)
+        share = (min(misfits_m) / stated.misfit_m(motion)) ** 2
+        yield share, Hypothesis("gravity", f"'{experiment.name}'", data=data, corrected=without)
 
 
 def _clock(fit: TestedFit) -> Iterator[Doubt]:
@@ -91,7 +92,7 @@ def _clock(fit: TestedFit) -> Iterator[Doubt]:
         if abs(lag_s) <= ESTIMATED_LAGS * prior_s:
             return None
         other = with_pose_lag(experiment, lag_s)
-        return other and (other, {**clock_hypothesis("", lag_s, None).data})
+        return other and (other, clock_data(lag_s))
 
     changes = fit.blocks_of(rates, 1)
     yield Doubt("clock", "s", correct, changes=changes, mean=0.0, wide=WIDE_LAG_S)

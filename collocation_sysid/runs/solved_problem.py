@@ -228,15 +228,19 @@ class SolvedProblem:
         if not self.omitted_checks:
             causes = cause_concerns(self.causes)
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
+            effects = effect_concerns(self.effects, self.suspects)
+            # Effects are judged with this mesh.
+            known = meshes if effects else []
             return Assessment.from_concerns(
                 (
                     *(each for each in causes if each.code not in OPEN_CAUSES),
-                    *effect_concerns(self.effects, self.suspects),
+                    *known,
+                    *effects,
                     *(each for each in causes if each.code in OPEN_CAUSES),
                     *of_fit,
                     *of_fields,
                     *numerical,
-                    *meshes,
+                    *([] if effects else meshes),
                     *grasp_extent_concerns(self.problem),
                 )
             )

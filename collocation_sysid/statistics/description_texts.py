@@ -31,17 +31,12 @@ MESSAGES = {
     "loading alone, end window_s at the largest displacement",
     "law": "the material deforms by another law than stated, such as {material}: compare laws "
     "with compare-models --materials",
-    "law/damping": "the material is damped by another law than stated, such as {damping}: "
-    "compare laws with compare-models --damping",
     "law/both": "material and damping obey other laws than stated, such as {material} with "
     "{damping}: compare laws with compare-models --materials and --damping",
     "mesh-section": "the section of the body is {real}, and that of the mesh {meshed} and as "
     "wide: mesh the section of the body (object.cylinder_m or box_m)",
     "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
     "its extents with those of the real body",
-    "mesh-coarse": "the mesh is too coarse for such accurate measurements: its estimated error "
-    "changes the predictions by {sigmas:.2g} sigma (RMS), which the constants do not absorb; "
-    "{remedy}",
     "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare it "
     "with the real body",
     "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "
@@ -89,18 +84,12 @@ MESSAGES = {
     "ms, in which the grasp moves by {grasp_mm:.2g} mm: the body was not at rest at the "
     'beginning, as start = "equilibrium" assumes, or the clocks of markers and poses differ; '
     "begin window_s, or the recording, when the body is at rest",
-    "unlike": "the tracks do not move like a grasped body: for every stiffness, the markers of a "
-    "simulated body are {by_mm:.3g} mm (RMS) away from them, on a body of {size_mm:.3g} mm, and "
-    "no single common mistake explains this; check frames, poses and labels, and if the tracks "
-    "were simulated, that the simulation was stable",
     "mesh-parts": "the mesh consists of {parts} unconnected parts, and no grasp holds {loose} of "
     "them, the largest with {nodes} nodes: merge coincident nodes, or remove loose parts from "
     "the mesh",
     "obstacle-normal": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed body at "
     "the first sample, and none of it with the opposite normal: reverse the normal, which points "
     "out of the solid towards the body",
-    "obstacle-place": "obstacle '{obstacle}' contains {percent:.0f} % of the undeformed body at "
-    "the first sample: check its position, size, unit and the sign of its motion",
     "specimen-true-stress": "its stresses fit as true stresses (force over deformed area): set "
     'stress = "true", or divide the forces by the undeformed area',
     "specimen-compression": "its strains and stresses fit as those of a compression test: set "

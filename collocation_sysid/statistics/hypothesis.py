@@ -27,8 +27,6 @@ class Hypothesis:
     # Description with the mistake corrected, of the type that its test expects; None if no test is
     # needed.
     corrected: Any = None
-    # Factor by which a hypothesis with fitted numbers must fit better than one without.
-    handicap: float = 1.0
     # Factor by which the misfit decreases if the hypothesis is true; 0 until it is tested.
     strength: float = 0.0
     # Misfit that remains if the hypothesis is true, in the unit of its test; None if it is not

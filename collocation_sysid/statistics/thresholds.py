@@ -150,26 +150,9 @@ ESTIMATED_LAGS = Threshold(
     "Standard deviations of an estimated time shift up to which the fit follows a lag by itself.",
     study="mistakes",
 )
-LINEAR = Threshold(
-    2.0,
-    "Factor by which a correction that is known to first order must decrease the misfit to be "
-    "the cause: what remains is of second order.",
-    study="mistakes",
-)
-PARTLY = Threshold(
-    1.2,
-    "The same to be mentioned, and before corrections that do not suffice either.",
-    study="mistakes",
-)
 INDISTINGUISHABLE = Threshold(
     10.0,
     "Difference of losses (χ²) below which two corrections explain the data equally well.",
-    study="mistakes",
-)
-FURTHER = Threshold(
-    2.0,
-    "Factor by which a correction must decrease the misfit more than one that is known to first "
-    "order, such as a finer mesh, to be mentioned beside it if neither suffices.",
     study="mistakes",
 )
 PARTIAL = Threshold(
@@ -194,11 +177,6 @@ FITTED = Threshold(1.5, "Additional factor for hypotheses with fitted numbers.",
 ONE_OF_MANY = Threshold(
     1.05, "Additional factor for each of many variants of one mistake.", study="mistakes"
 )
-LARGEST_MISFIT = Threshold(
-    0.3,
-    "Distance of the tracks over the body's diagonal from which on no stiffness explains them.",
-    study="mistakes",
-)
 LEAST_DECREASE = Threshold(
     16.0,
     "Decrease of χ² by a linear step below which a hypothesis is not fitted again: e⁻⁸ as likely.",
@@ -207,12 +185,6 @@ LEAST_DECREASE = Threshold(
 WIDEST = Threshold(
     0.25,
     "Largest relative error of the width of a mesh that is no mistake of another kind.",
-    study="mistakes",
-)
-LEAST_SIGMAS = Threshold(
-    1.0,
-    "Root mean square of an error of the mesh that the constants do not absorb, in σ, up to "
-    "which it is no cause: smaller than noise.",
     study="mistakes",
 )
 NOISE_LEVEL = Threshold(

@@ -327,7 +327,7 @@ TRACK_FAULTS = {
         with_track_axes((1, 0, 2), (-1, 1, 1)), ("markers-axes", "camera-frame")
     ),
     "poses constant": Fault(lambda e, rng: _with_poses(e, constant), ("poses-constant",)),
-    "simulation reset after NaN": Fault(restarting, ("markers-jump", "unlike")),
+    "simulation reset after NaN": Fault(restarting, ("markers-jump",)),
     "mesh in two parts": Fault(torn, ("mesh-parts",)),
 }
 

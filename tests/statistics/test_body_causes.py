@@ -13,7 +13,6 @@ from study_hidden_errors import TRUTH, twin
 from collocation_sysid import Problem, Unknown
 from collocation_sysid.fem.laws.materials import DAMPINGS
 from collocation_sysid.judge.bodies import (
-    LinearCorrection,
     body_rows,
     mirrored_meshes,
     with_body,
@@ -93,39 +92,6 @@ def test_the_smaller_change_among_laws_of_equal_fit_is_named():
     assert _named_alone_or_together([both, material], {1: 100.0, 2: 150.0}.get) == [both]
 
 
-def test_a_coarse_mesh_is_named_if_its_error_to_first_order_explains_most():
-    data = {"sigmas": 3.0, "remedy": "refine the mesh"}
-
-    def mesh(strength: float) -> Hypothesis:
-        corrected = LinearCorrection(strength**-2)
-        return Hypothesis("mesh-coarse", "", data, corrected, strength=strength, remaining=3.0)
-
-    (named,) = _named_alone_or_together([mesh(2.5)], lambda _: 100.0)
-    assert named.code == "mesh-coarse"
-    lag = Hypothesis("gripper-frame", "'a'", corrected=1, strength=1.8, remaining=1.4)
-    (partial,) = _named_alone_or_together([lag, mesh(1.6)], lambda _: 100.0)
-    assert partial.code == "insufficient"
-    assert "the mesh is too coarse" in partial.message
-    assert "gripper" not in partial.message
-
-
-def test_a_mesh_that_is_known_to_be_coarse_comes_before_what_also_explains_its_error():
-    law = Hypothesis("law", "'a'", {"material": "x"}, corrected=1, strength=3.0, remaining=0.9)
-
-    def mesh(strength: float) -> Hypothesis:
-        data = {"sigmas": 3.0, "remedy": "refine the mesh"}
-        corrected = LinearCorrection(strength**-2)
-        return Hypothesis("mesh-coarse", "", data, corrected, strength=strength, remaining=1.4)
-
-    losses = {1: 100.0}
-    (named,) = _named_alone_or_together([law, mesh(2.2)], lambda each: losses.get(each, 1e3))
-    assert named.code == "mesh-coarse"
-    (several,) = _named_alone_or_together([law, mesh(1.5)], lambda each: losses.get(each, 1e3))
-    assert several.code == "several"
-    assert several.strength == law.strength
-    assert several.message.index("the mesh is too coarse") < several.message.index("another law")
-
-
 def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
     hung = hung_cube(5)
     assert not [row for row in mirrored_meshes(hung) if row.hypothesis(hung)]
@@ -173,15 +139,6 @@ def test_hidden_errors_of_a_bent_bar_are_named(error: str, cause: str):
     near = {name: Unknown(1.3 * value) for name, value in TRUTH.items()}
     problem = replace(twin(error, 0, near), substeps=2)
     assert find_misspecifications(solve(problem))[0].cause == cause
-
-
-@pytest.mark.slow
-def test_a_coarse_mesh_of_a_bent_bar_is_mentioned_alone():
-    """Its error to first order is not exact, so that the correction leaves a part of the residuals."""
-    near = {name: Unknown(1.3 * value) for name, value in TRUTH.items()}
-    (named,) = find_misspecifications(solve(replace(twin("coarse", 0, near), substeps=2)))
-    assert "the mesh is too coarse" in named.message
-    assert "; or " not in named.message
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from ...common.array_types import Array
 from ...errors import SimulationError
 from ...fem.laws.constants import is_modulus
 from ...fem.laws.moduli import engineering_constants
-from ...judge.doubt import HypothesisTest
+from ...judge.doubt import Doubt, accepted
 from ...model.nuisance_map import NuisanceMap
 from ...program.depth.camera_alignment import AlignedPose, ExactCloud, iterate_alignments, thinned
 from ...program.depth.camera_model import DepthCameraModel
@@ -225,21 +225,19 @@ class _ImageComparison:
     def hypotheses(self) -> Iterator[Hypothesis]:
         """Yield corrections that fit far better, else a pose far off its prior."""
         stated = self.fit(self.stated)
-        test = HypothesisTest(
-            stated.misfit,
-            lambda corrected: self.fit(corrected).misfit,
-            required_factor=LEAST_IMPROVEMENT,
-            smallest_misfit=1.0,
-        )
         if stated.misfit <= LEAST_IMPROVEMENT:
             return
-        accepted = [
+
+        def misfit_of(image: MeasuredPixels) -> float:
+            return self.fit(image).misfit
+
+        found = [
             each
-            for each in test.accepted(self._mistakes())
-            if each.strength > CERTAIN or self.fit(each.corrected).misfit < MISFIT
+            for each in accepted(self._mistakes(), self.stated, misfit_of, LEAST_IMPROVEMENT, 1.0)
+            if each.strength > CERTAIN or misfit_of(each.corrected) < MISFIT
         ]
-        yield from accepted
-        if accepted or stated.distance_m > ALIGNED * self.rough_m:
+        yield from found
+        if found or stated.distance_m > ALIGNED * self.rough_m:
             return
         deviation = float(np.abs(self._pose_deviations(stated)).max())
         if deviation > LARGEST_POSE_DEVIATION:
@@ -304,7 +302,7 @@ class _ImageComparison:
         )
         return weights * errors
 
-    def _mistakes(self) -> Iterator[Hypothesis]:
+    def _mistakes(self) -> Iterator[Doubt]:
         image = self.stated
         size = np.array([image.columns - 1.0, image.rows - 1.0])
         u, v = image.pixels.T
@@ -314,12 +312,12 @@ class _ImageComparison:
             "upside down (rotated by 180°)": size - image.pixels,
         }
         for order, pixels in flips.items():
-            yield self._hypothesis("camera-image", image.with_pixels(pixels), order=order)
+            yield self._row("camera-image", image.with_pixels(pixels), order=order)
         for ratio in SIZE_RATIOS:
             factor = 1 / ratio
             zoomed = np.array(image.camera.matrix)
             zoomed[[0, 1], [0, 1]] *= factor
-            yield self._hypothesis("camera-matrix/focal", image.with_matrix(zoomed), factor=factor)
+            yield self._row("camera-matrix/focal", image.with_matrix(zoomed), factor=factor)
         matrix = image.camera.require_matrix()
         centres = {
             "counted from the opposite corner of the image": size - matrix[:2, 2],
@@ -328,13 +326,13 @@ class _ImageComparison:
         for how, centre in centres.items():
             other = np.array(matrix)
             other[:2, 2] = centre
-            yield self._hypothesis(
+            yield self._row(
                 "camera-matrix/centre",
                 image.with_matrix(other),
                 how=how,
                 centre=str(np.round(centre, 1).tolist()),
             )
-        yield self._hypothesis("camera-rays", image.with_depths_of_ray_lengths())
+        yield self._row("camera-rays", image.with_depths_of_ray_lengths())
 
-    def _hypothesis(self, code: str, corrected: MeasuredPixels, **data: object) -> Hypothesis:
-        return Hypothesis(code, self.subject, data=data, corrected=corrected, handicap=ONE_OF_MANY)
+    def _row(self, code: str, without: MeasuredPixels, **data: object) -> Doubt:
+        return Doubt.whole(code, without, self.subject, ONE_OF_MANY, **data)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array
-from ...judge.doubt import HypothesisTest
+from ...judge.doubt import Doubt, accepted
 from ...program.collocation import ExperimentIterate
 from ...program.depth.camera_alignment import thinned
 from ...program.depth.comparison import camera_residuals
@@ -100,46 +100,34 @@ class _MotionComparison:
 
     def hypotheses(self, experiment: str) -> Iterator[Hypothesis]:
         """Yield the mistakes whose correction fits far better."""
-        misfit_m = self.misfit_m(self.stated)
-        if misfit_m <= self.rough_m:
+        if self.misfit_m(self.stated) <= self.rough_m:
             return
-        test = HypothesisTest(
-            misfit_m,
-            self.misfit_m,
-            required_factor=LEAST_IMPROVEMENT,
-            smallest_misfit=self.rough_m / LEAST_IMPROVEMENT,
-        )
-        subject = f"'{self.camera.depth.name}' of '{experiment}'"
-        yield from test.accepted(self._mistakes(subject))
+        rows = self._mistakes(f"'{self.camera.depth.name}' of '{experiment}'")
+        least_m = self.rough_m / LEAST_IMPROVEMENT
+        yield from accepted(rows, self.stated, self.misfit_m, LEAST_IMPROVEMENT, least_m)
 
-    def _mistakes(self, subject: str) -> Iterator[Hypothesis]:
+    def _mistakes(self, subject: str) -> Iterator[Doubt]:
         stated = self.stated
         reversed_order = ImageTimes(stated.images[::-1], stated.times_s)
-        yield Hypothesis("camera-order", subject, data={}, corrected=reversed_order)
+        yield Doubt.whole("camera-order", reversed_order, subject)
         moved_m = np.linalg.norm(self.places_m - self.places_m[0], axis=2)
         if moved_m.max() > MOVING * self.camera.size_m:
             same = np.full(len(stated.images), stated.times_s[0])
-            yield Hypothesis(
-                "camera-constant",
-                subject,
-                data={"by_mm": 1e3 * moved_m.max()},
-                corrected=ImageTimes(stated.images, same),
-            )
+            without = ImageTimes(stated.images, same)
+            yield Doubt.whole("camera-constant", without, subject, by_mm=1e3 * moved_m.max())
         span_s = float(np.ptp(stated.times_s))
         for lag_s in LAGS_S[np.abs(LAGS_S) <= LONGEST_LAG * span_s]:
             times_s = stated.times_s - lag_s
             covered = times_s <= self.at_s[-1] + 1e-9
             if np.count_nonzero(covered) < FEWEST_IMAGES:
                 continue
-            yield Hypothesis(
+            yield Doubt.whole(
                 "camera-clock",
+                ImageTimes(stated.images[covered], times_s[covered]),
                 subject,
-                data={
-                    "by_ms": 1e3 * abs(lag_s),
-                    "when": "late" if lag_s > 0 else "early",
-                    "do": "subtract this from" if lag_s > 0 else "add this to",
-                },
-                corrected=ImageTimes(stated.images[covered], times_s[covered]),
+                by_ms=1e3 * abs(lag_s),
+                when="late" if lag_s > 0 else "early",
+                do="subtract this from" if lag_s > 0 else "add this to",
             )
 
     def misfit_m(self, described: ImageTimes) -> float:

@@ -248,8 +248,8 @@ def _smallest_gaps_m(experiment: Experiment, obstacle: Obstacle, times_s: Array)
 
 
 def placement_mistakes(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield hypotheses about parts of a body that no grasp holds, and about each obstacle that
-    contains more than half of it; they need no further test.
+    """Yield hypotheses about parts of a body that no grasp holds, and about planes with the body
+    behind them.
     """
     yield from _loose_parts(experiment)
     for obstacle in experiment.obstacles:
@@ -276,7 +276,9 @@ def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
 
 
 def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothesis]:
-    """Blame the normal of a plane with the whole body behind it, else the place of the obstacle."""
+    """Yield the reversed normal of a plane with the whole body behind it."""
+    if not isinstance(obstacle.shape, Plane):
+        return
     nodes_m = experiment.rigid_positions(experiment.t_s[:1])[
         0, : len(experiment.body.nodes.points_m)
     ]
@@ -284,12 +286,10 @@ def _containing(experiment: Experiment, obstacle: Obstacle) -> Iterator[Hypothes
     gaps_m = obstacle.shape.signed_distances_m((nodes_m - translations_m[0]) @ rotations[0])
     deep_m = DEEP * float(np.linalg.norm(np.ptp(nodes_m, axis=0)))
     share = float((gaps_m < -deep_m).mean())
-    if share <= MOST_INSIDE:
-        return
-    reversible = isinstance(obstacle.shape, Plane) and not (gaps_m > deep_m).any()
-    code = "obstacle-normal" if reversible else "obstacle-place"
-    data = {"obstacle": obstacle.name, "percent": 100 * share}
-    yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=100 * share)
+    if share > MOST_INSIDE and not (gaps_m > deep_m).any():
+        data = {"obstacle": obstacle.name, "percent": 100 * share}
+        of = f"'{experiment.name}'"
+        yield Hypothesis("obstacle-normal", of, data=data, strength=100 * share)
 
 
 def hypotheses(experiment: Experiment) -> tuple[Hypothesis, ...]:

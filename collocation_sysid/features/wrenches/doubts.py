@@ -20,7 +20,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...errors import InputError, SimulationError
 from ...judge.contradictions import load_sign_hypotheses
-from ...judge.doubt import Doubt, HypothesisTest
+from ...judge.doubt import Doubt, accepted
 from ...judge.fit import Candidate, TestedFit
 from ...judge.sensors import measurement_mistake
 from ...judge.source import SimulatedCheck, Source
@@ -211,11 +211,9 @@ class _OneSensor:
 
     def accepted(self) -> list[Hypothesis]:
         """Return what improves the fit far enough."""
-        misfit = self.misfit(self.declared)
-        if misfit <= NOISE_LEVEL:
+        if self.misfit(self.declared) <= NOISE_LEVEL:
             return []
-        test = HypothesisTest(misfit, self.misfit, required_factor=BETTER, smallest_misfit=1.0)
-        return list(test.accepted(self._hypotheses()))
+        return [*accepted(self._rows(), self.declared, self.misfit, BETTER, 1.0)]
 
     def _large_tare(self) -> Iterator[Hypothesis]:
         """Yield a mean difference beyond `LARGEST_TARE` σ of the tare's prior."""
@@ -308,20 +306,14 @@ class _OneSensor:
         shift_m: Array = np.asarray(solution[0], dtype=np.float64)
         return shift_m
 
-    def _hypotheses(self) -> Iterator[Hypothesis]:
-        subject = f"the wrench of '{self.part.transcription.experiment.name}'"
-        for row, handicap in self._mistakes():
-            if (found := row.hypothesis(self.declared)) is not None:
-                yield replace(found, subject=subject, handicap=handicap)
-
-    def _mistakes(self) -> Iterator[tuple[Doubt, float]]:
+    def _rows(self) -> Iterator[Doubt]:
         wrench = self.sensor.wrench
+        subject = f"the wrench of '{self.part.transcription.experiment.name}'"
 
-        def mistake(
-            code: str, without: Wrench, handicap: float = 1.0, **data: Any
-        ) -> tuple[Doubt, float]:
+        def mistake(code: str, without: Wrench, handicap: float = 1.0, **data: Any) -> Doubt:
             """Return the row of a sensor that measured `without`; `data` are for the message."""
-            return measurement_mistake(code, wrench, lambda _: without, **data), handicap
+            row = measurement_mistake(code, wrench, lambda _: without, **data)
+            return replace(row, subject=subject, handicap=handicap)
 
         values = np.array(wrench.values)
         yield mistake("wrench-sign", replace(wrench, values=-values))
@@ -367,8 +359,7 @@ class _OneSensor:
         for shift_s in np.linspace(-span_s, span_s, SHIFTS + 1):
             data = {"by_ms": 1e3 * abs(shift_s), "when": "later" if shift_s < 0 else "earlier"}
             yield mistake("wrench-clock", replace(wrench, t_s=wrench.t_s + shift_s), **data)
-        tare = Doubt("wrench-tare", "σ", lambda *_: (self._with_tare(FREE_TARE), {}))
-        yield tare, 1.0
+        yield Doubt.whole("wrench-tare", self._with_tare(FREE_TARE), subject)
 
 
 def _without_tare(values: Array, tare: float) -> Array:

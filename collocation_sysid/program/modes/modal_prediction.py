@@ -51,7 +51,7 @@ class DeclaredMotion:
     gravity_m_s2: Array  # (3,): gravity [m/s²]
     mesh_scale: float = 1.0  # factor of the size of the mesh and of the markers' places on it
     lag_s: float = 0.0  # delay of the markers' clock [s]
-    name: str = ""  # name of the experiment in quotation marks
+    name: str = ""  # name of the experiment
     # (4, 4): constant motion that is part of the poses and is applied first, such as
     # `gripper_to_body`.
     first_motion: Array = field(default_factory=lambda: np.eye(4))
@@ -69,7 +69,6 @@ class DeclaredMotion:
         t_s = experiment.t_s[:MOST_SAMPLES]
         rotations, translations = grasp.poses.at(t_s)
         tracks = experiment.markers.positions_at_samples_m[:MOST_SAMPLES]
-        name = f"'{experiment.name}'"
         gravity_m_s2 = experiment.gravity_m_s2
         return cls(
             t_s,
@@ -77,7 +76,7 @@ class DeclaredMotion:
             translations_m=translations,
             tracks_m=tracks,
             gravity_m_s2=gravity_m_s2,
-            name=name,
+            name=experiment.name,
             first_motion=grasp.poses.first_motion,
         )
 
