@@ -18,10 +18,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import filmed_twins
 import numpy as np
+import record
 from assumed_twins import anisotropic_law
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
@@ -455,6 +457,16 @@ FILMED: dict[str, tuple[str, Fault]] = {
         Fault(matrices(with_focal_lengths_times(1.3)), ()),
     ),
 }
+# Right causes of those errors that have one.
+RIGHT = {
+    "mirrored": "mesh-mirrored",
+    "wide": "mesh-width",
+    "hanging": "rest-shape",
+    "filtered": "tracks-filtered",
+    "twice": "markers-same",
+    "law": "law",
+    "quaternions": "quaternion-order",
+}
 # Characters of a first reason that the table shows.
 REASON_LENGTH = 60
 
@@ -497,6 +509,7 @@ def main() -> None:
     parser.add_argument("--twins", type=int, default=5, help="of each error")
     errors = {name: text for name, (text, _) in (*ERRORS.items(), *FILMED.items())}
     parser.add_argument("--only", nargs="+", choices=tuple(errors), default=tuple(errors))
+    parser.add_argument("--json", type=Path, help="file of results for the record of codes")
     options = parser.parse_args()
     print(
         "| error | E over the true E | E inside | all inside | verdicts | good, one outside "
@@ -506,6 +519,9 @@ def main() -> None:
     for name in options.only:
         answers = [fit(name, seed) for seed in range(options.twins)]
         print(row(errors[name], answers), flush=True)
+        for answer in answers if options.json else ():
+            right = [RIGHT[name]] if name in RIGHT else []
+            record.append(options.json, errors[name], right, answer["named"])
 
 
 def row(text: str, answers: Sequence[Mapping[str, Any]]) -> str:

@@ -311,7 +311,7 @@ def compare(
 
     A description that is refused, or a solve that fails, is an answer of a study too.
     """
-    answer: dict[str, Any] = {"seed": seed}
+    answer: dict[str, Any] = {"seed": seed, "named": ()}
     try:
         described = problem()
         began = time.process_time()
@@ -321,6 +321,7 @@ def compare(
     except Exception as error:
         return answer | {"verdict": "failed", "reasons": [repr(error)], "constants": {}}
     answer |= {"verdict": run.trust.verdict, "reasons": list(run.trust.reasons)}
+    answer["named"] = tuple(each.code for each in run.causes[:1])
     answer["constants"] = {name: _constant(run, name, truth[name]) for name in names}
     elapsed = run.elapsed_s
     answer |= {"search_s": elapsed.search, "checks_s": elapsed.checks}

@@ -16,11 +16,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import contact_twins
 import depth_twins
 import filmed_twins
 import numpy as np
+import record
 from script_arguments import make_parser
 from twins import BODIES, SOFT, sensing_twin, twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
@@ -69,6 +71,8 @@ class MistakeRow:
     is_correct: bool
     is_reported: bool  # whether `check` names a cause, or refuses the problem
     is_good: bool  # whether `solve` rates the answer "good"
+    right: tuple[str, ...]  # right causes
+    named: tuple[str, ...]  # codes that `check` and `solve` name first
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,7 @@ class SolveReport:
 
     text: str
     is_good: bool
+    named: tuple[str, ...] = ()  # code that is named first
 
 
 def main() -> None:
@@ -92,6 +97,8 @@ def main() -> None:
         is_solved=not options.check_only,
     ):
         print(_line([row.name, row.checked, row.solved]), flush=True)
+        if options.json:
+            record.append(options.json, row.name, row.right, row.named)
         rows.append(row)
     print(f"\n{summary(rows)}; {time.perf_counter() - began_s:.0f} s")
 
@@ -107,6 +114,7 @@ def _options() -> argparse.Namespace:
         "--seeds", type=int, default=5, help="number of correct problems of each kind"
     )
     parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--json", type=Path, help="file of results for the record of codes")
     parser.add_argument("--check-only", action="store_true", help="do not solve")
     return parser.parse_args()
 
@@ -226,6 +234,8 @@ def table_row(
         is_correct=fault is None,
         is_reported=bool(causes) or bool(refusal),
         is_good=report.is_good,
+        right=() if fault is None else fault.causes,
+        named=(*(each.code for each in causes[:1]), *report.named),
     )
 
 
@@ -254,10 +264,12 @@ def solve_report(problem: Problem, family: ProblemFamily) -> SolveReport:
     status = answer.solution.status.value
     reason = causes_text(answer.causes) if answer.causes else status
     verdict = answer.trust.verdict
+    named = tuple(each.code for each in answer.causes[:1])
     if verdict != "good":
-        return SolveReport(f"{verdict}: {reason}", False)
+        return SolveReport(f"{verdict}: {reason}", False, named)
     ratio = answer.estimates[family.parameter].value / family.truth
-    return SolveReport(f"{verdict}: {reason}, {family.parameter} {ratio:.3g} of the truth", True)
+    text = f"{verdict}: {reason}, {family.parameter} {ratio:.3g} of the truth"
+    return SolveReport(text, True, named)
 
 
 def causes_text(causes: Sequence[Hypothesis]) -> str:

@@ -9,7 +9,6 @@ only if the answer would be rated "good" without them.
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections import Counter
@@ -19,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import record
 from script_arguments import make_parser
 from studies import markdown
 from twins import random_poses
@@ -61,6 +61,7 @@ class VerdictOutcome:
     reasons: tuple[str, ...]
     worst_errors: float | None  # largest error, in standard errors; None without estimates
     worst: str | None  # name of the parameter with this error
+    named: tuple[str, ...] = ()  # code of the likely mistake that is named first
 
     @property
     def is_right(self) -> bool:
@@ -84,9 +85,9 @@ def main() -> None:
         outcomes = []
         for seed in range(arguments.first, arguments.first + count):
             outcomes.append(judge_twin(name, seed))
+            right = () if name == "none" else FAULTS[name].causes
             if arguments.json:
-                with arguments.json.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(outcomes[-1])) + "\n")
+                record.append(arguments.json, name, right, **asdict(outcomes[-1]))
         faulty_outcomes += outcomes if name != "none" else []
         rows.append(row(name, outcomes))
         print(" | ".join(rows[-1]), flush=True)
@@ -138,7 +139,8 @@ def judge_twin(fault: str, seed: int) -> VerdictOutcome:
             require_plausible_markers(experiment, typical_constants(problem.parameters))
         answer = run(problem, seek_causes=False)
         if answer.trust.verdict == "good":
-            answer = replace(answer, causes=find_misspecifications(answer.solution))
+            causes = find_misspecifications(answer.solution, answer.is_consistent)
+            answer = replace(answer, causes=causes)
     except (InputError, SimulationError) as error:
         return VerdictOutcome(fault, seed, "refused", (str(error),), None, None)
     errors = errors_of(answer, truth)
@@ -150,6 +152,7 @@ def judge_twin(fault: str, seed: int) -> VerdictOutcome:
         answer.trust.reasons,
         errors[worst_name] if worst_name else None,
         worst_name,
+        tuple(each.code for each in answer.causes[:1]),
     )
 
 

@@ -170,8 +170,8 @@ DEPTH_FAULTS = {
 }
 MOVING_FAULTS = {
     "depth: camera 0.1 s late": Fault(late, ("camera-clock",)),
-    "depth: images in reverse order": Fault(images(lambda each: each[::-1]), ("camera-clock",)),
+    "depth: images in reverse order": Fault(images(lambda each: each[::-1]), ("camera-order",)),
     "depth: image of the start throughout": Fault(
-        images(lambda each: np.repeat(each[:1], len(each), axis=0)), ("camera-clock",)
+        images(lambda each: np.repeat(each[:1], len(each), axis=0)), ("camera-constant",)
     ),
 }
