@@ -1,26 +1,17 @@
-"""Posterior of a solution: steps from the answer with all effects of the budget."""
+"""Posterior of a solution: one step from the answer with all effects of the budget."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from ..common.array_types import Array
-from ..errors import SimulationError
 from ..methods.solution import Solution
-from ..methods.starts.initial_trajectories import simulate_trajectories
 from ..problem import Problem
 from ..program.collocation import Collocation
 from ..statistics.budget.consider_analysis import changed_residuals, changes_of_assumptions
 from ..statistics.budget.systematic_effects import ASSUMPTIONS
-from ..statistics.linearised import DerivedModuli, LinearisedFit, linearise_fit
+from ..statistics.linearised import DerivedModuli, LinearisedFit
 from .posterior import Effects, Posterior
-
-# Change of a parameter, in its standard deviations, up to which one step suffices.
-SHORT = 0.5
-# Most steps, each with a simulation and a linearisation.
-MOST_STEPS = 4
 
 
 def is_learnt(collocation: Collocation) -> bool:
@@ -34,11 +25,12 @@ def augmented_fit(
     fit: LinearisedFit,
     discretisation: Mapping[str, Sequence[Array]],
 ) -> Posterior:
-    """Return the posterior of a solution.
+    """Return the posterior of a solution, by one step from it.
 
-    Where a step changes a parameter by more than `SHORT` of its standard deviation, motion and
-    residuals are linearised again where it leads, so that the posterior is not one of first order
-    in the parameters; it is in the effects. A step whose motion cannot be simulated is the last one.
+    The step leads along directions in which parameters and effects compensate each other, such as a
+    softer and a larger body. There the errors of second order cancel too, but only if both are
+    linearised at one point: a second linearisation at the new parameters, but without the effects,
+    leads away from the truth.
 
     Parameters
     ----------
@@ -49,44 +41,19 @@ def augmented_fit(
     """
     collocation = solution.collocation
     deviations = problem.assumed_deviations
+    changes = changes_of_assumptions(collocation, solution.z, deviations)
     means = problem.uncertainty.assumptions.means
-    z = solution.z
-    lower, upper = collocation.parameter_bounds
-    may_be_learnt = is_learnt(collocation)
-    for number in range(1, MOST_STEPS + 1):
-        p, positions = collocation.parameters_from(z), collocation.unpack(z)[1]
-        changes = changes_of_assumptions(collocation, z, deviations)
-        posterior = Posterior.from_fit(
-            fit,
-            Effects.from_changes(changes, deviations, means, discretisation),
-            collocation.parameters,
-            p[: collocation.nq],
-            problem.uncertainty,
-            is_learnt=may_be_learnt,
-            derived_at=lambda q: DerivedModuli.from_bodies(
-                (t.constants for t in collocation.transcriptions), q
-            ),
-        )
-        step = posterior.step[: len(p)]
-        errors = np.sqrt(np.diag(posterior.covariance)[: collocation.nq])
-        is_long = np.abs(step[: collocation.nq]) > SHORT * errors
-        if (
-            number == MOST_STEPS
-            or not may_be_learnt
-            or not (is_long & ~fit.at_bound[: collocation.nq]).any()
-        ):
-            break
-        there = np.clip(p + step, lower, upper)
-        moved, failure = simulate_trajectories(collocation, there, guess=positions)
-        if failure is not None:
-            break
-        z = collocation.pack(there, moved)
-        try:
-            again = linearise_fit(collocation, z)
-        except SimulationError:
-            break
-        fit = again.with_disturbances(block.disturbances for block in fit.blocks)
-    return posterior
+    return Posterior.from_fit(
+        fit,
+        Effects.from_changes(changes, deviations, means, discretisation),
+        collocation.parameters,
+        solution.q,
+        problem.uncertainty,
+        is_learnt=is_learnt(collocation),
+        derived_at=lambda q: DerivedModuli.from_bodies(
+            (t.constants for t in collocation.transcriptions), q
+        ),
+    )
 
 
 def suspects(

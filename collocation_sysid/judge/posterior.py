@@ -254,6 +254,12 @@ class Posterior:
         moved = self.start + self.step[: len(self.start)]
         return np.clip(moved, *self.parameters.bounds_q)
 
+    @property
+    def phi(self) -> Array:
+        """Nuisance parameters (nphi,), in units of their priors."""
+        places = slice(len(self.start), self._of_effects[0] if self.effects.names else None)
+        return (self.fit.prior_residual + self.fit.prior_jacobian * self.step)[places]
+
     @cached_property
     def _information(self) -> Array:
         return least_squares_of_fit(self.fit).information

@@ -221,6 +221,7 @@ class SolvedProblem:
             self.rollouts,
             motions=self.modes_by_experiment.values(),
             uncertainty=self.uncertainty,
+            phi=None if self.posterior is None else self.posterior.phi,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..common.array_types import root_mean
+from ..common.array_types import Array, root_mean
 from ..errors import SimulationError
 from ..features.registry import FEATURES
 from ..features.specimens.concerns import as_specimen_concerns
@@ -14,9 +14,9 @@ from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..model.schemes import as_scheme
 from ..problem import Problem
-from ..program.collocation import ExperimentIterate
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
+from ..program.transcription import Transcription
 from ..recording.nuisance import TIME
 from ..recording.rotation_per_step import DOUBTFUL_ANGLE_RAD
 from ..statistics.assessment import (
@@ -59,6 +59,7 @@ def solution_concerns(
     rollouts: Mapping[str, ForwardSimulation | str],
     motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
+    phi: Array | None = None,
 ) -> Iterator[Concern]:
     """Yield the concerns about a solution and its forward simulations.
 
@@ -75,6 +76,9 @@ def solution_concerns(
     uncertainty : Uncertainty or None
         Statistical uncertainty; None without error bars, which is a concern of its own if there
         are parameters.
+    phi : (nphi,) array, optional
+        Nuisance parameters of all experiments, in units of their priors, in the posterior with all
+        effects; by default those of the solution.
     """
     status = solution.status
     yield from body_concerns(solution)
@@ -88,7 +92,13 @@ def solution_concerns(
     if ENDED_BY_ASSOCIATION in solution.notes:
         yield Concern("solve/jump")
     transcriptions = solution.collocation.transcriptions
-    unknowns = [each for part in solution.parts for each in _nuisance_concerns(part)]
+    collocation = solution.collocation
+    at = collocation.parameters_from(solution.z)[collocation.nq :] if phi is None else phi
+    unknowns = [
+        concern
+        for each in transcriptions
+        for concern in _nuisance_concerns(each, at[each.nuisance_indices.indices - collocation.nq])
+    ]
     if uncertainty is not None:
         misfits = fit_concerns(uncertainty)
         of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
@@ -117,7 +127,6 @@ def solution_concerns(
             for feature in FEATURES:
                 yield from feature.simulation_concerns(name, rollout)
         yield from _forward_concerns(name, rollout, fitted, is_static=name in static)
-    collocation = solution.collocation
     for transcription in collocation.transcriptions:
         yield from rotation_step_concerns(
             transcription.experiment,
@@ -135,15 +144,15 @@ def solution_concerns(
             )
 
 
-def _nuisance_concerns(part: ExperimentIterate) -> Iterator[Concern]:
-    nuisance = part.transcription.nuisance
-    experiment = part.transcription.experiment
-    low, high = nuisance.bounds(part.transcription.association.clock_samples)
+def _nuisance_concerns(transcription: Transcription, phi: Array) -> Iterator[Concern]:
+    nuisance = transcription.nuisance
+    experiment = transcription.experiment
+    low, high = nuisance.bounds(transcription.association.clock_samples)
     # Zero is a plausible value of a lag or a tool's mass, although it is a bound.
     low = np.where(low == 0, -np.inf, low)
     yield from nuisance_concerns(
         nuisance.names,
-        part.phi,
+        phi,
         low=low,
         high=high,
         is_specimen=experiment.specimen is not None,
@@ -152,7 +161,7 @@ def _nuisance_concerns(part: ExperimentIterate) -> Iterator[Concern]:
     )
     for k in nuisance.indices_of_rows(TIME):
         scale = float(nuisance.scales[k])
-        yield from clock_concerns(experiment.name, float(part.phi[k]) * scale, prior_s=scale)
+        yield from clock_concerns(experiment.name, float(phi[k]) * scale, prior_s=scale)
 
 
 def _outlier_counts(solution: Solution) -> tuple[int, int]:

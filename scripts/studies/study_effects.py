@@ -3,15 +3,15 @@
 The bars, motions and constants are those of `study_independent_twins`. All default assumptions and
 all default nuisance parameters of a recording with markers are wrong by random numbers with their
 default standard deviations; only the damping law is the stated one, because γ_r and γ_m are
-constants of this law. The data are simulated with twice as many elements along each edge and with
+constants of this law. The data are simulated with three tet10 elements across the thickness and with
 shorter time steps than the fit has, and extrapolated to infinitely small ones, so that the fit has
-errors of mesh and time steps too. It has tet10 elements, one across the thickness (81 nodes), 60
-samples, stated places of the markers and no guesses. `--divisions 2 2 4` has 225 nodes.
+errors of mesh and time steps too. It has tet10 elements, two across the thickness (225 nodes), 60
+samples, stated places of the markers and no guesses.
 
 Answers are appended to a file with one line of JSON per twin; twins that the file has are not solved
 again.
 
-    python scripts study_effects [--twins 100] [--first 0] [--divisions 1 1 4] [--file effects.jsonl]
+    python scripts study_effects [--twins 100] [--first 0] [--divisions 2 2 4] [--file effects.jsonl]
 """
 
 from __future__ import annotations
@@ -59,6 +59,9 @@ POSE_STEP_S = SAMPLE_S / 2
 # Time steps per sample of the simulation with all effects; its error is extrapolated with twice as
 # many.
 SUBSTEPS = 2
+# Boxes of the simulations whose difference is extrapolated to infinitely small elements.
+COARSE: Divisions = (2, 2, 6)
+FINE: Divisions = (3, 3, 9)
 AIR = ("air_drag", "added_mass", "buoyancy")
 DRAWN = (
     *("body_scale", "mass", "density_gradient", "stiffness_gradient", "anisotropy"),
@@ -71,7 +74,7 @@ def main() -> None:
     parser.add_argument("--twins", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument(
-        "--divisions", type=int, nargs=3, default=(1, 1, 4), help="boxes of the fit"
+        "--divisions", type=int, nargs=3, default=(2, 2, 4), help="boxes of the fit"
     )
     parser.add_argument("--file", type=Path, default=Path("effects.jsonl"))
     arguments = parser.parse_args()
@@ -139,19 +142,16 @@ def recorded_m(
     twin: Twin, divisions: Divisions, stated: cs.Experiment, rng: np.random.Generator
 ) -> Array:
     """Return the tracks (T, M, 3) [m] that cameras with errors record of a body with errors."""
-    across, deep, along = (2 * count for count in divisions)
-    refined: Divisions = (across, deep, along)
-    fine = _sampled(twin, refined, SUBSTEPS)
+    fine = _sampled(twin, FINE, SUBSTEPS)
     nuisance = stated.nuisance
     hand_eye = _size(nuisance.hand_eye_m), _size(nuisance.hand_eye_rad)
     held = displaced(tilted_gravity(fine, rng), *hand_eye, rng)
     moved = with_wrong_assumptions(held, constants(twin), drawn_errors(DRAWN, stated.body, rng))
     # The errors of elements and time steps decrease with the square of their lengths.
-    exact_m = exact_tracks_m(twin, fine)
-    of_steps_m = (
-        (exact_tracks_m(twin, _sampled(twin, refined, 2 * SUBSTEPS))[::2] - exact_m) * 4 / 3
-    )
-    of_mesh_m = (exact_m - exact_tracks_m(twin, _sampled(twin, divisions, SUBSTEPS))) / 3
+    coarse_m = exact_tracks_m(twin, _sampled(twin, COARSE, SUBSTEPS))
+    more_steps_m = exact_tracks_m(twin, _sampled(twin, COARSE, 2 * SUBSTEPS))[::2]
+    of_steps_m = (more_steps_m - coarse_m) * 4 / 3
+    of_mesh_m = (exact_tracks_m(twin, fine) - coarse_m) / ((FINE[0] / COARSE[0]) ** 2 - 1)
     true_m = moved.markers.positions_m + of_steps_m + of_mesh_m
     rate = 1 - _size(CLOCK_RATE.considered) * rng.standard_normal()
     late_s = _size(nuisance.time_shift_s) * rng.standard_normal()
