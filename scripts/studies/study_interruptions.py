@@ -1,9 +1,9 @@
 """Solves that are interrupted at random moments: whether each keeps a result.
 
 Solves of shipped problems, with and without guesses, with a coarse start and by interior point, run
-as commands of their own. At a random moment between its start and its usual end each receives
-SIGINT or SIGTERM. After the first simulation a result must be written, with the exit code 130 or
-143; there must be no traceback, and no other exit code at any moment.
+as commands of their own. Each receives SIGINT or SIGTERM at a random moment between its first
+simulation and its usual end, and a fifth of them before. After the first simulation a result must be
+written, with the exit code 130 or 143; there must be no traceback, and no other exit code.
 
     python scripts study_interruptions [--solves 40] [--seed 0]
 """
@@ -60,15 +60,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the random moments")
     arguments = parser.parse_args()
     rng = np.random.default_rng(arguments.seed)
-    durations_s = [solved(case, None)[2] for case in CASES]
+    usual_s = [solved(case, None)[2] for case in CASES]
     faults = 0
     print("| problem | options | signal | s | exit code | simulated | status | fault |")
     print("|---|---|---|---|---|---|---|---|")
     for number in range(arguments.solves):
         which = number % len(CASES)
-        after_s = rng.uniform(0.0, 1.05) * durations_s[which]
+        first_s, last_s = usual_s[which]
+        is_early = number % 5 == 0
+        after_s = rng.uniform(0.0, first_s if is_early else last_s - first_s)
         sent = (signal.SIGINT, signal.SIGTERM)[number // len(CASES) % 2]
-        cells, fault, _ = solved(CASES[which], (after_s, sent))
+        cells, fault, _ = solved(CASES[which], (is_early, after_s, sent))
         faults += bool(fault)
         print(f"| {' | '.join(cells)} | {fault} |", flush=True)
     print(f"\n{faults} of {arguments.solves} solves with a fault")
@@ -76,10 +78,11 @@ def main() -> None:
 
 
 def solved(
-    case: tuple[str, Sequence[str]], interruption: tuple[float, signal.Signals] | None
-) -> tuple[list[str], str, float]:
-    """Solve a case, and interrupt it after a time [s]; return the cells of its row, the fault (empty
-    for none) and the duration [s].
+    case: tuple[str, Sequence[str]], interruption: tuple[bool, float, signal.Signals] | None
+) -> tuple[list[str], str, tuple[float, float]]:
+    """Solve a case, and interrupt it a time [s] after its start (true) or its first simulation; return
+    the cells of its row, the fault (empty for none), and the times of the first simulation and of the
+    end [s].
     """
     name, options = case
     with tempfile.TemporaryDirectory() as folder:
@@ -97,13 +100,15 @@ def solved(
         )
         sent_s, expected = float("inf"), {0}
         if interruption is not None:
-            after_s, number = interruption
+            is_early, after_s, number = interruption
+            while not is_early and process.poll() is None and not _is_written(mark):
+                time.sleep(0.01)
             time.sleep(after_s)
             sent_s = time.time()
             process.send_signal(number)
             expected = {0, 128 + number}
         out, err = process.communicate()
-        duration_s = time.time() - began_s
+        ended_s = time.time()
         first = mark.read_text().split() if mark.exists() else []
         is_simulated = bool(first) and float(first[0]) < sent_s
         written = run / "result.json"
@@ -113,10 +118,17 @@ def solved(
         fault = f"exit code {process.returncode}: {err[-300:]!r}"
     elif is_simulated and status not in ("interrupted", "converged"):
         fault = f"no result: {err[-300:]!r}"
+    times_s = float(first[0]) - began_s if first else 0.0, ended_s - began_s
     if interruption is None:
-        return [], fault, duration_s
-    cells = [name, " ".join(options), interruption[1].name, f"{interruption[0]:.2f}"]
-    return [*cells, str(process.returncode), str(is_simulated), status], fault, duration_s
+        return [], fault, times_s
+    is_early, after_s, number = interruption
+    moment = f"{after_s:.2f} after {'start' if is_early else 'simulation'}"
+    cells = [name, " ".join(options), number.name, moment]
+    return [*cells, str(process.returncode), str(is_simulated), status], fault, times_s
+
+
+def _is_written(file: Path) -> bool:
+    return file.exists() and file.stat().st_size > 0
 
 
 if __name__ == "__main__":

@@ -423,6 +423,17 @@ def test_a_failed_search_survives_an_interrupt_of_the_scan_that_follows(tiny, mo
     assert result["history"]
 
 
+def test_a_search_at_its_limit_says_where_it_ended_and_what_it_does_not_explain(tiny):
+    far = settings("solver.reduced-space.max_iterations=2", "parameters.mu_pa.guess=5000")
+    method = settings("solver.method=reduced-space")
+    outcome = run_command("solve", "problem.toml", *method, *far, "--out", "run")
+    assert outcome.code == 1
+    ended = r"It ended at λ = \S+ Pa, μ = \S+ Pa, γ_r = \S+ s, γ_m = \S+ 1/s, where it does not explain "
+    measurements = r"the markers \(\S+ standard deviations\)\."
+    assert re.search(ended + measurements, result_in(tiny / "run")["message"])
+    assert re.search(ended, " ".join(outcome.out.split()))
+
+
 def test_an_answer_survives_an_interrupted_roll_out(tiny, monkeypatch):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
