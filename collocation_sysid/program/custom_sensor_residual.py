@@ -54,7 +54,6 @@ class CustomSensorResidual(MeasurementResidual):
     is_static: bool
 
     sigma_key = "sigma"
-    has_offsets = True
 
     @classmethod
     def from_sensor(
