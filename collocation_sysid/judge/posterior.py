@@ -318,16 +318,7 @@ class Posterior:
                 if name.partition(" ")[0] not in left_out
             ),
         ]
-        blocks = (replace(b, jacobian=b.jacobian[..., kept]) for b in self.fit.blocks)
-        fit = replace(
-            self.fit,
-            blocks=tuple(blocks),
-            names=tuple(self.fit.names[k] for k in kept),
-            prior_residual=self.fit.prior_residual[kept],
-            prior_jacobian=self.fit.prior_jacobian[kept],
-            at_bound=self.fit.at_bound[kept],
-            effect_count=len(kept) - first,
-        )
+        fit = self.fit.only(kept, effect_count=len(kept) - first)
         considered = self.considered.without(left_out)
         learnt = self.effects.without(left_out)
         step = gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means

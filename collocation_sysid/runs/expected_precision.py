@@ -32,7 +32,7 @@ from ..recording.poses import PoseSequence
 from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import moduli_of, specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
-from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions
+from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions, unweighted_fit
 from ..statistics.combinations import (
     WIDE,
     Combination,
@@ -43,7 +43,7 @@ from ..statistics.combinations import (
 )
 from ..statistics.estimates import relative_derivatives
 from ..statistics.linearised import LinearisedFit, linearise_fit
-from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
+from ..statistics.uncertainty import ErrorModel, uncertainty_from_fit
 from .coarse_start import sample_distance
 
 # Errors of measurements that were not made.
@@ -108,10 +108,11 @@ def expected_precision(
     from ..judge.augmented_fit import is_learnt
     from ..judge.posterior import Effects, Posterior
 
-    fit, known = _exact_fit(collocation, z)
+    fit, of_nuisances = unweighted_fit(collocation, z, deviations)
+    fit = _exact(fit)
     parameters = collocation.parameters
     q = z[: collocation.nq]
-    changes = changes_of_assumptions(collocation, z, deviations)
+    changes = changes_of_assumptions(collocation, z, deviations, of_nuisances)
     effects = Effects.from_changes(changes, deviations, {}, {})
     posterior = Posterior.from_fit(
         fit, effects, parameters, q, EXACT_NOISE, is_learnt=is_learnt(collocation)
@@ -120,7 +121,7 @@ def expected_precision(
     of_noise = posterior.uncertainty.complete_covariance
     covariance = posterior.combine_covariance(of_noise, sizes)
     kept = [k for k in parameters.scalar_coordinates if not fit.at_bound[k]]
-    names = tuple(known.names[k] for k in kept)
+    names = tuple(parameters.free[k].name for k in kept)
     values = parameters.values(q)
     return ExpectedPrecision(
         names,
@@ -135,20 +136,19 @@ def expected_precision(
     )
 
 
-def _exact_fit(collocation: Collocation, z: Array) -> tuple[LinearisedFit, Uncertainty]:
-    """Return fit and uncertainty as if all residuals were zero, by noise of the stated σ."""
-    fit = linearise_fit(replace(collocation, huber=UNWEIGHTED), z)
-    exact = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
-    fit = replace(fit, blocks=tuple(exact), prior_residual=0 * fit.prior_residual)
-    q = z[: collocation.nq]
-    return fit, uncertainty_from_fit(fit, collocation.parameters, q, EXACT_NOISE)
+def _exact(fit: LinearisedFit) -> LinearisedFit:
+    """Return the fit as if all residuals were zero."""
+    blocks = [replace(b, residual=0 * b.residual, misfit=None) for b in fit.blocks]
+    return replace(fit, blocks=tuple(blocks), prior_residual=0 * fit.prior_residual)
 
 
 def expected_deviations(collocation: Collocation, z: Array) -> dict[str, float]:
     """Return the relative standard deviation of each estimated scalar parameter by noise of the
     stated σ and the errors of the sensors, if all residuals were zero at z.
     """
-    fit, known = _exact_fit(collocation, z)
+    fit = _exact(linearise_fit(replace(collocation, huber=UNWEIGHTED), z))
+    parameters = collocation.parameters
+    known = uncertainty_from_fit(fit, parameters, z[: collocation.nq], EXACT_NOISE)
     kept = [k for k in collocation.parameters.scalar_coordinates if not fit.at_bound[k]]
     deviations = np.sqrt(np.diag(known.complete_covariance))
     return {known.names[k]: float(deviations[k]) for k in kept}

@@ -15,7 +15,7 @@ covariance B of the score Sᵀe becomes L (LᵀB L) Lᵀ for the parameters, wit
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -265,16 +265,20 @@ class LinearisedFit:
         """The fit without the effects among its parameters."""
         if not self.effect_count:
             return self
-        count = len(self.names) - self.effect_count
-        blocks = (replace(b, jacobian=b.jacobian[..., :count]) for b in self.blocks)
+        return self.only(range(len(self.names) - self.effect_count))
+
+    def only(self, kept: Sequence[int], effect_count: int = 0) -> LinearisedFit:
+        """Return the fit of some of its parameters, the others unchanged."""
+        own = [*kept]
+        blocks = (replace(b, jacobian=b.jacobian[..., own]) for b in self.blocks)
         return replace(
             self,
             blocks=tuple(blocks),
-            names=self.names[:count],
-            prior_residual=self.prior_residual[:count],
-            prior_jacobian=self.prior_jacobian[:count],
-            at_bound=self.at_bound[:count],
-            effect_count=0,
+            names=tuple(self.names[k] for k in own),
+            prior_residual=self.prior_residual[own],
+            prior_jacobian=self.prior_jacobian[own],
+            at_bound=self.at_bound[own],
+            effect_count=effect_count,
         )
 
     @property

@@ -26,7 +26,7 @@ from ...program.sweep import ForwardSubstitution, PrescribedColumns, Sweep, Swee
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
-from ..linearised import linearise_fit
+from ..linearised import LinearisedFit, linearise_fit
 from .systematic_effects import ASSUMPTIONS, Effect, ExperimentAtAnswer
 
 # A threshold of Huber's loss that no residual reaches.
@@ -60,7 +60,10 @@ class ResidualChanges(NamedTuple):
 
 
 def changes_of_assumptions(
-    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    of_nuisances: ResidualChanges | None = None,
 ) -> ResidualChanges:
     """Return the changes of the residuals by all assumptions of a fit and by nuisance parameters
     that are not estimated, each off by its standard deviation.
@@ -72,6 +75,8 @@ def changes_of_assumptions(
     deviations : mapping of str to float or None
         Standard deviations of assumptions and nuisance parameters by name, in place of those of the
         tables; None for what is exact.
+    of_nuisances : ResidualChanges, optional
+        Known result of `changes_of_nuisances`.
 
     Notes
     -----
@@ -81,7 +86,7 @@ def changes_of_assumptions(
     rows = [(row, deviations.get(row.name, row.considered)) for row in ASSUMPTIONS]
     assumptions = [(row, s) for row, s in rows if s is not None]
     of_bodies = changed_residuals(collocation, z, assumptions)
-    of_nuisances = changes_of_nuisances(collocation, z, deviations=deviations)
+    of_nuisances = of_nuisances or changes_of_nuisances(collocation, z, deviations)
     if not of_nuisances.names:
         return of_bodies
     both = zip(of_bodies.blocks, of_nuisances.blocks, strict=True)
@@ -110,6 +115,32 @@ def changes_of_nuisances(
         other experiments, with the name of the kind; no blocks if all are estimated or exact.
         Huber's weights are not applied.
     """
+    wide, at, names = _with_considered(collocation, z, deviations)
+    return _changes_by(names, linearise_fit(wide, at)) if names else ResidualChanges((), [])
+
+
+def unweighted_fit(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> tuple[LinearisedFit, ResidualChanges]:
+    """Return the fit without Huber's weights, and the result of `changes_of_nuisances`."""
+    wide, at, names = _with_considered(collocation, z, deviations)
+    fit = linearise_fit(wide, at)
+    own = [wide.parameter_names.index(name) for name in collocation.parameter_names]
+    return fit.only(own), _changes_by(names, fit)
+
+
+def _changes_by(names: Mapping[int, str], fit: LinearisedFit) -> ResidualChanges:
+    """Return the changes by some parameters of a fit, by their places."""
+    blocks = [block.jacobian[..., [*names]] for block in fit.blocks]
+    return ResidualChanges(tuple(names.values()), blocks)
+
+
+def _with_considered(
+    collocation: Collocation, z: Array, deviations: Mapping[str, float | None]
+) -> tuple[Collocation, Array, dict[int, str]]:
+    """Return the program with the nuisance parameters that are not estimated, whatever Huber's
+    weights, its variables, and the places and kinds of these parameters.
+    """
 
     def with_added_nuisances(experiment: Experiment) -> Experiment:
         nuisance = experiment.nuisance
@@ -118,23 +149,18 @@ def changes_of_nuisances(
         return replace(experiment, nuisance=replace(nuisance, **more))
 
     wider = [with_added_nuisances(experiment) for experiment in collocation.experiments]
-    wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)  # whatever their weights
+    wide = replace(collocation, experiments=wider, huber=UNWEIGHTED)
     p, positions = collocation.unpack(z)
     values = dict(zip(collocation.parameter_names, p.tolist(), strict=True))
     at = wide.pack(wide.with_values(values, np.zeros(wide.nq + wide.nphi)), positions)
-    new = np.array(
-        [k for k, name in enumerate(wide.parameter_names) if name not in values], dtype=np.int64
-    )
-    if not len(new):
-        return ResidualChanges((), [])
-    names: dict[int, str] = {}
+    kinds: dict[int, str] = {}
     for transcription in wide.transcriptions:
         own = zip(
             transcription.parameter_indices[wide.nq :], transcription.nuisance.entries, strict=True
         )
-        names |= {int(place): entry.row.name for place, entry in own}
-    blocks = [block.jacobian[..., new] for block in linearise_fit(wide, at).blocks]
-    return ResidualChanges(tuple(names[k] for k in new.tolist()), blocks)
+        kinds |= {int(place): entry.row.name for place, entry in own}
+    new = [k for k, name in enumerate(wide.parameter_names) if name not in values]
+    return wide, at, {k: kinds[k] for k in new}
 
 
 @one_blas_thread()
