@@ -43,7 +43,9 @@ from .run_sections import (
 
 # Derived moduli in the summary; others are in the details.
 SHOWN_MODULI = ("young_pa", "poisson", INSTANTANEOUS.name)
-# Reasons of the verdict in the summary, gravest first.
+# Lines of the summary, with those of the folder and the next step, as far as one reason leaves them,
+# and most reasons of the verdict, gravest first.
+MOST_LINES = 16
 SHOWN_REASONS = 5
 # Sources of uncertainty in the summary, and the smallest share of a variance that counts.
 SHOWN_SOURCES = 3
@@ -95,11 +97,8 @@ def next_step(result: Result, folder: Path) -> str:
 
 
 def _brief(result: Result) -> list[Shown]:
-    outcome = [] if result.converged else [outcome_section(result)]
-    sections = (*outcome, verdict_section(result.trust, max_reasons=SHOWN_REASONS))
-    return [
-        *flattened_parts(sections),
-        *_further_reasons(result),
+    outcome = [] if result.converged else [*flattened_parts([outcome_section(result)])]
+    others = [
         *remedy_command(result.trust.concerns),
         *(Line(note, "quiet") for note in result.notes if note.startswith(NO_CAUSE)),
         *_start(result),
@@ -108,10 +107,15 @@ def _brief(result: Result) -> list[Shown]:
         *_basis(result),
         *_fit(result),
     ]
+    taken = sum(1 + len(e.rows) if isinstance(e, Table) else 1 for e in (*outcome, *others))
+    # Beside verdict, further reasons, folder and next step.
+    shown = min(SHOWN_REASONS, max(1, MOST_LINES - 4 - taken))
+    verdict = flattened_parts([verdict_section(result.trust, max_reasons=shown)])
+    return [*outcome, *verdict, *_further_reasons(result, shown), *others]
 
 
-def _further_reasons(result: Result) -> Iterator[Line]:
-    if (count := len(result.trust.concerns) - SHOWN_REASONS) > 0:
+def _further_reasons(result: Result, shown: int) -> Iterator[Line]:
+    if (count := len(result.trust.concerns) - shown) > 0:
         further = "1 further reason" if count == 1 else f"{count} further reasons"
         yield Line(f"  {further}, less grave: in the report, and with --details", "quiet")
 

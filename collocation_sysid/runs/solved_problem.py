@@ -230,8 +230,8 @@ class SolvedProblem:
             causes = cause_concerns(self.causes)
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
             effects = effect_concerns(self.effects, self.suspects)
-            # Effects are judged with this mesh.
-            known = meshes if effects else []
+            # Effects are judged with this mesh, so that a coarse one is as grave.
+            known = [replace(each, grade=effects[0].grade) for each in meshes] if effects else []
             return Assessment.from_concerns(
                 (
                     *(each for each in causes if each.code not in OPEN_CAUSES),

@@ -101,8 +101,10 @@ def test_the_gravest_of_many_reasons_are_shown_and_the_others_counted():
     ]
     result = replace(solved(), trust=replace(solved().trust, concerns=concerns))
     shown = [line for line in lines(result) if line.startswith("  ")]
-    assert sum("sigma" in line for line in shown) == 5
-    assert any("2 further reasons" in line for line in shown)
+    count = sum("sigma" in line for line in shown)
+    assert 1 <= count <= 5
+    assert any(f"{7 - count} further reasons" in line for line in shown)
+    assert len(lines(result)) < MOST_LINES
     assert sum("of the sum of squared" in line for line in lines(result, details=True)) == 7
 
 
