@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from ..common.declarations import declaration, key
 from ..common.time_dependence import over_time
 from ..errors import InputError, hint_at, listed
 from .sample_times import first_unordered_time
-from .sources import c3d, motive, plain_csv, qualisys, trc
+from .sources import c3d, motive, plain_csv, qualisys, trc, vicon
 from .sources.raw_tracks import LabelChooser, RawTracks
 from .sources.source import as_table, open_source
 from .sources.text import decode, names_file_in_errors
@@ -28,6 +29,7 @@ _TEXT_FORMATS = {
     trc.BEGINNING: trc.read,
     qualisys.BEGINNING: qualisys.read,
     motive.BEGINNING: motive.read,
+    **{f"{block}\n": vicon.read for block in vicon.BLOCKS},
 }
 
 
@@ -77,11 +79,11 @@ def read_markers(
 ) -> MarkerTable:
     """Read marker tracks; the format is recognised by the file's content.
 
-    Known are C3D (with the extra ``collocation-sysid[c3d]``), TRC, Qualisys TSV, Motive CSV, and
-    plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres, and optionally <name>_sigma,
-    the standard deviation of each sample) or long (t_s, marker, x_m, y_m, z_m). A blank cell or NaN
-    is a missing sample; in motion-capture formats, though not in plain CSV, so is one at exactly
-    (0, 0, 0).
+    Known are C3D (with the extra ``collocation-sysid[c3d]``), TRC, Qualisys TSV, Motive CSV, Vicon
+    Nexus CSV, and plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres, and optionally
+    <name>_sigma, the standard deviation of each sample) or long (t_s, marker, x_m, y_m, z_m). A
+    blank cell or NaN is a missing sample; in motion-capture formats, though not in plain CSV, so is
+    one at exactly (0, 0, 0).
 
     Parameters
     ----------
@@ -126,8 +128,9 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
             return c3d.read(path, source, choose=choose)
         text = decode(source)
         start = text.lstrip().lstrip('"')
+        first_cell = re.split("[,;\t\r\n]", start, maxsplit=1)[0] + "\n"
         for beginning, read in _TEXT_FORMATS.items():
-            if start.startswith(beginning):
+            if start.startswith(beginning) or first_cell == beginning:
                 return read(text, choose)
     return plain_csv.read(as_table(source), choose)
 

@@ -370,6 +370,11 @@ def test_measured_markers_come_before_those_of_a_solved_body(file):
     )
 
 
+def test_markers_of_motive_in_the_frame_of_a_body_are_refused(file):
+    with pytest.raises(InputError, match="Coordinate Space is 'Local'; expected Global"):
+        read_markers(file(MOTIVE.replace("Space,Global", "Space,Local")))
+
+
 def test_unlabelled_markers_are_taken_only_if_asked_for(file):
     table = read_markers(file(MOTIVE), labels={"Unlabeled 7": "tip"})
     assert table.names == ("Tip 1", "base", "tip")
@@ -430,9 +435,64 @@ def test_a_frame_without_the_marker_asked_for_is_a_frame(file):
     np.testing.assert_allclose(table.positions_m, TRACKS_M[:, :1])
 
 
+VICON = """Trajectories
+100
+,,S:tip,,,S:base,,
+Frame,Sub Frame,X,Y,Z,X,Y,Z
+,,mm,mm,mm,mm,mm,mm
+7,0,1,2,3,4,5,6
+8,0,1,2,3,,,
+10,0,1,2,3,4,5,7
+"""
+DEVICES = """Devices
+1000
+,,Force Plate - Force,,
+Frame,Sub Frame,Fx,Fy,Fz
+,,N,N,N
+1,0,0.1,0.2,0.3
+1,1,0.1,0.2,0.3
+
+"""
+OUTPUTS = """Model Outputs
+100
+,,S:LWristAngles,,
+Frame,Sub Frame,X,Y,Z
+,,deg,deg,deg
+1,0,1,2,3
+
+"""
+
+
+@pytest.mark.parametrize("above", ["", DEVICES, OUTPUTS, DEVICES + OUTPUTS])
+def test_a_vicon_csv_has_its_markers_among_other_blocks(file, above):
+    table = read_markers(file(above + VICON))
+    assert table.names == ("S:tip", "S:base")
+    np.testing.assert_allclose(table.t_s, [0, 0.01, 0.03])
+    np.testing.assert_allclose(table.positions_m[2, 1], [0.004, 0.005, 0.007])
+    assert np.isnan(table.positions_m[1, 1]).all()
+    blocks = [name for name in ("Devices", "Model Outputs") if name in above]
+    assert ("not read: " + ", ".join(blocks) in table.notes) == bool(blocks)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (DEVICES, "found the blocks Devices of Vicon Nexus, but no Trajectories"),
+        (VICON.replace("mm,mm\n", "mm,deg\n"), "line 5: the units are deg, mm"),
+        (VICON.replace("Sub Frame", "Sub"), "line 1: expected below Trajectories"),
+        (VICON.replace("S:base", "S:tip"), "two markers are named 'S:tip'"),
+        (VICON.replace("100", "fast"), "'fast'; expected a number above 0"),
+    ],
+)
+def test_a_bad_vicon_csv_is_refused(file, text, words):
+    with pytest.raises(InputError) as caught:
+        read_markers(file(text))
+    assert words in str(caught.value)
+
+
 def test_an_unknown_text_file_is_answered_with_the_formats_known(file):
     message = refusal(file("frame;x;y\n1;2;3\n"))
-    assert "a C3D, TRC, Qualisys TSV or Motive CSV file" in message
+    assert "a C3D, TRC, Qualisys TSV, Motive or Vicon CSV file" in message
 
 
 # C3D ----------------------------------------------------------------------------------------------
@@ -470,6 +530,29 @@ def test_c3d_is_read_with_its_unit_rate_and_gaps(tmp_path):
     assert table.notes == (
         "Tip 1: 1 of 4 samples missing (1 blank); base: 1 of 4 samples missing (1 zeros)",
     )
+
+
+@pytest.mark.parametrize(
+    ("lists", "group"),
+    [
+        ({"ANGLES": ["RElbow"]}, "ANGLES"),
+        ({"FORCES2": ["RElbow"]}, "FORCES2"),
+        ({"TYPE_GROUPS": ["MY_OUTPUTS"], "MY_OUTPUTS": ["RElbow"]}, "MY_OUTPUTS"),
+    ],
+)
+def test_outputs_of_a_model_in_c3d_are_no_markers(tmp_path, lists, group):
+    ezc3d = pytest.importorskip("ezc3d")
+    tracks_mm = 1000 * np.concatenate([TRACKS_M, 50 + TRACKS_M[:, :1]], axis=1)
+    path = write_c3d(tmp_path / "take.c3d", tracks_mm, labels=("Tip 1", "base", "RElbow"))
+    c3d = ezc3d.c3d(str(path))
+    for name, labels in lists.items():
+        c3d.add_parameter("POINT", name, labels)
+    c3d.write(str(path))
+    table = read_markers(path)
+    assert table.names == ("Tip 1", "base")
+    assert f"RElbow of POINT:{group} are outputs of a model, not markers" in table.notes[0]
+    with pytest.raises(InputError, match="no marker 'RElbow'"):
+        read_markers(path, names=["RElbow"])
 
 
 def test_a_negative_residual_in_c3d_is_a_gap(tmp_path):

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
 from numpy.typing import NDArray
 
 from ...common.isolated_process import Failed, ProcessLimits, run_isolated
-from ...errors import InputError
+from ...errors import InputError, listed
 from .raw_tracks import LabelChooser, RawTracks
 from .units import length_unit_of_text
 
 # Second byte of every C3D file.
 _KEY = 0x50
+# Beginnings of the parameters of all points.
+_OF_POINTS = ("LABELS", "UNITS", "RATE", "TYPE_GROUPS")
 # Bytes of a block, the unit of addresses in the file.
 _BLOCK = 512
 # Processor types with other number formats than Intel's.
@@ -24,13 +26,19 @@ _DEC = 85
 _SGI = 86
 # Largest frame number that the header's 16 bits can hold.
 _COUNTER_LIMIT = 65535
+# Parameters that list points which Vicon computes from a model, such as joint angles [°] and powers:
+# they are no markers. POINT:TYPE_GROUPS may name others.
+_OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "MODELED_MARKERS", "REACTIONS")
 # On damaged files ezc3d may crash, which a process of its own survives.
-WORKER = r"""
+WORKER = rf"""
 import re, ezc3d
 file = ezc3d.c3d(sys.argv[1])
 of_points = file["parameters"]["POINT"]
-kept = [key for key in of_points if re.fullmatch(r"(LABELS[0-9]{0,3}|UNITS|RATE)", key)]
-found = {key: numpy.array(of_points[key]["value"]) for key in kept}
+groups = map(str, of_points.get("TYPE_GROUPS", {{"value": []}})["value"])
+outputs = [*{_OUTPUTS!r}, *(re.escape(group.strip()) for group in groups if group.strip())]
+names = rf"(LABELS|{{'|'.join(outputs)}})[0-9]{{{{0,3}}}}|UNITS|RATE|TYPE_GROUPS"
+kept = [key for key in of_points if re.fullmatch(names, key)]
+found = {{key: numpy.array(of_points[key]["value"]) for key in kept}}
 found["points"] = numpy.asarray(file["data"]["points"], dtype=float)[:3]
 """
 
@@ -80,7 +88,15 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
             "expected a label for each",
             where="POINT:LABELS",
         )
-    chosen = choose(labels)
+    outputs = _model_outputs(read, labels)
+    markers = [k for k, label in enumerate(labels) if label not in outputs]
+    if outputs and not markers:
+        raise InputError(
+            f"all points are outputs of a model ({listed(sorted(set(outputs.values())))}), not "
+            "markers; expected the trajectories of markers",
+            where="POINT:LABELS",
+        )
+    chosen = [markers[k] for k in choose([labels[k] for k in markers])]
     units = "".join(map(str, read.get("UNITS", [])[:1]))
     rates = [float(rate) for rate in read.get("RATE", [])[:1]]
     return RawTracks(
@@ -90,7 +106,24 @@ def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
         unit_key="POINT:UNITS",
         rate_hz=rates[0] if rates and rates[0] > 0 else None,
         rate_key="POINT:RATE",
+        notes=tuple(
+            f"{listed(names)} of POINT:{group} are outputs of a model, not markers: left out"
+            for group in sorted(set(outputs.values()))
+            if (names := [label for label in outputs if outputs[label] == group])
+        ),
     )
+
+
+def _model_outputs(parameters: Mapping[str, NDArray], labels: Sequence[str]) -> dict[str, str]:
+    """Return the parameter that lists it by the label of each point that is computed by a model."""
+    lists = {key: parameters[key] for key in parameters if not key.startswith(_OF_POINTS)}
+    groups = {str(name).strip(): key for key, names in lists.items() for name in names}
+    named = {label: (label, label.rpartition(":")[2]) for label in labels}  # also without subject
+    return {
+        label: next(groups[name] for name in names if name in groups)
+        for label, names in named.items()
+        if not groups.keys().isdisjoint(names)
+    }
 
 
 def _header_counts(content: bytes) -> tuple[int, int | None]:

@@ -43,6 +43,12 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             "this is not a Motive CSV file with markers; expected rows of Type, Name, ID and "
             "Position, then 'Frame,Time (Seconds),X,Y,Z,…'"
         )
+    space, line = header.entries.get("Coordinate Space", ("", first.line))
+    if space.lower() not in ("", "global"):
+        raise InputError(
+            f"Coordinate Space is '{space}'; expected Global: export the markers in the world frame",
+            where=f"line {line}",
+        )
     heads = _column_headings(rows[1:top], rows[top])
     columns = _marker_columns(heads, rows[top].line)
     labels = list(columns)

@@ -126,8 +126,8 @@ def _wide_labels(table: Table) -> list[str]:
         return list(labels)
     raise InputError(
         f"the columns are {_first_columns(header)} ({'; '.join(faults) or 'no markers'}); expected t_s "
-        "and, for each marker, <name>_x, <name>_y, <name>_z; or a C3D, TRC, Qualisys TSV or Motive "
-        "CSV file",
+        "and, for each marker, <name>_x, <name>_y, <name>_z; or a C3D, TRC, Qualisys TSV, Motive or "
+        "Vicon CSV file",
         where="line 1",
     )
 
