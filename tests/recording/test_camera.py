@@ -173,7 +173,48 @@ COLMAP = f"""# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
 1 OPENCV 1280 720 812.3 809.1 642.2 357.7 {" ".join(map(str, BROWN[:4]))}
 """
+CAMODOCAL = f"""%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: front
+image_width: 1280
+image_height: 720
+distortion_parameters:
+   k1: {BROWN[0]}
+   k2: {BROWN[1]}
+   p1: {BROWN[2]}
+   p2: {BROWN[3]}
+projection_parameters:
+   fx: 812.3
+   fy: 809.1
+   cx: 641.7
+   cy: 357.2
+"""
+MATLAB = {
+    "RadialDistortion": [BROWN[0], BROWN[1], BROWN[4]],
+    "TangentialDistortion": BROWN[2:4],
+    "ImageSize": [720, 1280],
+    "WorldUnits": "mm",
+}
+OLD_MATRIX = [[812.3, 0, 0], [0, 809.1, 0], [642.7, 358.2, 1]]
+OPENCV_FISHEYE = OPENCV_YAML.replace(str(BROWN[:5]), str(FISHEYE))
 FILES = {
+    "camodocal": (CAMODOCAL, None, "pinhole", BROWN[:4]),
+    "MATLAB": (
+        json.dumps(MATLAB | {"K": np.transpose(OLD_MATRIX).tolist()}),
+        None,
+        "pinhole",
+        BROWN[:5],
+    ),
+    "MATLAB, older": (
+        json.dumps(MATLAB | {"IntrinsicMatrix": OLD_MATRIX}),
+        None,
+        "pinhole",
+        BROWN[:5],
+    ),
+    "OpenCV fisheye": (OPENCV_FISHEYE + "fisheye_model: 1\n", None, "fisheye", FISHEYE),
+    "OpenCV fisheye as a word": (OPENCV_FISHEYE + "fisheye: yes\n", None, "fisheye", FISHEYE),
+    "OpenCV, no fisheye": (OPENCV_YAML + "fisheye_model: 0\n", None, "pinhole", BROWN[:5]),
     "OpenCV YAML": (OPENCV_YAML, None, "pinhole", BROWN[:5]),
     "OpenCV JSON": (OPENCV_JSON, None, "pinhole", BROWN),
     "ROS": (
@@ -211,6 +252,12 @@ def test_calibration_files_are_recognised_by_their_content(kind: str, tmp_path: 
     np.testing.assert_allclose(read.distortion, distortion)
     assert (read.model, read.size_px) == (model, (1280, 720))
     cs.Camera(read.matrix, read.distortion, model=read.model, size_px=read.size_px)
+
+
+def test_keys_of_a_calibration_that_are_not_understood_are_listed(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.dat"
+    file.write_text(OPENCV_YAML + "wavelength: 3\nsquare_size: 20\n")
+    assert read_calibration(file).unread == ("wavelength",)
 
 
 def test_a_calibration_written_by_opencv_is_read(tmp_path: Path) -> None:
@@ -262,6 +309,11 @@ def test_the_pose_of_an_anipose_camera_is_that_of_opencv(tmp_path: Path) -> None
         ),
         (KALIBR, "cam7", r"cam.dat: found no camera 'cam7'"),
         (KALIBR.replace("equidistant", "fov"), "cam0", r"cam0.distortion_model: found 'fov'"),
+        (OPENCV_YAML + "fisheye_model: 1\n", None, r"at most 4 that are not zero: those of a fis"),
+        (OPENCV_YAML + "fisheye_model: perhaps\n", None, r"fisheye_model: found 'perhaps'; expec"),
+        (OPENCV_YAML + "radial_distortion: [1, 2]\n", None, r"radial_distortion: found \[1, 2\]"),
+        (OPENCV_YAML + "xi: 1.2\n", None, r"xi: found 1.2; expected only matrix, distortion"),
+        (CAMODOCAL.replace("PINHOLE", "MEI"), None, r"model_type: found 'MEI'; expected one of"),
         (COLMAP.replace("OPENCV", "FOV"), None, r"cam.dat: line 3: found FOV; expected one of"),
         (
             ROS_YAML.format(model="plumb_bob", count=14, coefficients=[0.1] * 14),

@@ -34,8 +34,8 @@ class ImageCameraSection(Section, of=Camera):
     Attributes
     ----------
     file : str, optional
-        Calibration of OpenCV, ROS, Kalibr, Anipose or COLMAP; keys of the table replace what it
-        states.
+        Calibration of OpenCV, ROS, Kalibr, Anipose, COLMAP, camodocal or MATLAB; keys of the table
+        replace what it states.
     name : str, optional
         Name or number of the camera in a file of several.
     length_unit : {"m", "cm", "mm", "in"}
@@ -65,6 +65,9 @@ class ImageCameraSection(Section, of=Camera):
             file = existing_file(folder.path, self.file, key=f"{where}.file")
             with located(where=f"{where}.file"):
                 read = read_calibration(file, self.name)
+            if read.unread:
+                keys = ", ".join(read.unread)
+                folder.add_note(f"{self.file}: these keys are not understood: {keys}")
             names = ("matrix", "distortion", "model", "size_px", "pose")
             arguments = {name: getattr(read, name) for name in names}
             if arguments["pose"] is not None:

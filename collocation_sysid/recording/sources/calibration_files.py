@@ -4,6 +4,8 @@
 |---|---|---|
 | OpenCV | YAML with `%YAML:1.0`, XML, JSON | `camera_matrix`, `distortion_coefficients`, `image_width` |
 | OpenCV in Python | .npz | `mtx` and `dist`, or `K` and `D` |
+| camodocal | YAML with `%YAML:1.0` | `model_type: PINHOLE`, `projection_parameters` |
+| MATLAB | JSON of `cameraParameters.toStruct` | `IntrinsicMatrix` or `K`, `RadialDistortion` |
 | ROS `camera_info` | YAML | `camera_matrix`, `distortion_model`; messages `k`, `d`, `width` |
 | a log | `LOG#TOPIC` | messages `k`, `d`, `width` of CameraInfo or Foxglove's CameraCalibration |
 | Kalibr | YAML | `cam0`: `intrinsics`, `distortion_model`, `resolution` |
@@ -60,6 +62,7 @@ LENSES: dict[str, Lens] = {
     "plumb_bob": "pinhole",
     "rational_polynomial": "pinhole",
     "radtan": "pinhole",
+    "pinhole": "pinhole",
     "none": "pinhole",
     "": "pinhole",
     "equidistant": "fisheye",
@@ -78,6 +81,20 @@ COLMAP_MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int, ...], Lens]
     "FULL_OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7, 8, 9, 10, 11), "pinhole"),
     "OPENCV_FISHEYE": ((0, 1, 2, 3), (4, 5, 6, 7), "fisheye"),
 }
+# Words of keys that state the lens: one that is not understood is refused.
+_OF_LENS = re.compile(
+    r"fisheye|disto|lens|model|mirror|^xi$|tilt|prism|radial|tangential|skew|omni|^projectionparam"
+)
+# Other keys without an effect on the lens; those that are not among them are noted.
+_KNOWN_KEYS = re.compile(
+    r"cameraname|name|calibrationtime|calibrationdate|flags?(value)?|n(rof)?frames|board.*|square.*"
+    r"|.*error.*|rms|extrinsic.*|gridpoints|imagepoints|rectificationmatrix|projectionmatrix|r|p"
+    r"|binning.*|roi|header|estimate.*|numradial.*|worldunits|worldpoints|rvecs?|tvecs?|[rt]vectors"
+    r"|rotationvectors|translationvectors|markersize|aspectratio|focallength|principalpoint"
+    r"|version|typeid"
+)
+# MATLAB counts pixels from (1, 1), OpenCV from (0, 0).
+_FIRST_PIXEL_OF_MATLAB = 1.0
 # COLMAP counts pixels from the corner of the image, OpenCV from the centre of the first pixel.
 CORNER_OF_PIXEL = 0.5
 
@@ -94,6 +111,7 @@ class Calibration:
     size_px: tuple[int, int] | None = None
     # (4, 4) or None: transform from the camera to the world of the file; None if it states none.
     pose: Array | None = None
+    unread: tuple[str, ...] = ()  # keys of the file that are not understood
 
 
 def read_calibration(path: str | Path, camera: str | None = None) -> Calibration:
@@ -249,9 +267,10 @@ def _coefficients(numbers: Array, model: Lens, key: str) -> Array:
     flat = numbers.ravel()
     most = 4 if model == "fisheye" else 8
     if flat[most:].any():
+        why = "those of thin prisms and tilted sensors are not supported"
+        why = "those of a fisheye lens" if model == "fisheye" else why
         raise InputError(
-            f"found {len(flat)} coefficients; expected at most {most} that are not zero: those of "
-            "thin prisms and tilted sensors are not supported",
+            f"found {len(flat)} coefficients; expected at most {most} that are not zero: {why}",
             where=key,
         )
     flat = flat[:most]
@@ -268,9 +287,13 @@ def _lens(name: Any, key: str) -> Lens:
     return lens
 
 
+def _plain(key: Any) -> str:
+    return re.sub(r"[_\s-]", "", str(key)).lower()
+
+
 def _value(content: Mapping[str, Any], names: tuple[str, ...]) -> tuple[str, Any]:
     """Return key and value of the first of some names that a table has; "" and None for none."""
-    plain = {re.sub(r"[_\s-]", "", str(key)).lower(): key for key in content}
+    plain = {_plain(key): key for key in content}
     found = next((plain[name] for name in names if name in plain), None)
     return ("", None) if found is None else (str(found), content[found])
 
@@ -294,26 +317,75 @@ def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
 
 
 def _opencv_camera(content: Mapping[str, Any]) -> Calibration:
+    """Return the camera of a file with the keys of OpenCV, ROS, camodocal or MATLAB."""
+    plain = {_plain(key): str(key) for key in content}
     matrix_key, matrix = _value(content, MATRIX_KEYS)
+    key, distortion = _value(content, DISTORTION_KEYS)
+    used = {matrix_key, key}
+    projection_key, projection = _value(content, ("projectionparameters",))
+    if isinstance(projection, Mapping):
+        fx, fy, cx, cy = (projection.get(name) for name in ("fx", "fy", "cx", "cy"))
+        matrix_key, matrix = projection_key, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        key, values = _value(content, ("distortionparameters",))
+        values = values if isinstance(values, Mapping) else {}
+        distortion = [values.get(name, 0) for name in ("k1", "k2", "p1", "p2")]
+        used |= {projection_key, key}
+        if more := values.keys() - {"k1", "k2", "p1", "p2"}:
+            raise InputError(f"found {listed(map(str, more))}; expected k1, k2, p1, p2", where=key)
     if matrix is None:
         raise InputError(
             f"found the keys {listed(list(map(str, content))) or 'none'}; expected the matrix of a "
             "camera as camera_matrix or K, or the cameras of Kalibr or Anipose"
         )
-    model_key, model = _value(content, ("distortionmodel", "cameramodel", "model"))
-    lens = _lens(model, model_key)
-    if content.get("fisheye") is True:
-        lens = "fisheye"
-    key, distortion = _value(content, DISTORTION_KEYS)
     numbers = np.zeros(0) if distortion is None else _numbers(distortion, key)
-    name = _value(content, ("cameraname", "name"))[1]
+    nine = _matrix(matrix, matrix_key)
+    radial_key, radial = _value(content, ("radialdistortion",))
+    if radial_key and distortion is None:
+        tangential_key, tangential = _value(content, ("tangentialdistortion",))
+        key, used = radial_key, used | {radial_key, tangential_key, plain.get("skew", "")}
+        k = np.append(_numbers(radial, radial_key), [0.0, 0.0, 0.0])
+        p = np.append(
+            _numbers([] if tangential is None else tangential, tangential_key), [0.0, 0.0]
+        )
+        numbers = np.array([k[0], k[1], p[0], p[1], k[2]])
+        # Older versions store the transposed matrix.
+        nine = nine.T if _plain(matrix_key) == "intrinsicmatrix" else nine
+        nine = nine - np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]]) * _FIRST_PIXEL_OF_MATLAB
+    model_key, model = _value(content, ("distortionmodel", "cameramodel", "modeltype", "model"))
+    lens = _lens(model, model_key)
+    for flag in [given for name, given in plain.items() if "fisheye" in name]:
+        used.add(flag)
+        lens = "fisheye" if _is_true(content[flag], flag) else lens
+    size_keys = {*WIDTH_KEYS, *HEIGHT_KEYS, *SIZE_KEYS}
+    left = {
+        name: given
+        for name, given in plain.items()
+        if given not in {*used, model_key} and name not in size_keys
+    }
+    for name, given in left.items():
+        if _OF_LENS.search(name) and not _KNOWN_KEYS.fullmatch(name):
+            known = "matrix, distortion, model and size of a pinhole or fisheye camera"
+            raise InputError(f"found {content[given]!r}; expected only {known}", where=given)
+    size = _size(content)
+    if key == radial_key and size is not None and _value(content, SIZE_KEYS)[0]:
+        size = size[::-1]  # rows come first in MATLAB
     return Calibration(
-        str(name or ""),
-        _matrix(matrix, matrix_key),
+        str(_value(content, ("cameraname", "name"))[1] or ""),
+        nine,
         _coefficients(numbers, lens, key),
         lens,
-        _size(content),
+        size,
+        unread=tuple(given for name, given in left.items() if not _KNOWN_KEYS.fullmatch(name)),
     )
+
+
+def _is_true(value: Any, key: str) -> bool:
+    word = str(value).lower()
+    if word in ("true", "1", "yes", "on"):
+        return True
+    if word in ("false", "0", "no", "off", "none", ""):
+        return False
+    raise InputError(f"found {value!r}; expected 0 or 1", where=key)
 
 
 def _kalibr_camera(name: str, content: Mapping[str, Any]) -> Calibration:
@@ -339,7 +411,8 @@ def _kalibr_camera(name: str, content: Mapping[str, Any]) -> Calibration:
 
 def _anipose_camera(key: str, content: Mapping[str, Any]) -> Calibration:
     """Return a camera of Anipose, whose rotation and translation are from world to camera."""
-    lens: Lens = "fisheye" if content.get("fisheye") else "pinhole"
+    is_fisheye = _is_true(content.get("fisheye", False), f"{key}.fisheye")
+    lens: Lens = "fisheye" if is_fisheye else "pinhole"
     distortion = _numbers(content["distortions"], f"{key}.distortions")
     pose = None
     if {"rotation", "translation"} <= content.keys():
