@@ -96,6 +96,9 @@ class FittedExperiment(PredictionErrors):
     # mapping of name to str, or None: units of the custom sensors that state one; None if none
     # does.
     reading_unit: Mapping[str, str] | None = None
+    # mapping of name to str, or None: kinds of the sensors that are images of a camera, such as
+    # "image tracks"; None without any.
+    reading_kind: Mapping[str, str] | None = None
     # mapping of obstacle to FrictionSummary, or None: friction of the obstacles that have some;
     # None without any.
     friction: Mapping[str, FrictionSummary] | None = None
@@ -114,7 +117,9 @@ class FittedExperiment(PredictionErrors):
         for reading, rms in (self.reading_rms or {}).items():
             unit = (self.reading_unit or {}).get(reading, "")
             sigma = quantity((self.reading_sigma or {})[reading], unit)
-            yield f"{reading} of '{name}': {quantity(rms, unit)} RMS (sigma {sigma})"
+            kind = (self.reading_kind or {}).get(reading)
+            what = f"{kind} {reading}" if kind else reading
+            yield f"{what} of '{name}': {quantity(rms, unit)} RMS (sigma {sigma})"
         joules = "J in the modelled part" if is_symmetric else "J"
         for obstacle, friction in (self.friction or {}).items():
             yield (

@@ -291,6 +291,10 @@ def stated_sigmas(experiment: Experiment) -> dict[str, Any]:
         "wrench_sigma_nm": of_torque,
         "reading_sigma": _shown_sigmas(experiment),
         "reading_unit": units_by_name(experiment),
+        "reading_kind": {
+            each.name: each.measurement_text for each in experiment.readings if each.counts_pixels
+        }
+        or None,
     }
 
 

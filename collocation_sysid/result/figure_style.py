@@ -190,19 +190,19 @@ def make_log_axis(axes: Axes) -> None:
     """Make the y axis logarithmic, with plain numbers where these are short (from 0.001 to
     100,000).
 
-    The limits are widened to span at least a ratio of 4, so that at least two numbers are shown.
-    Data must have been drawn before.
+    The limits are widened to span at least a ratio of 4, of numbers that are powers 100, so that at
+    least two numbers are shown. Data must have been drawn before.
     """
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    widen = max(1.0, 4.0 / (high / low)) ** 0.5
-    axes.set_ylim(low / widen, high * widen)
     plain = low > 1e-3 and high < 1e5
-    few = high / low < (1e3 if plain else 30.0)  # powers beside all else are too wide
+    widen = max(1.0, (4.0 if plain else 100.0) / (high / low)) ** 0.5
+    axes.set_ylim(low / widen, high * widen)
+    few = plain and high / low < 1e3  # powers beside all else are too wide
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10 else (1.0, 2.0, 5.0)
     axes.yaxis.set_major_locator(LogLocator(subs=subs if few else (1.0,), numticks=7))
     axes.yaxis.set_minor_locator(NullLocator())
-    if few and plain:
+    if few:
         format_plain_numbers(axes.yaxis)
     else:
         axes.yaxis.set_major_formatter(LogFormatterSciNotation(minor_thresholds=(inf, inf)))

@@ -13,6 +13,8 @@ PICTURE_CAPTIONS = {
     "depth": "Points of a depth camera with the outline of the fitted surface, at up to four samples, "
     "and the distance of each point behind the surface; grey points are not compared.",
     "outline": "Edge of the masks (grey) and contour of the fitted body (red) in up to four images.",
+    "image": "First and worst image of a camera: tracks of the points (grey), contour of the fitted "
+    "body (red), measured points, and enlarged errors of the fit as arrows.",
     "shapes": "The fitted body at several times of the recording; orange: measured markers.",
     "field": "Spatially varying constant between the ends of its 95 % interval; below, a cut "
     "through the body. Pale colours: the data add little to the prior.",
@@ -21,6 +23,7 @@ PICTURE_CAPTIONS = {
     "gap": "Gap between the body's surface and obstacles.",
     "tracks": "Measured, fitted and simulated markers, the residual below.",
     "wrench": "Wrench of a grasp: measured, fitted and simulated.",
+    "pixels": "Image tracks: measured, fitted and simulated pixels.",
     "reading": "Custom sensor: measured, fitted and simulated.",
     "modulus": "Modulus over frequency or time: measured, fitted and simulated.",
     "error": "Distance of the markers from their measurements over time.",
@@ -48,6 +51,7 @@ LEADING_PICTURES = (
     "reading",
     "depth",
     "outline",
+    "image",
 )
 
 

@@ -96,6 +96,26 @@ def image_unit(has_matrix: bool) -> str:
     return "pixels" if has_matrix else "mm"
 
 
+def first_and_worst_images(samples: Array) -> list[int]:
+    """Return the indices of the first image of tracks with a measured point, and of the one with the
+    largest RMS error of the fit, else of the simulation; fewer if they agree or none is compared.
+
+    Parameters
+    ----------
+    samples : (S, 1 + 3m) array
+        Times, and m pixel coordinates as measured, fitted and simulated, see
+        `MotionRecord.readings`.
+    """
+    measured, fitted, simulated = np.split(samples[:, 1:], 3, axis=1)
+    model = fitted if np.isfinite(fitted).any() else simulated
+    seen = np.flatnonzero(np.isfinite(measured).any(axis=1))
+    squares = (model - measured) ** 2
+    known = np.isfinite(squares).sum(axis=1)
+    errors = np.nansum(squares, axis=1) / np.maximum(known, 1)
+    images = [*seen[:1].tolist(), *([int(errors.argmax())] if known.any() else [])]
+    return list(dict.fromkeys(images))
+
+
 @dataclass(frozen=True, eq=False)
 class MotionRecord:
     """Measured, fitted and simulated motion of an experiment at T samples of n nodes and M markers."""
@@ -152,8 +172,9 @@ class MotionRecord:
     # position in the world [m] from column 5, and rows of outlines; `camera_overlays` describes
     # them completely.
     visible_points: Mapping[str, Array] = field(default_factory=dict)
-    # mapping of name to (k, 4): for each camera with outlines, of a few images: time [s], 0 for the
-    # edge of the mask and 1 for the fitted contour of the body, and pixel u, v.
+    # mapping of name to (k, 4): for each camera with outlines or tracks, of a few images: time [s],
+    # 0 for the edge of the mask and 1 for the fitted contour of the body, and pixel u, v; contours
+    # in images of tracks are pieces of lines with NaN after each.
     outlines: Mapping[str, Array] = field(default_factory=dict)
     # mapping of name to str: units of the custom sensors that state one, and of image coordinates,
     # see `image_key`.

@@ -23,6 +23,7 @@ from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..errors import InputError
 from ..features.contact.feature import contact_fields
+from ..features.image_tracks.residual import ImageTrackResidual
 from ..features.measurements import recorded_series
 from ..features.outlines.outlines import edge_pixels
 from ..features.outlines.residual import OutlinesResidual
@@ -33,7 +34,7 @@ from ..runs.result_builder import build_result
 from ..runs.result_content import Result
 from ..runs.solved_problem import SolvedProblem
 from .element_fields import ElementFields
-from .replay import MotionRecord
+from .replay import MotionRecord, first_and_worst_images
 from .run_writers import replaced_folder, write_frames
 
 REFINEMENT_FILE = "refinement.json"
@@ -164,8 +165,8 @@ def _result_text(result: Result) -> str:
 def write_pictures(
     finished: SolvedProblem, result: Result, folder: Path, say: Callable[[str], None]
 ) -> None:
-    """Draw all pictures of a run, including the Jacobian's structure, and write them into its
-    folder as PNG files; existing ones are replaced.
+    """Draw all pictures of a run, including the structure of the Jacobian unless that of a
+    specimen, and write them into its folder as PNG files; existing ones are replaced.
 
     Parameters
     ----------
@@ -187,8 +188,10 @@ def write_pictures(
     from .pictures import all_pictures, jacobian_sparsity, save_pictures
 
     solution = finished.solution
-    jacobian = jacobian_sparsity(solution.collocation, solution.z)
-    save_pictures(folder, all_pictures(replays(finished), result) | {"jacobian": jacobian}, say=say)
+    pictures = all_pictures(replays(finished), result)
+    if solution.collocation.transcriptions[0].experiment.specimen is None:
+        pictures["jacobian"] = jacobian_sparsity(solution.collocation, solution.z)
+    save_pictures(folder, pictures, say=say)
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
@@ -200,8 +203,8 @@ def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
 
 
 def write_all_frames(finished: SolvedProblem, place: Path) -> None:
-    """Write the ParaView frames of every fitted experiment, see `write_frames`; existing ones are
-    replaced.
+    """Write the ParaView frames of every fitted experiment with a mesh, see `write_frames`; existing
+    ones are replaced.
 
     With several fitted experiments each has a subfolder of its name, which is made if missing.
     Besides the data of `write_frames` and `_constant_cell_data`, the frames have the residuals of
@@ -219,6 +222,8 @@ def write_all_frames(finished: SolvedProblem, place: Path) -> None:
     """
     for part in finished.solution.parts:
         transcription = part.transcription
+        if transcription.experiment.specimen is not None:
+            continue
         positions = part.x.reshape(len(part.x), -1, 3)
         here = place if len(finished.solution.parts) == 1 else place / transcription.experiment.name
         here.mkdir(exist_ok=True)
@@ -279,6 +284,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _visible_points(finished, experiment)
             contours = _outlines(finished, experiment.name)
+            contours |= _contours_of_tracks(finished, experiment.name, replay)
             collected.append(
                 replace(replay, fields=of_cells, visible_points=of_cameras, outlines=contours)
             )
@@ -310,6 +316,26 @@ def _outlines(finished: SolvedProblem, experiment: str) -> dict[str, Array]:
             for kind, pixels in enumerate((edge_pixels(mask), contours[k])):
                 column = np.ones((len(pixels), 1))
                 rows.append(np.hstack([residual.t_s[k] * column, kind * column, pixels]))
+        rows_by_camera[residual.sensor.name] = np.vstack(rows)
+    return rows_by_camera
+
+
+def _contours_of_tracks(
+    finished: SolvedProblem, experiment: str, replay: MotionRecord
+) -> dict[str, Array]:
+    """Return fitted contours (k, 4) in the first and in the worst image of tracks of each camera."""
+    part = finished.solution.part_of(experiment)
+    if part is None:
+        return {}
+    rows_by_camera = {}
+    for residual in part.transcription.residuals_of(ImageTrackResidual):
+        samples = replay.readings[residual.sensor.name]
+        images = first_and_worst_images(samples)
+        rows = [np.zeros((0, 4))]
+        for k in images:
+            pixels = residual.contour_px(k, part.x, part.phi)
+            column = np.ones((len(pixels), 1))
+            rows.append(np.hstack([samples[k, 0] * column, column, pixels]))
         rows_by_camera[residual.sensor.name] = np.vstack(rows)
     return rows_by_camera
 

@@ -65,6 +65,8 @@ SHOWN_REMEDIES = ("platen_slip",)
 SMALLEST_SHOWN_SHARE = 0.01
 # Moduli of which the most important is the first.
 STIFFNESS_NAMES = ("young_pa", "mu_pa", "kappa_pa", "lambda_pa")
+# Beginnings of the codes of reasons that the residuals are no noise of the stated size.
+REASONS_OF_RESIDUALS = ("noise/", "residuals/", "specimen/law", "specimen/persist")
 # Smallest relative correction of an estimate that is stated.
 SMALLEST_CORRECTION = 0.005
 # Posterior over prior deviation of an effect from which on the data do not see it.
@@ -95,9 +97,7 @@ def run_report(run: str | Path) -> TitledParts:
     result = Result.read(run)
     with damaged_run_refused(run):
         verdict = verdict_section(result.trust, linked=True)
-        took = (
-            f" {result.method}, {result.iterations} iterations; {_elapsed_text(result.elapsed_s)}"
-        )
+        took = f" {result.method}, {result.iterations} iterations"
         badge = Span(result.status, f"badge {result.trust.verdict}")
         pictures = captioned_pictures(run)
         meaning = Line(f"{VERDICT_MEANINGS[result.trust.verdict]}.", "quiet")
@@ -250,7 +250,7 @@ def _largest_contributions(result: Result) -> list[str]:
         if each.combined_std_error and each.statistical_std_error and name in result.budget
     }
     systematic = {name: ratio for name, ratio in ratios.items() if ratio > SYSTEMATIC_RATIO}
-    sentences = []
+    names_by_sources: dict[str, list[str]] = {}
     remedies = []
     for name in sorted(systematic, key=lambda name: -systematic[name])[:SHOWN_BUDGETS]:
         shares = list(result.budget[name].items())[:SHOWN_SOURCES]
@@ -260,10 +260,11 @@ def _largest_contributions(result: Result) -> list[str]:
         sources = ", ".join(
             f"{source_label(s)} {share:.0%}" for s, share in shares if share > SMALLEST_SHOWN_SHARE
         )
-        sentences.append(
-            f"largest contributions to the combined uncertainty of {symbol_of(name)}: {sources}"
-        )
-    return sentences + [
+        names_by_sources.setdefault(sources, []).append(symbol_of(name))
+    return [
+        f"largest contributions to the combined uncertainty of {listed(names)}: {sources}"
+        for sources, names in names_by_sources.items()
+    ] + [
         f"to reduce the contribution of {source_label(source)}: {remedy_for(source)}"
         for source in remedies
     ]
@@ -509,8 +510,18 @@ def millimetres_text(metres: float) -> str:
 
 
 def notes_section(result: Result) -> TitledParts:
-    """Return the notes of a run as a section."""
-    return TitledParts("Notes", tuple(f"note: {note}" for note in result.notes))
+    """Return the notes of a run as a section, without those that the reasons of the verdict and the
+    remarks on the parameters state already.
+    """
+    codes = [concern.code for concern in result.trust.concerns]
+    is_judged = any(code.startswith(REASONS_OF_RESIDUALS) for code in codes)
+    stated = {each.statement() for each in result.combinations}
+    notes = [
+        note
+        for note in result.notes
+        if note not in stated and not (is_judged and note.startswith("the residuals "))
+    ]
+    return TitledParts("Notes", tuple(f"note: {note}" for note in notes))
 
 
 # What the page alone has --------------------------------------------------------------------------
@@ -520,15 +531,18 @@ def _cards(result: Result) -> Cards:
     values = result.estimates
     fit = result.fit
     simulated = result.rollout
-    name = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))
-    interval = values[name].combined95
-    factor, unit = _readable_unit(result, name)
-    value = f"{number(factor * values[name].value, 4)} {unit}"
-    known = "no error bar"
-    if interval is not None:
-        low, high = (number(factor * end, 4) for end in interval)
-        known = f"{low} to {high} (95 %)"
-    cards = [(symbol_of(name), value.strip(), known)]
+    first = next((key for key in STIFFNESS_NAMES if key in values), next(iter(values)))
+    free = (name for name, each in result.parameters.items() if not each.fixed)
+    cards = []
+    for name in dict.fromkeys((first, *free)):
+        interval = values[name].combined95
+        factor, unit = _readable_unit(result, name)
+        value = f"{number(factor * values[name].value, 4)} {unit}"
+        known = "no error bar"
+        if interval is not None:
+            low, high = (number(factor * end, 4) for end in interval)
+            known = f"{low} to {high} (95 %)"
+        cards.append((symbol_of(name), value.strip(), known))
     if any(each.samples for each in fit.experiments.values()):
         alone = f"RMS; expected from noise alone: {millimetres(fit.noise_rms_m)}"
         cards.append(("markers, fitted", millimetres(fit.rms_m), alone))

@@ -580,13 +580,13 @@ def bench(measured_axes: tuple[int, ...] = (2,)) -> MotionRecord:
 
 def test_a_bench_is_drawn_as_force_over_displacement():
     pictures = with_unique_names(experiment_pictures(bench()))
-    (axes,) = pictures["force_displacement_hung_cube"].axes
+    axes, errors = pictures["force_displacement_hung_cube"].axes
     lines = {line.get_label(): line.get_xydata() for line in axes.lines}
     assert lines.keys() == {"measured", "measured, unloading", "fitted"}
     for label, stiffness in (("measured", 1.0), ("measured, unloading", 1.0), ("fitted", 1.1)):
         np.testing.assert_allclose(lines[label][:, 1], stiffness * lines[label][:, 0], atol=1e-12)
     assert lines["measured"][:, 0].max() > 0
-    assert axes.get_xlabel() == "displacement [mm]"
+    assert errors.get_xlabel() == "displacement [mm]"
     assert axes.get_ylabel() == "force [N]"
 
 

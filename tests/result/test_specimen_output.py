@@ -49,3 +49,14 @@ def test_an_undetermined_parameter_is_stated_once(folder):
     assert limit.startswith("not determined: μ₂; variance of μ₂")
     assert "to reduce noise" in limit
     assert "mu_2_pa" not in outcome.out
+
+
+@pytest.mark.long
+def test_a_homogeneous_specimen_has_no_frames_and_no_jacobian(folder):
+    text = PROBLEM.replace("ogden-2", "neo-hookean").split("[parameters]")[0]
+    text += "[parameters]\nmu_pa = {}\nkappa_pa = 1e9\n[[experiment]]" + PROBLEM.split("ment]]")[1]
+    (folder / "problem.toml").write_text(text)
+    run_command("solve", folder / "problem.toml", "--out", folder / "run")
+    names = {file.name for file in (folder / "run").rglob("*")}
+    assert "stress_pull.png" in names
+    assert not names & {"frames", "trajectory.pvd", "jacobian.png"}

@@ -26,7 +26,7 @@ from ...program.measurement_model import CorrespondenceModel
 from ...program.measurement_residual import GROUP, RowStencil
 from ...program.observables import PointPositions
 from ...recording.nuisance import cayley_rotation
-from .camera_images import POSE_UNKNOWNS, CameraImagesResidual
+from .camera_images import LEAST_DEPTH_M, POSE_UNKNOWNS, CameraImagesResidual
 from .places import TrackedPlaces
 from .tracks import WALK_TERMS, ImageTracks, place_labels
 
@@ -98,6 +98,44 @@ class ImageTrackResidual(CameraImagesResidual):
         pose[:3, 3] -= pose[:3, :3] @ turned.T @ errors[3:]
         pose[:3, :3] = pose[:3, :3] @ turned.T
         return pose
+
+    def contour_px(self, k: int, x: Array, phi: Array) -> Array:
+        """Return the contour of the body in the image with index k, as pixels (P, 2) of pieces of
+        lines with NaN after each, at rows x (rows, 3n) and φ (k,); hidden pieces are contained.
+        """
+        names = list(self.sensor.camera_unknowns(self.experiment))
+        values = (phi * self.nuisance.scales)[self.own_parameters[0]].tolist()
+        errors = dict(zip(names, values, strict=False))
+        since_s = self.t_s[k] - self.t_s[0]
+        at_s = self.t_s[k] + errors.get("delay_s", 0.0) + errors.get("clock_rate", 0.0) * since_s
+        times = self.observable_s[: len(x)]
+        after = int(np.clip(np.searchsorted(times, at_s), 1, max(len(times) - 1, 1)))
+        before, after = after - 1, min(after, len(times) - 1)
+        step_s = max(float(times[after] - times[before]), 1e-12)
+        share = float(np.clip((at_s - times[before]) / step_s, 0.0, 1.0))
+        shape_m = ((1 - share) * x[before] + share * x[after]).reshape(-1, 3)
+        turn, shift = (
+            np.array([errors.get(name, 0.0) for name in part])
+            for part in (POSE_UNKNOWNS[:3], POSE_UNKNOWNS[3:])
+        )
+        turned = np.array(ca.DM(cayley_rotation(ca.SX(ca.DM(turn)))))
+        found = self.correspondences
+        own = (shape_m - found.translations[k]) @ found.rotations[k] @ turned.T + shift
+        triangles = self.experiment.body.mesh.surface
+        corners = own[triangles]
+        if (corners[..., 2] <= LEAST_DEPTH_M).any():
+            return np.full((1, 2), np.nan)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        is_facing = np.einsum("fi,fi->f", normals, corners[:, 0]) < 0
+        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        ends, which = np.unique(edges, axis=0, return_inverse=True)
+        facing = np.bincount(which.ravel(), np.repeat(is_facing, 3), minlength=len(ends))
+        camera = self.sensor.camera
+        matrix = camera.require_matrix().copy()
+        matrix[:2, :2] *= 1 + errors.get("focal_error", 0.0)
+        matrix[:2, 2] += [errors.get("centre_u_px", 0.0), errors.get("centre_v_px", 0.0)]
+        pixels = replace(camera, matrix=matrix).distorted_pixels(own)[ends[facing == 1]]
+        return np.pad(pixels, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 2)
 
     @property
     def observable_sigmas(self) -> Array:

@@ -18,7 +18,7 @@ from ...recording.specimen import is_harmonic, is_relaxation
 from ...runs.result_content import Result
 from ..figure_style import RESOLUTION_DPI, own_settings
 from ..replay import MotionRecord, damaged_run_refused, read_run
-from .cameras import camera_pictures
+from .cameras import camera_pictures, is_of_tracks
 from .confidence import (
     Confidence,
     budget_picture,
@@ -147,7 +147,9 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         names = replay.reading_columns.get(name, names)
         unit = replay.reading_units.get(name)
         units = [unit] * places if unit else []
-        yield (f"reading_{replay.name}_{name}", sensor_picture(values, names, units=units))
+        is_tracks = is_of_tracks(replay.outlines.get(name))
+        kind = "pixels" if is_tracks else "reading"
+        yield (f"{kind}_{replay.name}_{name}", sensor_picture(values, names, units=units))
     yield from camera_pictures(replay)
     if replay.has_shapes():
         yield f"shapes_{replay.name}", shapes_picture(replay)

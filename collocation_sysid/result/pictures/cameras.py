@@ -14,12 +14,18 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
-from ..figure_style import PAGE_MM, SMALL_PT, VERMILION
-from ..replay import MotionRecord, image_key
+from ..figure_style import BLACK, BLUE, PAGE_MM, SMALL_PT, VERMILION
+from ..replay import MotionRecord, first_and_worst_images, image_key
+from .scene import round_length
 
 # Beginnings of the names of pictures.
 KIND = "depth"
 OUTLINE_KIND = "outline"
+TRACKS_KIND = "image"
+# Length of the longest arrow of an error, as a share of the extent of the points.
+ARROW_SHARE = 0.12
+# Share of the extent of the points that is shown beside them.
+TRACKS_MARGIN = 0.08
 # Name of the points in the legend of a film.
 LEGEND_ENTRY = "depth image"
 # Millimetres in an inch, the unit of lengths in Matplotlib.
@@ -41,14 +47,81 @@ OUTLINE_MARGIN = 0.5
 
 
 def camera_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
-    """Yield name and picture of the images of each camera, named "depth_<experiment>_<camera>", or
-    "outline_<experiment>_<camera>" for masks.
+    """Yield name and picture of the images of each camera, named "depth_<experiment>_<camera>",
+    "outline_<experiment>_<camera>" for masks, or "image_<experiment>_<camera>" for tracks.
     """
     for name, rows in replay.visible_points.items():
         unit = replay.reading_units.get(image_key(name), "")
         yield f"{KIND}_{replay.name}_{name}", depth_picture(rows, unit)
     for name, rows in replay.outlines.items():
-        yield f"{OUTLINE_KIND}_{replay.name}_{name}", outline_picture(rows)
+        if is_of_tracks(rows) and name in replay.readings:
+            yield f"{TRACKS_KIND}_{replay.name}_{name}", tracks_picture(rows, replay.readings[name])
+        else:
+            yield f"{OUTLINE_KIND}_{replay.name}_{name}", outline_picture(rows)
+
+
+def is_of_tracks(rows: Array | None) -> bool:
+    """Return whether rows of `MotionRecord.outlines` are contours alone, as those of tracks."""
+    return rows is not None and {*rows[:, 1].tolist()} == {1.0}
+
+
+def tracks_picture(rows: Array, samples: Array) -> Figure:
+    """Return a figure of the first and of the worst image of a camera: tracks of the points up to
+    its time, fitted contour of the body, measured points, and enlarged errors of the fit as arrows.
+
+    Parameters
+    ----------
+    rows : (k, 4) array
+        Contours, see `MotionRecord.outlines`.
+    samples : (S, 1 + 3m) array
+        Times, and pixel coordinates as measured, fitted and simulated.
+    """
+    images = first_and_worst_images(samples)
+    if not images:
+        return _sentence_figure("no image has a point")
+    t_s = samples[:, 0]
+    measured, fitted, simulated = (
+        part.reshape(len(samples), -1, 2) for part in np.split(samples[:, 1:], 3, axis=1)
+    )
+    model = fitted if np.isfinite(fitted).any() else simulated
+    errors = model - measured
+    low, high = np.nanmin(measured, axis=(0, 1)), np.nanmax(measured, axis=(0, 1))
+    lines = rows[:, 2:][np.isfinite(rows[:, 2:]).all(axis=1)]
+    if len(lines):
+        low, high = np.minimum(low, lines.min(axis=0)), np.maximum(high, lines.max(axis=0))
+    extent = float(max(*(high - low), 1.0))
+    largest = float(np.nanmax(np.abs(errors[images]), initial=0.0))
+    factor = max(1.0, round_length(ARROW_SHARE * extent / largest)) if largest else 1.0
+    room = TRACKS_MARGIN * extent
+    shown = np.pad(np.array([low - room, high + room]), ((0, 0), (1, 0)))
+    axes, _ = _new_panels(shown, np.array(images), rows=1)
+    for number, (panel, k) in enumerate(zip(axes[0], images, strict=True)):
+        for point in range(measured.shape[1]):
+            panel.plot(*measured[: k + 1, point].T, color="0.75", lw=0.8, zorder=1)
+        contour = rows[np.isclose(rows[:, 0], t_s[k]), 2:]
+        panel.plot(*contour.T, color=VERMILION, lw=0.8, zorder=2, label="fitted contour")
+        panel.plot(*measured[k].T, "o", ms=2.5, color=BLACK, zorder=3, label="measured")
+        known = np.isfinite(errors[k]).all(axis=1)
+        panel.quiver(
+            *measured[k, known].T, *(factor * errors[k, known]).T, color=BLUE, zorder=4,
+            angles="xy", scale_units="xy", scale=1, width=0.006, label=f"error of the fit × {factor:g}",
+        )  # fmt: skip
+        rms = float(np.sqrt(np.mean(errors[k, known] ** 2))) if known.any() else np.nan
+        which = "first" if number == 0 else "worst"
+        which = "first and worst" if len(images) == 1 and known.any() else which
+        panel.set_title(f"{which} image, t = {t_s[k]:.4g} s: {rms:.2g} px RMS", fontsize=SMALL_PT)
+        panel.set(xlim=(low[0] - room, high[0] + room), ylim=(high[1] + room, low[1] - room))
+        panel.set(aspect="equal")
+        panel.tick_params(labelsize=SMALL_PT, width=0.6)
+        panel.set_xlabel("u [px]", fontsize=SMALL_PT)
+    axes[0, 0].set_ylabel("v [px]", fontsize=SMALL_PT)
+    figure = axes[0, 0].figure
+    figure.set_figheight(figure.get_figheight() + TITLE_HEIGHT_INCH)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=3, fontsize=SMALL_PT, frameon=False
+    )
+    return figure
 
 
 def outline_picture(rows: Array) -> Figure:

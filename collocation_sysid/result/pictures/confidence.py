@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -40,6 +42,15 @@ JOINT_RADIUS = float(np.sqrt(chi2_isf(0.05, 2)) / normal_isf(0.025))
 MAX_HALF_WIDTH = np.log(1e3)
 # Deviation of a logarithm beyond which axes show factors instead of percent.
 FACTOR_THRESHOLD = 1.0
+
+
+# Width of a letter of a label and of a cell of the correlations [mm], and most letters of a label
+# that is not turned.
+LETTER_MM = 1.7
+CELL_MM = 7.0
+LONGEST_FLAT = 4
+# Most letters in a line of the labels of combinations.
+LABEL_WIDTH = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +181,16 @@ def correlation_matrix(confidence: Confidence) -> Figure:
     """
     correlation = correlation_from_covariance(confidence.covariance)
     count = len(confidence.names)
-    figure = framed_figure(64, 52, left_mm=8, right_mm=7, foot_mm=6, top_mm=5)
+    # Cells for numbers of two digits, and room for labels with the names of regions.
+    symbols = [symbol_as_mathtext(name) for name in confidence.names]
+    longest = max(len(symbol_of(name)) for name in confidence.names)
+    label_mm = max(8.0, 4 + LETTER_MM * longest)
+    cells_mm = max(41.0, CELL_MM * count)
+    upright = longest > LONGEST_FLAT
+    figure = framed_figure(
+        label_mm + cells_mm + 15, cells_mm + 5 + (label_mm if upright else 6), left_mm=label_mm,
+        right_mm=7, foot_mm=label_mm if upright else 6, top_mm=5,
+    )  # fmt: skip
     axes, bar_axes = figure.subplots(1, 2, width_ratios=(1, 0.06), gridspec_kw={"wspace": 0.06})
     image = axes.imshow(correlation, cmap="PuOr", vmin=-1, vmax=1)
     for (i, j), value in np.ndenumerate(correlation):
@@ -178,10 +198,9 @@ def correlation_matrix(confidence: Confidence) -> Figure:
             j, i, f"{value:.2f}".replace("-", "−"), ha="center", va="center",
             fontsize=SMALL_PT, color="white" if abs(value) > 0.65 else BLACK,
         )  # fmt: skip
-    symbols = [symbol_as_mathtext(name) for name in confidence.names]
     style_axes(axes, "correlation")
     axes.grid(False)
-    axes.set_xticks(range(count), symbols, fontsize=TEXT_PT)
+    axes.set_xticks(range(count), symbols, fontsize=TEXT_PT, rotation=90 if upright else 0)
     axes.set_yticks(range(count), symbols, fontsize=TEXT_PT)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
@@ -212,10 +231,13 @@ def combinations_picture(alone: Mapping[str, float], directions: Sequence[Direct
         Combinations, the best determined first.
     """
     rows = [(symbol_of(name), factor) for name, factor in alone.items()]
-    rows += [(each.label, each.factor) for each in directions]
-    longest = max(len(text) for text, _ in rows)
+    rows += [(each.formula(), each.factor) for each in directions]
+    rows = [(_folded(text), factor) for text, factor in rows]
+    longest = max(len(line) for text, _ in rows for line in text.splitlines())
+    left_mm = 6 + LETTER_MM * longest
+    lines = len(rows) * (1 + 0.45 * max(text.count("\n") for text, _ in rows))
     figure = framed_figure(
-        COLUMN_MM, 16 + 6 * len(rows), left_mm=min(45.0, 6 + 1.5 * longest), right_mm=5, foot_mm=11,
+        max(COLUMN_MM, left_mm + 45), 16 + 6 * lines, left_mm=left_mm, right_mm=5, foot_mm=11,
         top_mm=4,
     )  # fmt: skip
     axes = figure.subplots()
@@ -236,6 +258,13 @@ def combinations_picture(alone: Mapping[str, float], directions: Sequence[Direct
     axes.set_yticks(range(len(rows)), [text for text, _ in rows], fontsize=SMALL_PT)
     axes.grid(False, axis="y")
     return figure
+
+
+def _folded(text: str) -> str:
+    """Return a formula in lines of at most `LABEL_WIDTH` letters, which begin with an operator."""
+    whole = text.replace(" ", "\u00a0")
+    parts = re.sub(r"\u00a0([·/+]|\S+,)\u00a0", " \\1\u00a0", whole)
+    return textwrap.fill(parts, LABEL_WIDTH, break_long_words=False)
 
 
 # Smallest share of a variance with a colour of its own; smaller ones are drawn together, and so are

@@ -36,7 +36,8 @@ _STAGE_COLOUR = "#808080"
 
 def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None) -> Figure:
     """Return a figure of misfit, loss, violation of the equations of motion, and parameters
-    against the iteration number; values that are not positive are left out.
+    against the iteration number; values that are not positive are left out, and quantities without
+    any others, such as the violation of a specimen.
 
     Parameters
     ----------
@@ -50,16 +51,22 @@ def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None
     KeyError
         If one of the parameters is missing in an iteration.
     """
-    figure = framed_figure(COLUMN_MM, 132, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
-    heights = (1.0, 1.0, 1.0, 0.2, 1.4)  # a gap for the legend
-    grid = figure.add_gridspec(5, 1, height_ratios=heights, hspace=0.12)
-    panels = [figure.add_subplot(grid[row]) for row in (0, 1, 2, 4)]
     numbers = [iteration.number for iteration in history]
-    curves = (
-        ("misfit [σ]", [i.misfit for i in history], BLUE),
-        ("loss", [i.loss for i in history], BLUE),
-        ("violation [N]", [i.violation_n for i in history], VERMILION),
-    )
+    curves = [
+        (label, values, colour)
+        for label, values, colour in (
+            ("misfit [σ]", [i.misfit for i in history], BLUE),
+            ("loss", [i.loss for i in history], BLUE),
+            ("violation [N]", [i.violation_n for i in history], VERMILION),
+        )
+        if label == "loss" or np.isfinite(_positive_or_nan(values)).any()
+    ]
+    count = len(curves)
+    height_mm = 48 + 28 * count
+    figure = framed_figure(COLUMN_MM, height_mm, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
+    heights = (*[1.0] * count, 0.2, 1.4)  # a gap for the legend
+    grid = figure.add_gridspec(count + 2, 1, height_ratios=heights, hspace=0.12)
+    panels = [figure.add_subplot(grid[row]) for row in (*range(count), count + 1)]
     rungs = _continuation_stages(history)
     for axes, (label, values, colour) in zip(panels, curves, strict=False):
         for part in rungs:
@@ -67,14 +74,14 @@ def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None
             axes.plot(numbers[part], _positive_or_nan(values[part]), "o-", **style)
         style_axes(axes, "", xlabel="", ylabel=label)
         make_log_axis(axes)
-    _mark_continuation_stages(panels[:3], history, stages=rungs)
+    _mark_continuation_stages(panels[:-1], history, stages=rungs)
     drawn = list(history[0].parameters) if names is None and history else list(names or ())
-    _draw_parameters(panels[3], history, names=drawn)
-    panels[3].set_xlabel("iteration", fontsize=TEXT_PT)
+    _draw_parameters(panels[-1], history, names=drawn)
+    panels[-1].set_xlabel("iteration", fontsize=TEXT_PT)
     for axes in panels:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.yaxis.set_label_coords(-0.145, 0.5)
-        axes.tick_params(labelbottom=axes is panels[3])
+        axes.tick_params(labelbottom=axes is panels[-1])
     return figure
 
 

@@ -5,6 +5,7 @@ force over displacement, measured, fitted and simulated.
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -17,7 +18,9 @@ from .over_time import drawn_models
 STRESS_UNITS = (("MPa", 1e-6), ("kPa", 1e-3), ("Pa", 1.0))
 # Largest measured value, in a readable unit, from which on that unit is used.
 READABLE = 1.0
-HEIGHT_MM = 62
+HEIGHT_MM = 76
+# Colour of measured dots, behind the fit.
+GREY = "#8A8A8A"
 # Component of a unit vector below which a direction does not count as having it.
 DIRECTION_TOLERANCE = 1e-3
 # Share of the largest strain or displacement by which it must reverse to count as unloading.
@@ -53,20 +56,23 @@ def harmonic_picture(strain: Array, t_s: Array, samples: Array) -> Figure:
     moduli_pa = samples[1:, 1:].reshape(-1, 2, 3) / strain[1::2, None, None] * [[[1], [-1]]]
     frequency_hz = 0.25 / np.diff(t_s)[::2]
     unit, factor = _readable_unit(moduli_pa, "Pa")
-    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=13)
-    axes = figure.subplots()
+    figure, axes, below = _two_panels()
     order = np.argsort(frequency_hz)
     for part, (title, marker) in enumerate((("storage", "o"), ("loss", "s"))):
         measured, fitted, simulated = factor * moduli_pa[order, part].T
-        dots = {"ls": "", "marker": marker, "ms": 3, "mec": BLACK, "mew": 0.5, "zorder": 3}
-        fill = "white" if part else BLACK
+        dots = {"ls": "", "marker": marker, "ms": 3, "mec": GREY, "mew": 0.7, "zorder": 1}
+        fill = "white" if part else GREY
         axes.plot(frequency_hz[order], measured, label=f"{title}, measured", mfc=fill, **dots)
         models = (each if np.isfinite(each).any() else None for each in (fitted, simulated))
         for label, values, style in drawn_models(*models):
-            axes.plot(frequency_hz[order], values, label="" if part else label, **style)
-    style_axes(axes, "", xlabel="frequency [Hz]", ylabel=f"modulus [{unit}]")
+            axes.plot(frequency_hz[order], values, label="" if part else label, zorder=3, **style)
+            apart = 100 * (values / measured - 1)
+            below.plot(frequency_hz[order], apart, marker=marker, mfc=fill, ms=2.4, **style)
+    style_axes(axes, "", xlabel="", ylabel=f"modulus [{unit}]")
+    style_axes(below, "", xlabel="frequency [Hz]", ylabel="error [%]")
     axes.set_xscale("log")
     axes.set_yscale("log")
+    _finish(below)
     add_legend_above(axes, columns=2)
     return figure
 
@@ -77,7 +83,8 @@ def relaxation_picture(strain: Array, t_s: Array, samples: Array) -> Figure:
     unit, factor = _readable_unit(moduli_pa, "Pa")
     label = f"relaxation modulus [{unit}]"
     figure = _curve(t_s[2:], factor * moduli_pa, xlabel="time [s]", ylabel=label)
-    figure.axes[0].set_xscale("log")
+    for axes in figure.axes:
+        axes.set_xscale("log")
     return figure
 
 
@@ -106,25 +113,44 @@ def force_picture(travel_m: Array, t_s: Array, samples: Array) -> Figure | None:
 
 
 def _curve(at: Array, columns: Array, xlabel: str, ylabel: str) -> Figure:
-    """Draw measured, fitted and simulated values (S, 3); measurements while unloading are open."""
-    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=13)
-    axes = figure.subplots()
+    """Draw measured, fitted and simulated values (S, 3), and model minus measurement below;
+    measurements while unloading are open.
+    """
+    figure, axes, below = _two_panels()
     measured, fitted, simulated = columns.T
     unloads = is_unloading(at)
-    dots = {"ls": "", "marker": "o", "ms": 2.4, "mec": BLACK, "mew": 0.5, "zorder": 3}
+    dots = {"ls": "", "marker": "o", "ms": 2.4, "mec": GREY, "mew": 0.5, "zorder": 1}
     for label, there, fill in (
-        ("measured", ~unloads, BLACK),
+        ("measured", ~unloads, GREY),
         ("measured, unloading", unloads, "white"),
     ):
         if np.isfinite(measured[there]).any():
             axes.plot(at[there], measured[there], label=label, mfc=fill, **dots)
     models = (each if np.isfinite(each).any() else None for each in (fitted, simulated))
     for label, values, style in drawn_models(*models):
-        axes.plot(at, values, label=label, **style)
-    style_axes(axes, "", xlabel=xlabel, ylabel=ylabel)
+        axes.plot(at, values, label=label, zorder=3, **style)
+        below.plot(at, values - measured, **style)
+    style_axes(axes, "", xlabel="", ylabel=ylabel)
+    style_axes(below, "", xlabel=xlabel, ylabel="error")
+    _finish(below)
     axes.yaxis.set_major_locator(MaxNLocator(5))
     add_legend_above(axes, columns=2)
     return figure
+
+
+def _two_panels() -> tuple[Figure, Axes, Axes]:
+    """Return a figure with the panel of a curve, and below it that of its errors."""
+    figure = framed_figure(COLUMN_MM, HEIGHT_MM, left_mm=15, right_mm=2, foot_mm=9.5, top_mm=13)
+    spaces = {"hspace": 0.1}
+    axes, below = figure.subplots(2, sharex=True, height_ratios=(3, 1), gridspec_kw=spaces)
+    below.axhline(0.0, color=BLACK, lw=0.6)
+    return figure, axes, below
+
+
+def _finish(below: Axes) -> None:
+    below.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
+    reach = max(map(abs, below.get_ylim()))
+    below.set_ylim(-reach, reach)
 
 
 def is_unloading(at: Array) -> NDArray[np.bool_]:
