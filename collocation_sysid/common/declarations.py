@@ -35,7 +35,7 @@ class Key:
     form: Any
     # Conversion from the value in the file to the field; None: the value itself. For a key that
     # names a file, from its path to times and values of a table.
-    read: Callable[[Any], Any] | None = None
+    read: Callable[..., Any] | None = None
     # For a key that names a file with a table: the field whose key states a constant instead; None
     # for all other keys.
     constant: str | None = None
@@ -60,7 +60,7 @@ def key(
     form: Any = None,
     *,
     converter: Callable[[S], T] | None = None,
-    read: Callable[[Any], Any] | None = None,
+    read: Callable[..., Any] | None = None,
     accepted: Any = None,
     metadata: Mapping[str, Any] | None = None,
     **field_options: Any,

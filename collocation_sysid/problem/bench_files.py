@@ -11,12 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
 from ..recording import Experiment, Grasp, Wrench
 from ..recording.sources.columns import (
+    ANGLE,
     DISPLACEMENT,
     DISPLACEMENTS,
     FORCE,
@@ -25,6 +27,7 @@ from ..recording.sources.columns import (
     STRAIN,
     STRESS,
     TIME,
+    TORQUE,
     TORQUES,
     Quantity,
     name_and_unit,
@@ -153,15 +156,22 @@ def add_displacement(
     InputError
         If the table already has a column of that name with other values.
     """
-    shifts_m = layout.sign / layout.scale * grasp.poses.at(table.t_s)[1]
+    factor = layout.sign / layout.scale
+    rotations, translations_m = grasp.poses.at(table.t_s)
+    centre_m = np.zeros(3) if layout.point_m is None else np.array(layout.point_m)
+    shifts_m = factor * (translations_m + rotations @ centre_m - centre_m)
+    turns = Rotation.from_matrix(rotations).as_rotvec()[:, "xyz".index(layout.axis)]
     displacement_m = shifts_m[:, "xyz".index(layout.axis)]
     values = {"displacement": displacement_m, **dict(zip("xyz", shifts_m.T, strict=True))}
+    values["angle"] = factor * np.unwrap(turns)
     usual = ["displacement"] if grasp.zero in ("", layout.axis) else [*grasp.zero]
+    if layout.point_m is not None:
+        usual = ["angle", *([*grasp.zero] and usual)]
     if rest_length_m is not None:
         values["strain"] = displacement_m / rest_length_m
         usual = ["strain"]
     chosen = _named_quantities(layout) or usual
-    known = (*DISPLACEMENTS, DISPLACEMENT, STRAIN)
+    known = (*DISPLACEMENTS, DISPLACEMENT, ANGLE, STRAIN)
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 
@@ -196,13 +206,14 @@ def add_loads(table: BenchTable, layout: ForceSensorSection, at_s: Array, loads:
     values = dict(zip(components, six_components.T, strict=True))
     column = f"f{layout.axis}"
     values["force"] = values[column]
+    values["torque"] = values[f"t{layout.axis}"]
     measured = [key for key in components if np.isfinite(values[key]).any()]
     usual = ["force"] if measured == [column] else measured
     if layout.area_m2 is not None:
         values["stress"] = values[column] / layout.area_m2
         usual = ["stress"]
     chosen = _named_quantities(layout) or usual
-    known = (*FORCES, *TORQUES, FORCE, STRESS)
+    known = (*FORCES, *TORQUES, FORCE, TORQUE, STRESS)
     table.add(layout, {key: values[key] for key in chosen}, known)
 
 

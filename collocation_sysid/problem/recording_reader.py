@@ -40,7 +40,9 @@ from ..recording.alignment import AlignedRecording
 from ..recording.gap_interpolation import interpolation_error
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
+from ..recording.sources.columns import name_and_unit
 from ..recording.sources.logs import stored_files
+from ..recording.sources.units import UNITS, si_factor
 from ..recording.time_tables import is_within_experiment
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
@@ -204,7 +206,10 @@ class RecordingReader:
             layout = grasp.displacement.dump_layout()
             layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
             layout["other_columns"] = self.section.noise_columns_of(grasp.displacement)
-            poses = read_displacement(file, **layout, timed=self._requires_times)
+            notes: list[str] = []
+            layout |= {"point_m": grasp.displacement.point_m, "timed": self._requires_times}
+            poses = read_displacement(file, **layout, notes=notes)
+            self._add_notes(*(f"{self.section.file_of(grasp.displacement)}: {n}" for n in notes))
         elif grasp.poses is None:
             return PoseSequence.fixed()
         else:
@@ -241,7 +246,9 @@ class RecordingReader:
             file = self._table_file(table, self._grasp_key(k, "displacement"))
             rest_m = strain_length_m(table, self.body)
             others = self.section.noise_columns_of(table)
-            zero = displaced_axes(file, table.columns, table.axis, rest_m, other_columns=others)
+            zero = displaced_axes(
+                file, table.columns, table.axis, rest_m, others, header_line=table.header_line
+            )
         is_obstacle = isinstance(section, ObstacleSection)
         kind, word = (Obstacle, "force") if is_obstacle else (Grasp, "wrench")
         number = k + 1 - len(self.section.grasp_list)
@@ -266,17 +273,18 @@ class RecordingReader:
     # What is measured, and what acts --------------------------------------------------------------
 
     def _read_wrench(
-        self, section: ForceSensorSection, key: str
+        self, section: ForceSensorSection, key: str, notes: list[str] | None = None
     ) -> tuple[Array, Array, dict[str, Array]]:
         """Return times (S,) [s], values (S, 6) [N, N m] and columns (S,) of σ by their keys of a
         wrench's file, divided by the section's `symmetry`; `key` is that of the section, for
-        messages.
+        messages, and `notes` are added to.
         """
         file = self._table_file(section, f"{key}.file")
         layout = section.dump_layout()
         layout["noise_columns"] = section.noise_columns
         layout["other_columns"] = self.section.noise_columns_of(section)
-        return read_wrench(file, **layout, symmetry=section.symmetry, timed=self._requires_times)
+        timed = self._requires_times
+        return read_wrench(file, **layout, symmetry=section.symmetry, timed=timed, notes=notes)
 
     def _wrench(self, section: ForceSensorSection, key: str, k: int, t_s: Array) -> Wrench:
         """Return the measured wrench within the times t_s of the experiment, and note how many
@@ -297,8 +305,16 @@ class RecordingReader:
                 for sigma, column in section.noise_columns.items():
                     message = f"found the column {column!r} without a file; expected a number"
                     raise InputError(message, where=sigma)
-                return Wrench(t_s, np.zeros((len(t_s), 6)), **{"sigma_nm": 1.0, **arguments})
-            at_s, values, sigmas = self._read_wrench(section, key)
+                zeros = np.zeros((len(t_s), 6))
+                zeros[:, :3] = np.nan if arguments.get("sigma_n") is None else 0.0
+                return Wrench(t_s, zeros, **{"sigma_nm": 1.0, **arguments})
+            notes: list[str] = []
+            at_s, values, sigmas = self._read_wrench(section, key, notes)
+            self._add_notes(*(f"{name}: {note}" for note in notes))
+            displacement = self.section.moved_sections[k].displacement
+            if displacement is not None and displacement.point_m is not None:
+                # Torques of a machine are about the axis of its rotation.
+                arguments.setdefault("point_m", displacement.point_m)
             mounting = self._frames.sensor_mounting(section, key, k=k)
             if note := self._frames.sensor_note(section, mounting):
                 self._add_notes(note)
@@ -340,7 +356,24 @@ class RecordingReader:
                 values = np.delete(values, place, axis=1)
                 columns = [name for name in columns if name != column]
             arguments["columns"] = columns
+            self._compare_units(columns, section.unit)
             return Gauge(t_s=at_s, values=values, **arguments)
+
+    def _compare_units(self, columns: Iterable[str], unit: str) -> None:
+        """Refuse columns of a custom sensor in another unit than the stated one, and note units that
+        are not used.
+        """
+        for column in columns:
+            own = (name_and_unit(column)[1] if column.endswith((")", "]")) else None) or ""
+            factors = [si_factor(own, each) for each in UNITS if si_factor(own, each)]
+            if not factors or own == unit:
+                continue
+            if any(si_factor(unit, each) in factors for each in UNITS):
+                continue
+            if unit:
+                message = f"column {column} has the unit {own}; expected {unit}: convert its values"
+                raise InputError(message, where="file")
+            self._add_notes(f"column {column} is used in its own unit, {own}")
 
     @property
     def _recording_folder(self) -> RecordingFolder:
@@ -375,7 +408,9 @@ class RecordingReader:
         for name, key in keys_of(table.of):
             if key.constant and key.read and (file_name := getattr(table, key.name)):
                 file = existing_file(self.folder, file_name, key=f"{where}.{key.name}")
-                arguments[name], arguments[key.constant] = key.read(file)
+                notes: list[str] = []
+                arguments[name], arguments[key.constant] = key.read(file, notes)
+                self._add_notes(*(f"{file_name}: {note}" for note in notes))
         with located(where=f"{where}.nodes" if "nodes" in arguments else where):
             return table.of(**arguments).on_body(self.body)
 

@@ -84,6 +84,8 @@ class TableSection(Section):
     columns : mapping of name to str
         Column of the file for each quantity whose column is not recognised by its name. A unit that
         the file does not state is added to the name, as in "Load (N)".
+    header_line : int, optional
+        Line of the column names in the file, if it is not the one above the longest table.
     axis : {"x", "y", "z"}
         Axis of the world along which a machine measures.
     sign : {1, -1}
@@ -93,24 +95,29 @@ class TableSection(Section):
 
     file: Text | None = None
     columns: dict[str, Text] = Field(default_factory=dict)
+    header_line: AtLeastOne | None = None
     axis: Literal["x", "y", "z"] = "z"
     sign: Literal[1, -1] = 1
 
     def dump_layout(self) -> dict[str, Any]:
-        """Return the arguments with which the columns are read, by name: `columns`, `axis`, `sign`,
-        and `scale`, `length_m` or `area_m2` where the section has them.
+        """Return the arguments with which the columns are read, by name: `columns`, `header_line`,
+        `axis`, `sign`, and `scale`, `length_m` or `area_m2` where the section has them.
         """
-        return self.model_dump(include={"columns", "axis", "sign", "scale", "length_m", "area_m2"})
+        names = {"columns", "header_line", "axis", "sign", "scale", "length_m", "area_m2"}
+        return self.model_dump(include=names)
 
 
 class DisplacementSection(TableSection):
-    """Translations without rotations from the undeformed position, such as those of a crosshead.
+    """Translations from the undeformed position, such as those of a crosshead, or a rotation.
 
     The file has the column t_s and any of x_m, y_m, z_m, in these or other units; or the
-    displacement of a testing machine; or an engineering strain, with length_m.
+    displacement of a testing machine; or its angle, with point_m; or an engineering strain, with
+    length_m.
 
     Attributes
     ----------
+    point_m : (3,) array, optional
+        Point [x, y, z] of the axis of rotation, whose direction is axis, if the file has an angle.
     length_m : float or "body", optional
         Undeformed length by which an engineering strain is multiplied [m]; "body" is the length of
         the body along the axis.
@@ -120,6 +127,7 @@ class DisplacementSection(TableSection):
         because each half takes half of the displacement.
     """
 
+    point_m: Vector | None = None
     length_m: Annotated[Literal["body"] | Positive, ByForm(str)] | None = None
     scale: Positive = 1.0
 
@@ -172,6 +180,15 @@ class ForceSensorSection(TableSection, of=Wrench):
     def states_axes(self) -> bool:
         """Whether the table states the axes of the components or the point of the torque."""
         return bool({"frame", "point_m"} & self.model_fields_set)
+
+    @model_validator(mode="after")
+    def _require_noise(self) -> ForceSensorSection:
+        if self.sigma_n is None and self.sigma_nm is None:
+            raise ValueError(
+                "found no sigma_n; expected sigma_n, the standard deviation of the noise of the "
+                "forces [N], or sigma_nm, that of the torques [N m]"
+            )
+        return self
 
     @model_validator(mode="after")
     def _require_one_frame(self) -> ForceSensorSection:
@@ -313,7 +330,7 @@ class MarkersSection(Section, of=Markers):
         Where the estimated positions of markers may be: anywhere in the undeformed body ("free"),
         or on its surface ("surface").
     file : str, optional
-        Marker tracks: C3D, TRC, Qualisys TSV, Motive CSV or plain CSV; not needed for `simulate`.
+        Marker tracks: C3D, TRC, Qualisys TSV, Motive, Vicon or plain CSV; not needed for `simulate`.
     sigma_m : Sigma
         Standard deviation of the noise of each coordinate [m], for all markers or by marker name.
     names : list of str, optional

@@ -10,12 +10,11 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..common.time_dependence import at_times, values_over_time
-from ..errors import InputError, listed, located
+from ..errors import listed, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
 from ..recording.homogeneous_deformation import shape_factor
 from ..recording.hysteresis import loading_rows
-from ..recording.sample_times import TIME_TOLERANCE_S, first_unordered_time
 from ..recording.specimen_averages import RESOLUTION, with_averaged_rows
 from ..recording.specimen_checks import (
     order_warnings,
@@ -55,13 +54,18 @@ class SpecimenReader:
         """
         section = self.section
         file = existing_file(self.folder, section.file, key="file")
-        is_timed = section.modulus != "harmonic" and (
-            self.body.has_memory or section.modulus is not None
-        )
+        has_order = section.modulus == "relaxation" or self.body.has_memory
         layout = layout_from_section(
-            section, requires_times=is_timed or section.window_s is not None, is_timed=is_timed
+            section, requires_times=has_order and section.modulus != "harmonic"
         )
-        table = read_specimen(file, layout)
+        table = read_specimen(file, replace(layout, window_s=None) if self.simulation else layout)
+        for note in table.notes:
+            self._add_note(f"{section.file}: {note}")
+        if {"second_displacement", "second_force"} & set(table.columns):
+            self._add_note(
+                "both displacements are divided by length_m, both forces by area_m2: of a specimen "
+                "with two sizes, convert them to strains and stresses"
+            )
         if table.is_incompressible:
             what = (
                 "the difference of the true stresses is taken"
@@ -125,17 +129,9 @@ class SpecimenReader:
     def _specimen(self, table: SpecimenTable) -> Specimen:
         section = self.section
         rows = self._rows(table)
-        if len(rows) < len(table.t_s):
-            self._add_note(f"{section.file}: {len(rows)} of {len(table.t_s)} rows are used")
-        used = at_times(table, rows)
-        if fault := first_unordered_time(table.t_s):
-            self._add_note(
-                f"{section.file}: times are not in order (row {fault[0] + 1}); the rows are taken as "
-                "they stand, because the law does not depend on times"
-            )
-            if first_unordered_time(used.t_s):
-                used = replace(used, t_s=np.arange(float(len(rows))))
-        arguments = values_over_time(used)
+        if len(rows) < table.row_count:
+            self._add_note(f"{section.file}: {len(rows)} of {table.row_count} rows are used")
+        arguments = values_over_time(at_times(table, rows))
         temperature = {
             "shift": section.shift,
             "temperature_difference_k": section.temperature_difference_k,
@@ -206,27 +202,14 @@ class SpecimenReader:
     def _rows(self, table: SpecimenTable) -> Index:
         """Return the indices (k,) of the rows to use; all rows of a simulation.
 
-        Otherwise these are the rows within `window_s`, without the first `skip_cycles` cycles of
-        the strain and, with branch "loading", only those of the last cycle up to its peak; of these
-        every `every`-th row, beginning with the first one.
+        Otherwise these are the rows of the table, thus of `window_s`, without the first
+        `skip_cycles` cycles of the strain and, with branch "loading", only those of the last cycle
+        up to its peak; of these every `every`-th row, beginning with the first one.
         """
         section = self.section
         rows = np.arange(len(table.t_s))
         if self.simulation:
             return rows
-        first_s, last_s = section.window_s or (-np.inf, np.inf)
-        if section.window_s is not None:
-            # Times that are not in order end the window where they leave it.
-            begun = np.flatnonzero(table.t_s >= first_s - TIME_TOLERANCE_S)
-            rows = rows[begun[0] :] if begun.size else rows[:0]
-            left = np.flatnonzero(table.t_s[rows] > last_s + TIME_TOLERANCE_S)
-            rows = rows[: left[0]] if left.size else rows
-        if not rows.size:
-            raise InputError(
-                f"found [{first_s:g}, {last_s:g}], which contains no sample; expected a window "
-                f"within the times of the table, {np.nanmin(table.t_s):g} s to {np.nanmax(table.t_s):g} s",
-                where="window_s",
-            )
         if section.skip_cycles:
             rows = rows[rows_after_cycles(table.strain[rows], section.skip_cycles)]
         if section.branch == "loading":
@@ -254,10 +237,10 @@ class SpecimenReader:
 
 
 def layout_from_section(
-    section: SpecimenSection, *, requires_times: bool = False, is_timed: bool = True
+    section: SpecimenSection, *, requires_times: bool = False
 ) -> SpecimenLayout:
     """Return the meaning of the columns of the file of a specimen; `requires_times` is whether the
-    file must contain times, `is_timed` whether they must increase.
+    file must contain times that increase.
     """
     return SpecimenLayout(
         test=section.deformation,
@@ -270,7 +253,8 @@ def layout_from_section(
         length_m=section.length_m,
         area_m2=section.area_m2,
         requires_times=requires_times,
-        is_timed=is_timed,
+        header_line=section.header_line,
+        window_s=section.window_s,
         axial_stretch=section.axial_stretch,
         transverse_stretch=section.transverse_stretch,
     )

@@ -49,6 +49,8 @@ class SpecimenSection(NamedSection):
         Column of the file for each quantity (stretch, strain, displacement, stress, force,
         pressure, lateral_stretch, …, t) whose column is not recognised by its name. A unit that the
         file does not state is added to the name, as in "Load (N)".
+    header_line : int, optional
+        Line of the column names in the file, if it is not the one above the longest table.
     strain_sign : {1, -1}
         -1 if the strains or displacements in the file are positive in compression.
     stress_sign : {1, -1}
@@ -111,6 +113,7 @@ class SpecimenSection(NamedSection):
     test: Annotated[str, Among((*TESTS, *MODULI))]
     file: Text
     columns: dict[str, Text] = Field(default_factory=dict)
+    header_line: AtLeastOne | None = None
     strain_sign: Literal[1, -1] = 1
     stress_sign: Literal[1, -1] = 1
     stress: Literal["engineering", "true"] = "engineering"

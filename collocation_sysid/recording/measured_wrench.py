@@ -18,7 +18,6 @@ from ..common.checked_arrays import (
     float_array,
     float_converter,
     read_only_floats,
-    unconverted_sigma,
     unconverted_sigma_or_none,
 )
 from ..common.declarations import declaration, key
@@ -29,8 +28,8 @@ from ..errors import InputError
 from .measurement import Measurement, checked_ratios, split_sigma
 from .poses import Frame
 from .sample_times import first_unordered_time
-from .sources.columns import FORCE, FORCES, STRESS, TORQUES, read_columns
-from .time_tables import axis_components, without_rounding
+from .sources.columns import FORCE, FORCES, STRESS, TORQUE, TORQUES, read_columns
+from .time_tables import axis_components, other_axes, without_rounding
 from .writers import write_columns_csv
 
 COMPONENTS = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -56,9 +55,10 @@ class Wrench(Measurement):
         Sample times, at any rate, on the clock of the grasps.
     values : (S, 3) or (S, 6) array
         fx, fy, fz [N], and tx, ty, tz [N m]; NaN where missing.
-    sigma_n : float, (S,) or (S, 3) array
+    sigma_n : float, (S,) or (S, 3) array, optional
         Standard deviation of the noise of each force [N]: one for all, one for each sample, or one
-        for each component. An array is stored as its median, and as ratios, `sigma_ratios`.
+        for each component; needed if forces are measured. An array is stored as its median, and as
+        ratios, `sigma_ratios`.
     sigma_nm : float, (S,) or (S, 3) array, optional
         Standard deviation of the noise of each torque [N m]; needed if torques are measured.
     frame : {"world", "grasp"}
@@ -87,7 +87,12 @@ class Wrench(Measurement):
 
     t_s: Array = key(converter=float_converter((None,), "t_s of the wrench"), metadata=over_time())
     values: Array = key(converter=_with_torques, metadata=over_time())
-    sigma_n: float = key(Noise, converter=unconverted_sigma, accepted=PositivePerSample)
+    sigma_n: float | None = key(
+        Noise | None,
+        converter=unconverted_sigma_or_none,
+        accepted=PositivePerSample | None,
+        default=None,
+    )
     sigma_nm: float | None = key(
         Noise | None,
         converter=unconverted_sigma_or_none,
@@ -118,11 +123,15 @@ class Wrench(Measurement):
                 "all values of the measured wrench are missing; expected at least one component with "
                 "a number"
             )
-        if self.sigma_nm is None and self.measured_components[3:].any():
-            raise InputError(
-                "the measured wrench contains torques, but sigma_nm is missing; expected the standard "
-                "deviation of the noise of the torques [N m]"
-            )
+        for name, what, unit, part in (
+            ("sigma_n", "forces", "N", slice(3)),
+            ("sigma_nm", "torques", "N m", slice(3, 6)),
+        ):
+            if getattr(self, name) is None and self.measured_components[part].any():
+                raise InputError(
+                    f"the measured wrench contains {what}, but {name} is missing; expected the "
+                    f"standard deviation of the noise of the {what} [{unit}]"
+                )
         self._split_sigmas()
 
     def _split_sigmas(self) -> None:
@@ -171,11 +180,11 @@ class Wrench(Measurement):
 
     @property
     def value_sigmas(self) -> Array:
-        """(6,) standard deviations of the components [N, N m]; those of torques are 1 if `sigma_nm`
-        is None, as no torque is measured then.
+        """(6,) standard deviations of the components [N, N m]; 1 where none is stated, as no such
+        component is measured then.
         """
-        torque = 1.0 if self.sigma_nm is None else self.sigma_nm
-        return np.repeat([self.sigma_n, torque], 3)
+        stated = (self.sigma_n, self.sigma_nm)
+        return np.repeat([1.0 if sigma is None else sigma for sigma in stated], 3)
 
     @property
     def number_names(self) -> tuple[str, ...]:
@@ -228,16 +237,18 @@ def read_wrench(
     timed: bool = True,
     noise_columns: Mapping[str, str] | None = None,
     other_columns: Collection[str] = (),
+    header_line: int | None = None,
+    notes: list[str] | None = None,
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Read force and torque of a grasp over time, columns in any order; blank cells are missing.
 
     Parameters
     ----------
     columns : mapping, optional
-        Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force or stress, and of t,
-        if their names are not recognised.
+        Names of the columns of fx, fy, fz, tx, ty, tz, or of a machine's force, torque or stress,
+        and of t, if their names are not recognised.
     axis : {"x", "y", "z"}
-        Axis of a machine's force or stress.
+        Axis of a machine's force, torque or stress.
     sign : {1, -1}
         Factor on the file's values: -1 if a positive value pulls the body against the axis.
     area_m2 : float, optional
@@ -250,6 +261,10 @@ def read_wrench(
         Column by the key, "sigma_n" or "sigma_nm", of the standard deviations that it holds.
     other_columns : collection of str
         Columns of the file that hold something else, such as the noise of another sensor.
+    header_line : int, optional
+        Line of the column names, see `read_columns`.
+    notes : list of str, optional
+        Words of column names that are not understood are added to it.
 
     Returns
     -------
@@ -265,7 +280,7 @@ def read_wrench(
         If a column names no unit or a wrong one, is unknown or repeated, a cell is not a number, or
         time does not increase; the line is named.
     """
-    quantities = (*FORCES, *TORQUES, FORCE) if area_m2 is None else (STRESS,)
+    quantities = (*FORCES, *TORQUES, FORCE, TORQUE) if area_m2 is None else (STRESS,)
     table = read_columns(
         path,
         quantities,
@@ -274,7 +289,11 @@ def read_wrench(
         requires_times=timed,
         noise_columns=noise_columns,
         other_columns=other_columns,
+        header_line=header_line,
+        other_kinds={**other_axes(axis), "volume": "the stress along the axis"},
     )
+    if notes is not None:
+        notes += table.notes
     factor = sign * (area_m2 or 1.0) / symmetry
     values = factor * axis_components(table, (*FORCES, *TORQUES), axis=axis)
     sigmas = {key: column / symmetry for key, column in table.noises.items()}

@@ -167,7 +167,7 @@ class Obstacle(Grasp):
         return ObstacleForces(
             self.wrench.t_s,
             self.wrench.values[:, :3],
-            sigma_n=self.wrench.sigma_n,
+            sigma_n=float(self.wrench.value_sigmas[0]),
             frame_poses=None if self.wrench.frame == "world" else self.poses,
         )
 

@@ -61,7 +61,7 @@ def read_poses(
         t_s, matrices = _read_archive(path)
         places = [f"index {k}" for k in range(len(t_s))]
         return _from_matrices(t_s, matrices, length_unit=length_unit, row_names=places)
-    grid = _with_column_names(as_table(source))
+    grid = _with_column_names(as_table(source, names_required=False))
     lines = [f"line {line}" for line in grid.lines]
     time = find_time(grid)
     if time is None:

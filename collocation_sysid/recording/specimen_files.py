@@ -29,9 +29,12 @@ from .sources.columns import (
     LATERAL_STRETCH,
     LOSS,
     LOSS_FACTOR,
+    MISSING,
     MODULUS,
     NOISES,
     PRESSURE,
+    SECOND_DISPLACEMENT,
+    SECOND_FORCE,
     SECOND_STRAIN,
     SECOND_STRESS,
     SECOND_STRETCH,
@@ -46,7 +49,6 @@ from .sources.columns import (
     Quantity,
     QuantityTable,
     column_statement,
-    deformed_column_names,
     fitting_column_names,
     name_and_unit,
     names_compression,
@@ -58,14 +60,32 @@ from .sources.text import Table, names_file_in_errors
 from .sources.units import si_factor
 from .specimen import LATERAL_NAME, LOSS_NOISE, SECOND_STRESS_NAME, STRESS_NAME, moduli_per_stress
 
-# Name of a column that no column of a table fits.
-MISSING = "…"
 # Most statements of columns that a message lists: more are not read.
 MOST_STATEMENTS = 4
 Sign = Literal[1, -1]
 StressMeasure = Literal["engineering", "true"]
 # What a table of a modulus has: the relaxation modulus over time, or the complex one over frequency.
 ModulusTable = Literal["relaxation", "harmonic"]
+# Kinds of `KINDS` that the names of columns may not state, by the kind of test.
+OTHER_KINDS = {
+    "uniaxial": ("shear", "pure shear", "two axes", "volume"),
+    "equibiaxial": ("shear", "volume"),
+    "biaxial": ("shear", "volume"),
+    "biaxial-difference": ("shear", "volume"),
+    "planar": ("simple shear", "volume"),
+    "simple-shear": ("tension", "pure shear", "two axes", "volume"),
+    "confined": ("shear", "two axes"),
+    "volumetric": ("tension", "shear", "two axes", "absolute"),
+}
+# Kinds of test that columns of these kinds belong to.
+TEST_OF_KIND = {
+    "tension": "uniaxial",
+    "shear": "simple-shear",
+    "simple shear": "simple-shear",
+    "pure shear": "planar",
+    "two axes": "equibiaxial",
+    "volume": "volumetric",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +103,7 @@ class SpecimenLayout:
     stress: StressMeasure = "engineering"
     length_m: float | None = None  # undeformed length that divides a displacement
     area_m2: float | None = None  # undeformed area by which a force is divided
-    requires_times: bool = False  # whether the table must have times
-    is_timed: bool = True  # whether its times must increase, because the law depends on them
+    requires_times: bool = False  # whether the table must have times that increase
     # Those of `Specimen`.
     axial_stretch: float = 1.0
     transverse_stretch: float | None = None
@@ -94,6 +113,18 @@ class SpecimenLayout:
     # mapping of str to str: columns of standard deviations by their keys "sigma_pa" or "sigma_n",
     # and "lateral_sigma".
     noise_columns: Mapping[str, str] = field(default_factory=dict)
+    header_line: int | None = None  # line of the column names; None to find it
+    window_s: tuple[float, float] | None = None  # first and last time of the rows
+
+    @property
+    def other_kinds(self) -> dict[str, str]:
+        """Kinds of strain, stress or modulus that the test does not have, with the remedy."""
+        tests = dict(TEST_OF_KIND)
+        if self.modulus:
+            tests |= {"tension": self.modulus, "shear": f"shear-{self.modulus}"}
+        remedies = {kind: f'test = "{test}"' for kind, test in tests.items()}
+        remedies["absolute"] = "the pressure above that of the surroundings"
+        return {kind: remedies[kind] for kind in OTHER_KINDS[self.test]}
 
     def list_quantities(self) -> tuple[Quantity, ...]:
         """Return the quantities that the table of this kind of test may have.
@@ -121,9 +152,9 @@ class SpecimenLayout:
         if self.test != "simple-shear":
             quantities.append(STRETCH)
         if deformation.second:
-            quantities += [SECOND_STRETCH, SECOND_STRAIN]
+            quantities += [SECOND_STRETCH, SECOND_STRAIN, SECOND_DISPLACEMENT]
         if deformation.second_stress:
-            quantities.append(SECOND_STRESS)
+            quantities += [SECOND_STRESS, SECOND_FORCE]
         if deformation.lateral:
             quantities += [LATERAL_STRETCH, LATERAL_STRAIN]
         return tuple(quantities)
@@ -143,15 +174,15 @@ class SpecimenLayout:
         """Return the quantities of which the table of a test with two strains must have exactly
         one; empty for other tests.
         """
-        return (SECOND_STRETCH, SECOND_STRAIN) if DEFORMATIONS[self.test].second else ()
+        of_second = SECOND_STRETCH, SECOND_STRAIN, SECOND_DISPLACEMENT
+        return of_second if DEFORMATIONS[self.test].second else ()
 
 
 @dataclass(frozen=True, eq=False)
 class SpecimenTable:
     """Measurements of a material test in the terms of `Specimen`."""
 
-    # (T,): times; the number of the row in seconds if the table has none. NaN or in any order if the
-    # law does not depend on them.
+    # (T,): times; the number of the row in seconds if the table has none, or none in order.
     t_s: Array = field(metadata=over_time())
     # (T,): strain without NaN; stress NaN where the cell is blank.
     strain: Array = field(metadata=over_time())
@@ -166,6 +197,8 @@ class SpecimenTable:
     # Quantities that the table has, such as "stretch" and "lateral_strain".
     columns: tuple[str, ...]
     unread: tuple[str, ...]  # columns with a unit that are not read
+    notes: tuple[str, ...] = ()  # see `QuantityTable`
+    row_count: int = 0
     # (T,) or None: standard deviations of stress, or of the modulus, and of the lateral stretch;
     # None without a column of them.
     sigma_pa: Array | None = field(default=None, metadata=over_time())
@@ -210,9 +243,12 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         column_names=layout.columns,
         blank_allowed=True,
         requires_times=layout.requires_times,
-        is_timed=layout.is_timed,
+        is_timed=layout.requires_times,
         column_advice=partial(column_advice, layout=layout),
         noise_columns=layout.noise_columns,
+        header_line=layout.header_line,
+        window_s=layout.window_s,
+        other_kinds=layout.other_kinds,
     )
     sigma_pa = table.noises.get("sigma_pa")
     if layout.modulus == "relaxation":
@@ -224,7 +260,7 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
     lateral = _lateral_stretch(table, layout)
     areas = _area_ratios(layout, strain, second_strain=second_strain, lateral=lateral)
     stress_pa = _stress_pa(table, layout)
-    second_pa = table.values.get(SECOND_STRESS.key)
+    second_pa = _second_stress_pa(table, layout)
     factor = np.ones_like(strain)
     if layout.test == "volumetric":
         factor = (1 + strain) ** 2
@@ -252,6 +288,8 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         compressive=tuple(filter(names_compression, table.grid.columns)),
         columns=tuple(table.values),
         unread=table.unread,
+        notes=table.notes,
+        row_count=table.row_count,
         sigma_pa=None if sigma_pa is None else sigma_pa * factor,
         lateral_sigma=table.noises.get("lateral_sigma"),
     )
@@ -306,6 +344,8 @@ def _modulus_table(
         is_incompressible=False,
         columns=tuple(table.values),
         unread=table.unread,
+        notes=table.notes,
+        row_count=table.row_count,
         sigma_pa=sigma_pa,
         frequency_hz=frequency_hz,
         loss_pa=loss_pa,
@@ -340,7 +380,8 @@ def column_advice(grid: Table, layout: SpecimenLayout) -> str:
     if second := layout.list_second_deformations():
         of_second = _column_choices(grid, second, layout.columns, taken=_names_of(deformations))
         keys = [key for each in deformations for key in each]
-        if MISSING in _names_of(of_second) and keys in ([STRETCH.key] * 2, [STRAIN.key] * 2):
+        alike = [[each.key] * 2 for each in (STRETCH, STRAIN, DISPLACEMENT)]
+        if MISSING in _names_of(of_second) and keys in alike:
             # Two of unknown axes: the first column is taken for the first axis.
             of_second = [{f"second_{keys[0]}": deformations[1][keys[0]]}]
             groups = [deformations[:1]]
@@ -359,15 +400,15 @@ def column_advice(grid: Table, layout: SpecimenLayout) -> str:
         and (quantity != TIME or TIME.key in layout.columns)
     }
     # Two stresses of unknown axes: the first column is taken for the first axis.
-    has_second_stress = SECOND_STRESS in layout.list_quantities()
     loads = groups[-1]
-    if (
-        has_second_stress
-        and SECOND_STRESS.key not in other
-        and [*map(list, loads)] == [[STRESS.key]] * 2
-    ):
-        groups[-1] = loads[:1]
-        other[SECOND_STRESS.key] = loads[1][STRESS.key]
+    for first, second_load in ((STRESS, SECOND_STRESS), (FORCE, SECOND_FORCE)):
+        if (
+            second_load in layout.list_quantities()
+            and second_load.key not in other
+            and [*map(list, loads)] == [[first.key]] * 2
+        ):
+            groups[-1] = loads[:1]
+            other[second_load.key] = loads[1][first.key]
     statements = []
     for combination in product(*groups):
         chosen = {key: name for each in combination for key, name in each.items()}
@@ -423,25 +464,15 @@ def _one_of(
     if len(there) != 1:
         present = " and ".join(quantity.key for quantity in there)
         expected = ", ".join(quantity.column for quantity in quantities)
-        if STRESS in quantities and TRUE_STRESS not in quantities and not there:
-            for column in deformed_column_names(table.grid, STRESS):
-                raise table.grid.error_at(
-                    f"column {column} holds a true stress, force over deformed area; expected an "
-                    'engineering stress, or stress = "true"'
-                )
-        if STRAIN in quantities and not there:
-            for column in deformed_column_names(table.grid, STRAIN):
-                raise table.grid.error_at(
-                    f"column {column} holds a true strain, the logarithm of the stretch; expected an "
-                    "engineering strain, or the stretch, which is the exponential of the true strain: "
-                    "convert its values, then call it stretch"
-                )
+        if not there and (why := table.contradiction(quantities)):
+            remedy = ', or stress = "true"' if "holds a true stress" in why else ""
+            raise table.grid.error_at(why + remedy)
         raise table.grid.error_at(
             f"the columns are {', '.join(table.grid.columns)}; found "
             f"{present or 'no column'} of the {what}, "
             f"expected exactly one of {expected}, in these or other units"
-            f"{other_columns_text(table.grid, layout.list_quantities())}. State "
-            f"{column_advice(table.grid, layout)}"
+            f"{other_columns_text(table.known_grid, layout.list_quantities())}. State "
+            f"{column_advice(table.known_grid, layout)}"
         )
     return there[0]
 
@@ -468,16 +499,20 @@ def _strain(table: QuantityTable, layout: SpecimenLayout) -> Array:
         _require_positive(table, quantity, ratio=ratio)
         return np.cbrt(ratio) - 1
     if quantity == DISPLACEMENT:
-        if layout.length_m is None:
-            raise table.grid.error_at(
-                "found a column of displacements, but not length_m; expected length_m, the undeformed "
-                "length of the specimen, or the gap of a shear test"
-            )
-        values = values / layout.length_m
+        values = values / _length_m(table, layout)
     strain = layout.strain_sign * values
     if layout.test != "simple-shear":
         _require_positive(table, quantity, ratio=1 + strain)
     return strain
+
+
+def _length_m(table: QuantityTable, layout: SpecimenLayout) -> float:
+    if layout.length_m is None:
+        raise table.grid.error_at(
+            "found a column of displacements, but not length_m; expected length_m, the undeformed "
+            "length of the specimen, or the gap of a shear test"
+        )
+    return layout.length_m
 
 
 def _require_positive(table: QuantityTable, quantity: Quantity, ratio: Array) -> None:
@@ -514,6 +549,8 @@ def _second_strain(table: QuantityTable, layout: SpecimenLayout) -> Array | None
     if quantity == SECOND_STRETCH:
         _require_positive(table, quantity, ratio=values)
         return values - 1
+    if quantity == SECOND_DISPLACEMENT:
+        values = values / _length_m(table, layout)
     strain = layout.strain_sign * values
     _require_positive(table, quantity, ratio=1 + strain)
     return strain
@@ -535,18 +572,32 @@ def _stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array:
     if quantity == PRESSURE:
         return -values
     if quantity == FORCE:
-        if layout.stress == "true":
-            raise table.grid.error_at(
-                'found a column of forces and stress = "true"; expected a column of true stresses, or '
-                'no stress = "true": the deformed area on which the force acts is not known'
-            )
-        if layout.area_m2 is None:
-            raise table.grid.error_at(
-                "found a column of forces, but not area_m2; expected area_m2, the undeformed area on "
-                "which the force acts"
-            )
-        values = values / layout.area_m2
+        values = values / _area_m2(table, layout)
     return layout.stress_sign * values
+
+
+def _second_stress_pa(table: QuantityTable, layout: SpecimenLayout) -> Array | None:
+    """Return the second stress (T,), before its sign is applied; None without one."""
+    both = [each for each in (SECOND_STRESS, SECOND_FORCE) if each.key in table.values]
+    if len(both) > 1:
+        _one_of(table, (SECOND_STRESS, SECOND_FORCE), "second load", layout)
+    if SECOND_FORCE.key in table.values:
+        return table.values[SECOND_FORCE.key] / _area_m2(table, layout)
+    return table.values.get(SECOND_STRESS.key)
+
+
+def _area_m2(table: QuantityTable, layout: SpecimenLayout) -> float:
+    if layout.stress == "true":
+        raise table.grid.error_at(
+            'found a column of forces and stress = "true"; expected a column of true stresses, or '
+            'no stress = "true": the deformed area on which the force acts is not known'
+        )
+    if layout.area_m2 is None:
+        raise table.grid.error_at(
+            "found a column of forces, but not area_m2; expected area_m2, the undeformed area on "
+            "which the force acts"
+        )
+    return layout.area_m2
 
 
 def _area_ratios(
@@ -711,6 +762,7 @@ def _specimen_quantities(
     }
     if layout.length_m is not None:
         quantities[DISPLACEMENT] = layout.strain_sign * strain * layout.length_m
+        quantities[SECOND_DISPLACEMENT] = layout.strain_sign * second_strain * layout.length_m
     if layout.list_second_deformations():
         quantities[SECOND_STRETCH] = 1 + second_strain
         quantities[SECOND_STRAIN] = layout.strain_sign * second_strain
@@ -735,4 +787,6 @@ def _specimen_quantities(
         second_pa = values[SECOND_STRESS_NAME]
         second_pa = second_pa / areas[1] if is_true else second_pa
         quantities[SECOND_STRESS] = layout.stress_sign * second_pa
+        if layout.area_m2 is not None:
+            quantities[SECOND_FORCE] = quantities[SECOND_STRESS] * layout.area_m2
     return quantities

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
 from ..errors import InputError, hint_at
 from .poses import PoseSequence
 from .sample_times import TIME_TOLERANCE_S, unrounded_s
 from .sources.columns import (
+    ANGLE,
     DISPLACEMENT,
     DISPLACEMENTS,
     FORCES,
@@ -20,6 +22,7 @@ from .sources.columns import (
     STRAIN,
     TENSION,
     TIME,
+    TORQUE,
     Quantity,
     QuantityTable,
     find_time,
@@ -36,8 +39,8 @@ LARGEST_N = 1e5
 FEWEST_SHARED_SAMPLES = 3
 
 
-def read_forces(path: str | Path) -> tuple[Array, Array]:
-    """Read a force over time: t_s, fx_n, fy_n, fz_n, columns in any order.
+def read_forces(path: str | Path, notes: list[str] | None = None) -> tuple[Array, Array]:
+    """Read a force over time: t_s, fx_n, fy_n, fz_n, columns in any order; `notes` are added to.
 
     Returns
     -------
@@ -50,12 +53,13 @@ def read_forces(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, or time does not increase; the
         line is named.
     """
-    table = read_columns(path, FORCES, requires_all=True)
+    table = _noted(read_columns(path, FORCES, requires_all=True), notes)
     return table.t_s, np.column_stack([table.values[quantity.key] for quantity in FORCES])
 
 
-def read_tension(path: str | Path) -> tuple[Array, Array]:
-    """Read the tension of a tendon, `t_s` (T,) and `tension_n` (T,), columns in any order.
+def read_tension(path: str | Path, notes: list[str] | None = None) -> tuple[Array, Array]:
+    """Read the tension of a tendon, `t_s` (T,) and `tension_n` (T,), columns in any order; `notes`
+    are added to.
 
     Raises
     ------
@@ -63,12 +67,12 @@ def read_tension(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         tension is negative; the line is named.
     """
-    return _read_limited(path, TENSION, largest=LARGEST_N, at_least=0.0)
+    return _read_limited(path, TENSION, largest=LARGEST_N, at_least=0.0, notes=notes)
 
 
-def read_pressure(path: str | Path) -> tuple[Array, Array]:
+def read_pressure(path: str | Path, notes: list[str] | None = None) -> tuple[Array, Array]:
     """Read a pressure above the surroundings', `t_s` (T,) and `pressure_pa` (T,), columns in any
-    order.
+    order; `notes` are added to.
 
     Raises
     ------
@@ -76,14 +80,32 @@ def read_pressure(path: str | Path) -> tuple[Array, Array]:
         If a column is missing or unknown, a cell is not a number, time does not increase, or a
         pressure is implausibly large; the line is named.
     """
-    return _read_limited(path, PRESSURE, largest=LARGEST_PA)
+    return _read_limited(
+        path,
+        PRESSURE,
+        largest=LARGEST_PA,
+        notes=notes,
+        other_kinds={"absolute": "the pressure above that of the surroundings"},
+    )
+
+
+def _noted(table: QuantityTable, notes: list[str] | None) -> QuantityTable:
+    """Return the table, whose notes are added to a list, if there is one."""
+    if notes is not None:
+        notes += table.notes
+    return table
 
 
 @names_file_in_errors
 def _read_limited(
-    path: str | Path, quantity: Quantity, largest: float, at_least: float = -np.inf
+    path: str | Path,
+    quantity: Quantity,
+    largest: float,
+    notes: list[str] | None,
+    at_least: float = -np.inf,
+    other_kinds: Mapping[str, str] | None = None,
 ) -> tuple[Array, Array]:
-    table = read_columns(path, [quantity])
+    table = _noted(read_columns(path, [quantity], other_kinds=other_kinds), notes)
     values = table.values[quantity.key]
     for row in (~((values >= at_least) & (abs(values) <= largest))).nonzero()[0]:
         is_so = f"{quantity.column} is {values[row]:g}"
@@ -107,19 +129,22 @@ def read_displacement(
     timed: bool = True,
     scale: float = 1.0,
     other_columns: Collection[str] = (),
+    header_line: int | None = None,
+    point_m: Sequence[float] | None = None,
+    notes: list[str] | None = None,
 ) -> PoseSequence:
     """Read displacements from the undeformed place over time, such as those of a crosshead.
 
-    A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement or
-    strain, in any order; along the other axes nothing moves.
+    A table has t_s and any of x_m, y_m and z_m (or _cm, _mm, _in), or a machine's displacement,
+    angle or strain, in any order; along the other axes nothing moves.
 
     Parameters
     ----------
     columns : mapping, optional
-        Names of the columns of x, y, z, or of a machine's displacement or strain, and of t, if
-        their names are not recognised.
+        Names of the columns of x, y, z, or of a machine's displacement, angle or strain, and of t,
+        if their names are not recognised.
     axis : {"x", "y", "z"}
-        Axis of a machine's displacement or strain.
+        Axis of a machine's displacement, angle or strain.
     sign : {1, -1}
         Factor on the file's values: -1 if positive values go against the axis.
     length_m : float, optional
@@ -130,11 +155,17 @@ def read_displacement(
         Factor on the displacements: share that the modelled part of the specimen has.
     other_columns : collection of str
         Columns of the file that hold something else, such as the noise of a force.
+    header_line : int, optional
+        Line of the column names, see `read_columns`.
+    point_m : (3,) sequence, optional
+        Point of the axis of rotation; needed if the file has angles.
+    notes : list of str, optional
+        Words of column names that are not understood are added to it.
 
     Returns
     -------
     PoseSequence
-        Pure translations.
+        Translations, and rotations about the axis if the file has angles.
 
     Raises
     ------
@@ -143,17 +174,24 @@ def read_displacement(
         does not increase; the line is named.
     """
     table = _read_displacements(
-        path, columns, length_m=length_m, timed=timed, other_columns=other_columns
+        path, columns, axis, length_m, timed=timed, other=other_columns, header_line=header_line
     )
-    shifts_m = (
-        sign
-        * scale
-        * (length_m or 1.0)
-        * np.nan_to_num(axis_components(table, DISPLACEMENTS, axis=axis))
-    )
-    return PoseSequence(
-        table.t_s, shifts_m, quaternions_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (len(shifts_m), 1))
-    )
+    _noted(table, notes)
+    factor = sign * scale
+    shifts = axis_components(table, DISPLACEMENTS, axis=axis)
+    shifts_m = factor * (length_m or 1.0) * np.nan_to_num(shifts)
+    turns = np.zeros((len(table.t_s), 3))
+    if ANGLE.key in table.values:
+        if point_m is None:
+            raise InputError(
+                "found a column of angles, but not point_m; expected point_m, a point of the axis of "
+                "rotation",
+                str(path),
+            )
+        turns[:, "xyz".index(axis)] = factor * table.values[ANGLE.key]
+        centre = np.asarray(point_m, dtype=float)
+        shifts_m = shifts_m + centre - Rotation.from_rotvec(turns).apply(centre)
+    return PoseSequence(table.t_s, shifts_m, quaternions_xyzw=Rotation.from_rotvec(turns).as_quat())
 
 
 def displaced_axes(
@@ -162,6 +200,7 @@ def displaced_axes(
     axis: str = "z",
     length_m: float | None = None,
     other_columns: Collection[str] = (),
+    header_line: int | None = None,
 ) -> str:
     """Return the axes along which a file has displacements, such as "z" or "xy"; empty if it has
     none, and without regard to their values.
@@ -169,24 +208,37 @@ def displaced_axes(
     Arguments and errors are those of `read_displacement`; times are not required.
     """
     table = _read_displacements(
-        path, columns, length_m=length_m, timed=False, other_columns=other_columns
+        path, columns, axis, length_m, timed=False, other=other_columns, header_line=header_line
     )
     shifts = axis_components(table, DISPLACEMENTS, axis=axis)
     is_present = np.asarray(np.isfinite(shifts).any(axis=0))
     return "".join(each for each, there in zip("xyz", is_present, strict=True) if there)
 
 
+def other_axes(axis: str) -> dict[str, str]:
+    """Return the axes that the names of a machine's columns may not state, with the remedy."""
+    return {each: f'axis = "{each}"' for each in "xyz" if each != axis}
+
+
 def _read_displacements(
     path: str | Path,
     columns: Mapping[str, str] | None,
+    axis: str,
     length_m: float | None,
     timed: bool,
-    other_columns: Collection[str],
+    other: Collection[str],
+    header_line: int | None,
 ) -> QuantityTable:
     """Read a displacement, or a strain if the undeformed length `length_m` [m] is given."""
-    quantities = (*DISPLACEMENTS, DISPLACEMENT) if length_m is None else (STRAIN,)
+    quantities = (*DISPLACEMENTS, DISPLACEMENT, ANGLE) if length_m is None else (STRAIN,)
     return read_columns(
-        path, quantities, column_names=columns, requires_times=timed, other_columns=other_columns
+        path,
+        quantities,
+        column_names=columns,
+        requires_times=timed,
+        other_columns=other,
+        header_line=header_line,
+        other_kinds={**other_axes(axis), "volume": "the strain along the axis"},
     )
 
 
@@ -198,10 +250,11 @@ def axis_components(table: QuantityTable, quantities: Sequence[Quantity], axis: 
     or "z").
     """
     places = {quantity.key: k for k, quantity in enumerate(quantities)}
-    values = np.full((len(table.t_s), len(quantities)), np.nan)
+    places |= {TORQUE.key: 3 + "xyz".index(axis), ANGLE.key: len(quantities)}
+    values = np.full((len(table.t_s), len(quantities) + 1), np.nan)
     for key, column in table.values.items():
         values[:, places.get(key, "xyz".index(axis))] = column
-    return values
+    return values[:, :-1]
 
 
 def without_rounding(t_s: Array) -> Array:

@@ -193,7 +193,7 @@ BAD = {
     "true stress": (
         "Time (s),True Stress (kPa)\n0,1\n1,2\n",
         {"area_m2": 1.0, "columns": {"stress": "True Stress (kPa)"}},
-        "column True Stress (kPa) refers to the deformed specimen; expected engineering stress",
+        "column True Stress (kPa) holds a true stress, force over deformed area; expected an engin",
     ),
     "not there": (PLAIN, {"columns": {"force": "Forse (N)"}}, "did you mean 'Force (N)'"),
     "no such key": (PLAIN, {"columns": {"load": "Force (N)"}}, "the key 'load'; expected one of t"),

@@ -31,7 +31,7 @@ def test_times_that_are_not_in_order_are_a_note(tmp_path, wrong):
     read = problem(tmp_path, [*TIMES[:28], wrong, "2.9"])
     (experiment,) = read.experiments
     np.testing.assert_array_equal(experiment.t_s, np.arange(30.0))
-    assert any("times are not in order (row 29)" in note for note in read.notes)
+    assert any("times are not in order (line 30" in note for note in read.notes)
 
 
 def test_a_window_ends_before_times_that_are_not_in_order(tmp_path):

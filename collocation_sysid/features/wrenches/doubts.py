@@ -387,7 +387,7 @@ def _multiplied(wrench: Wrench, columns: slice, factor: float) -> Wrench:
     return replace(
         wrench,
         values=values,
-        sigma_n=wrench.sigma_n * (larger if of_forces else 1.0),
+        sigma_n=wrench.sigma_n and wrench.sigma_n * (larger if of_forces else 1.0),
         sigma_nm=wrench.sigma_nm and wrench.sigma_nm * (larger if of_torques else 1.0),
     )
 

@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.array_types import Array
-from ...errors import InputError, hint_at
+from ...common.array_types import Array, Index
+from ...errors import InputError, hint_at, listed
+from ..sample_times import TIME_TOLERANCE_S
 from .source import read_table
 from .text import Table, names_file_in_errors, numeric_cells, times_in_column
 from .units import UNITS, expected_units, si_factor
@@ -54,6 +55,11 @@ class Quantity:
         """Name of its column in the project's own tables, with the unit."""
         return f"{self.key}_{self.unit}"
 
+    @property
+    def text(self) -> str:
+        """Name in messages."""
+        return self.key.replace("_", " ")
+
 
 TIME = Quantity("t", "time", unit="s", words="time zeit temps tiempo tempo")
 DISPLACEMENTS = tuple(Quantity(axis, "length", unit="m") for axis in "xyz")
@@ -68,6 +74,15 @@ DISPLACEMENT = Quantity(
     "allongement desplazamiento spostamento",
 )
 FORCE = Quantity("force", "force", unit="n", words="force load kraft last fuerza forza")
+TORQUE = Quantity(
+    "torque", "torque", unit="nm", words="torque moment drehmoment couple torsionsmoment momento"
+)
+ANGLE = Quantity(
+    "angle",
+    "angle",
+    unit="rad",
+    words="angle rotation twist winkel drehwinkel verdrehwinkel verdrehung angolo ángulo",
+)
 STRAIN = Quantity(
     *("strain", "ratio"),
     unit="1",
@@ -89,6 +104,10 @@ LATERAL_STRETCH = Quantity(
     "lateral_stretch", "ratio", unit="1", words=_STRETCHES, qualifier="lateral", unitless=True
 )
 SECOND_STRAIN = Quantity("second_strain", "ratio", unit="1", words=STRAIN.words, qualifier="second")
+SECOND_DISPLACEMENT = Quantity(
+    "second_displacement", "length", unit="m", words=DISPLACEMENT.words, qualifier="second"
+)
+SECOND_FORCE = Quantity("second_force", "force", unit="n", words=FORCE.words, qualifier="second")
 LATERAL_STRAIN = Quantity(
     "lateral_strain", "ratio", unit="1", words=STRAIN.words, qualifier="lateral"
 )
@@ -135,11 +154,15 @@ NOISES = {
 }
 KNOWN_QUANTITIES = (
     *(TIME, *DISPLACEMENTS, *FORCES, *TORQUES),
-    *(DISPLACEMENT, FORCE, STRAIN, STRESS, TENSION, PRESSURE),
+    *(DISPLACEMENT, FORCE, TORQUE, ANGLE, STRAIN, STRESS, TENSION, PRESSURE),
     *(STRETCH, SECOND_STRETCH, LATERAL_STRETCH, SECOND_STRAIN, LATERAL_STRAIN),
+    *(SECOND_DISPLACEMENT, SECOND_FORCE),
     *(VOLUME_RATIO, SECOND_STRESS, TRUE_STRESS, STRESS_DIFFERENCE, MODULUS),
     *(FREQUENCY, STORAGE, LOSS, LOSS_FACTOR),
 )
+
+# Name of a column that no column of a table fits.
+MISSING = "…"
 
 # A column's name and its unit: Load (kN), Load [kN], Load / kN, Load in kN, load_kn.
 _NAMED = re.compile(
@@ -151,14 +174,64 @@ _BARE_UNIT = re.compile(r"(?P<name>[^/]*?[^/\s])(?:\s+|/)(?P<unit>[^\s\d][^\s]*)
 # A unit with underscores, as in stress_kgf_cm2.
 _PER_AREA = re.compile(r"(?P<name>.+)_(?P<unit>[^\W_]+)_(?P<area>[^\W_]+)")
 # Strains and stresses of the deformed specimen, which neither its length nor its area multiplies.
-_DEFORMED = {"true", "wahre", "cauchy", "logarithmic", "logarithmische", "log", "hencky", "natural"}
+_DEFORMED = {
+    "true",
+    "wahre",
+    "cauchy",
+    "logarithmic",
+    "logarithmische",
+    "log",
+    "hencky",
+    "natural",
+    "ln",
+}
+# Strains and stresses of other measures, with what the strains are and the stretch that they give.
+_GREEN = ("a Green-Lagrange strain", "√(1 + 2 E)")
+_ALMANSI = ("an Almansi strain", "1/√(1 − 2 e)")
+_LOGARITHM = ("a true strain, the logarithm of the stretch", "the exponential of the true strain")
+STRAIN_MEASURES = {
+    **dict.fromkeys(("lagrange", "lagrangian", "green"), _GREEN),
+    **dict.fromkeys(("almansi", "euler", "eulerian"), _ALMANSI),
+    **dict.fromkeys(_DEFORMED, _LOGARITHM),
+}
+_OTHER_MEASURES = {*(STRAIN_MEASURES.keys() - _DEFORMED), "piola", "kirchhoff", "pk"}
+# The first Piola-Kirchhoff stress is the engineering stress.
+_FIRST_PIOLA = re.compile(r"(first|1st|1\.)\s+(piola([\s–-]+kirchhoff)?|pk)\b|\bpk\s?1\b")
+# What the words of a name state about strains, stresses and moduli, or about the axis.
+KINDS = {
+    "tension": re.compile(r"tensile|\bzug|young|\b(uni)?axial|\bnormal|compressive|druckspann"),
+    "shear": re.compile(r"shear|schub|scher|cisaillement|cortante|taglio|torsion|gamma|γ|\btau|τ"),
+    "simple shear": re.compile(r"\bsimple\b|\beinfache"),
+    "pure shear": re.compile(r"\bpure\b|\bplanar\b|\breine"),
+    "two axes": re.compile(r"\b(equi-?)?biaxial"),
+    "volume": re.compile(r"volumetric|volumen|hydrostat|\bbulk|\bkompressionsmodul"),
+    "absolute": re.compile(r"\babs(olute)?\b|absolut"),
+    **{axis: re.compile(rf"(?<![^\W\d_]){axis}(?![^\W\d_])") for axis in "xyz"},
+}
+# Symbols of moduli, as in E(t) and G′.
+_MODULUS_SYMBOLS = {
+    "tension": re.compile(r"\be(?![^\W\d_])"),
+    "shear": re.compile(r"\bg(?![^\W\d_])"),
+}
+# Words that state nothing that a reading could contradict.
+_NEUTRAL = (
+    "engineering eng nominal technical technische technischer ingénieur measured gemessen "
+    "gemessene actual raw value signal channel kanal sensor transducer cell machine maschine "
+    "instron zwick mts standard traverse grip clamp video optical extensometer gauge dic "
+    "digital camera laser elapsed test run of the in from axial uniaxial tensile compressive "
+    "compression zug prüf st first cable tendon chamber relative relaxation dynamic angular "
+    "delta δ ratio amount shear sigma σ epsilon eps ε nominale spannungs elastizitäts "
+    "relaxations kolben längen stauch"
+)
 # German compounds end with what they are: Druckspannung, Prüfkraft, Kolbenweg.
 _COMPOUND = re.compile(
-    r"(?P<first>\w+)(?P<last>zeit|weg|kraft|last|spannung|dehnung|stauchung|streckung|druck)"
+    r"(?P<first>\w+)(?P<last>zeit|weg|kraft|last|spannung|dehnung|stauchung|streckung|druck|"
+    r"modul)"
 )
 # Words in the name of a column that distinguish quantities with the same other words, by key.
 QUALIFIERS = {
     "deformed": _DEFORMED,
+    "measure": _OTHER_MEASURES,
     "second": {"second", "zweite"},
     "lateral": {"lateral", "transverse", "quer"},
     "difference": {"difference", "differenz", "différence"},
@@ -168,8 +241,8 @@ QUALIFIERS = {
     "factor": {"factor", "tan", "tanδ"},
     # Of no quantity: values that are computed from others, of something else, or not measured.
     "other": {
-        *("deviatoric", "hydrostatic", "mises", "tresca"),
-        *("volumetric", "rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
+        *("deviatoric", "mises", "tresca", "complex", "tangent", "secant", "plastic", "thermal"),
+        *("rate", "energy", "error", "fehler", "deviation", "abweichung", "std"),
         *("uncertainty", "residual", "target", "setpoint", "command", "commanded", "sollwert"),
         *("soll", "vor"),
         *("amplitude", "range", "strength", "limit", "noise"),
@@ -192,6 +265,23 @@ class QuantityTable:
     unread: tuple[str, ...] = ()
     # dict: (T,) array of standard deviations by their key of `NOISES`, NaN where missing.
     noises: Mapping[str, Array] = field(default_factory=dict)
+    # Words of names that are not understood, and what else was assumed, a sentence each.
+    notes: tuple[str, ...] = ()
+    row_count: int = 0  # rows of the file, of which those within the window are read
+    # dict: why a column that has a quantity's word does not hold it, by its name.
+    contradictions: Mapping[str, str] = field(default_factory=dict)
+    of_others: Collection[str] = ()  # columns of noise, and of others
+
+    def contradiction(self, quantities: Sequence[Quantity]) -> str:
+        """Return why columns with words of some quantities do not hold them; "" without any."""
+        words = set().union(*(quantity.words.split() for quantity in quantities))
+        found = [why for name, why in self.contradictions.items() if _words(name) & words]
+        return "; ".join(found)
+
+    @property
+    def known_grid(self) -> Table:
+        """Table in which columns that do not hold what their names say have no names."""
+        return _without_names(self.grid, {*self.contradictions, *self.of_others})
 
 
 @names_file_in_errors
@@ -206,6 +296,9 @@ def read_columns(
     column_advice: Callable[[Table], str] | None = None,
     noise_columns: Mapping[str, str] | None = None,
     other_columns: Collection[str] = (),
+    header_line: int | None = None,
+    window_s: tuple[float, float] | None = None,
+    other_kinds: Mapping[str, str] | None = None,
 ) -> QuantityTable:
     """Read those of some quantities that a table has, in any order, in SI units.
 
@@ -216,11 +309,12 @@ def read_columns(
         follow the name, as in "Load (N)". Other columns are not looked for if a quantity besides
         the time is mapped; without mapping, columns are recognised by name.
     blank_allowed : bool
-        Whether cells may be blank, which become NaN; a column of blank cells alone is refused.
+        Whether cells may be blank, which become NaN; a column of blank cells alone counts as
+        missing.
     requires_times : bool
         Whether times are required; otherwise rows are numbered in seconds if there are no times.
     is_timed : bool
-        Whether times must be numbers that increase; otherwise a time that is no number is NaN.
+        Whether times must increase; otherwise rows whose times do not are numbered, with a note.
     requires_all : bool
         Whether each of `quantities` is required; otherwise one is enough.
     column_advice : callable, optional
@@ -230,45 +324,145 @@ def read_columns(
         Column name by the key of `NOISES` that names it; these columns hold no other quantity.
     other_columns : collection of str
         Names of columns that others read, such as the noise of another sensor in the same file.
+    header_line : int, optional
+        Line of the column names; by default that above the longest table.
+    window_s : (float, float), optional
+        First and last time of the rows to read; cells of other rows are not read.
+    other_kinds : mapping, optional
+        Kinds among `KINDS` that the quantities do not have, with the statement that reads them,
+        such as 'test = "simple-shear"'; columns whose names state them are not read.
 
     Raises
     ------
     InputError
-        If a column is missing, repeated, unknown, without unit or with a wrong one, a cell is not a
-        number, or time does not increase (`is_timed`); the line is named.
+        If a column is missing, repeated, unknown, without unit or with a wrong one, its name
+        contradicts the quantity, a cell is not a number, or time does not increase; the line is
+        named.
     """
-    grid = read_table(path)
-    noises = {}
-    for key, name in (noise_columns or {}).items():
-        place, factor = _column_named_by_user(grid, NOISES[key], name=name, where=key)
-        noises[key] = factor * numeric_cells(grid, [place], blank_allowed=True)[:, 0]
-        grid = grid.without_column(place)
-    for name in other_columns:
-        if column := next((c for c in (name, name_and_unit(name)[0]) if c in grid.columns), None):
-            grid = grid.without_column(grid.columns.index(column))
-    if "t_s" in grid.columns and not column_names:
-        _require_known_columns(grid, quantities, all_of=requires_all)
-    places = _find_columns(grid, quantities, mapped=column_names or {}, column_advice=column_advice)
+    grid = read_table(path, header_line)
+    named = dict(column_names or {})
+    kinds = other_kinds or {}
+    noise_places = {
+        key: _column_named_by_user(grid, NOISES[key], name=name, where=key)
+        for key, name in (noise_columns or {}).items()
+    }
+    of_others = {grid.columns[place] for place, _ in noise_places.values()} | {*other_columns}
+    if "t_s" in grid.columns and not named:
+        known = _without_names(grid, of_others)
+        _require_known_columns(grid, known.columns, quantities, all_of=requires_all)
+    empty = [c for k, c in enumerate(grid.columns) if c and _is_blank(grid, k)]
+    contradictions = {} if named.keys() - {TIME.key} else _contradictions(grid, quantities, kinds)
+    sought = _without_names(grid, {*empty, *contradictions, *of_others})
+    places = _find_columns(grid, sought, quantities, mapped=named, column_advice=column_advice)
     t = places.pop(TIME.key, None)
-    if len(places) < (len(quantities) if requires_all else 1) or (requires_times and t is None):
-        advice = "" if column_advice is None or places else f". State {column_advice(grid)}"
+    needs_times = requires_times or window_s is not None
+    unused = [c for c in empty if any(_name_fits(c, each) for each in quantities)]
+    contradictions |= {column: f"column {column} has no values" for column in unused}
+    if len(places) < (len(quantities) if requires_all else 1) or (needs_times and t is None):
+        if contradictions and not places:
+            raise grid.error_at("; ".join(contradictions.values()))
+        advice = "" if column_advice is None or places else f". State {column_advice(sought)}"
         raise _columns_error(grid, quantities, all_of=requires_all, advice=advice)
-    values = {}
-    for key, (place, factor) in places.items():
-        values[key] = factor * numeric_cells(grid, [place], blank_allowed=blank_allowed)[:, 0]
-        if np.isnan(values[key]).all():
-            raise InputError(f"column {grid.columns[place]} has no values; remove it")
-    t_s = np.arange(float(len(grid.cells)))
-    if t is not None:
-        t_s = times_in_column(grid, *t, is_timed=is_timed)
-    used = [place for place, _ in (*places.values(), *([] if t is None else [t]))]
-    unread = [
-        column
-        for place, column in enumerate(grid.columns)
-        if place not in used and name_and_unit(column)[1] is not None
+    t_s, rows, notes = _times(grid, t, is_timed, window_s)
+    kept = grid if len(rows) == len(grid.cells) else grid.with_rows(rows)
+    values = {
+        key: factor * numeric_cells(kept, [place], blank_allowed=blank_allowed)[:, 0]
+        for key, (place, factor) in places.items()
+    }
+    noises = {
+        key: factor * numeric_cells(kept, [place], blank_allowed=True)[:, 0]
+        for key, (place, factor) in noise_places.items()
+    }
+    used = {place for place, _ in (*places.values(), *noise_places.values(), *([t] if t else []))}
+    left = [c for k, c in enumerate(grid.columns) if k not in used and c not in other_columns]
+    unread = [c for c in left if name_and_unit(c)[1] is not None and c not in unused]
+    by_key = {quantity.key: quantity for quantity in quantities}
+    of_user = {key: place for key, (place, _) in places.items() if key in named}
+    notes += [
+        f"the name of column {grid.columns[place]} states {kind}, and it is read as "
+        f"{by_key[key].text}, because columns states so"
+        for key, place in of_user.items()
+        for kind in _stated_kinds(grid.columns[place], by_key[key], kinds)
     ]
-    unread = [] if column_names else unread
-    return QuantityTable(grid, t_s, values=values, unread=tuple(unread), noises=noises)
+    words = {
+        f"{listed([repr(each) for each in unknown])} in {grid.columns[place]!r}, which is read as "
+        f"{by_key[key].text}"
+        for key, (place, _) in places.items()
+        if key not in of_user and (unknown := _unknown_words(grid.columns[place], by_key[key]))
+    }
+    notes += [f"column {column} has no values: it is not read" for column in unused]
+    if words:
+        notes.append(f"words that are not understood: {'; '.join(sorted(words))}")
+    return QuantityTable(
+        kept,
+        t_s,
+        values=values,
+        unread=() if named else tuple(unread),
+        noises=noises,
+        notes=tuple(notes),
+        row_count=len(grid.cells),
+        contradictions=contradictions,
+        of_others=of_others,
+    )
+
+
+def _is_blank(grid: Table, place: int) -> bool:
+    """Return whether a column has no values at all."""
+    cells = grid.cells[:, place]
+    if cells.dtype != object:
+        return bool(np.isnan(cells).all())
+    return all(cell == "" or cell.lower() == "nan" for cell in cells)
+
+
+def _without_names(grid: Table, names: Collection[str]) -> Table:
+    """Return a table in which columns of some names, with or without units, have no name."""
+    is_other = [c in names or name_and_unit(c)[0] in names for c in grid.columns]
+    columns = ["" if is_so else c for c, is_so in zip(grid.columns, is_other, strict=True)]
+    return replace(grid, columns=columns)
+
+
+def _times(
+    grid: Table,
+    column: tuple[int, float] | None,
+    is_timed: bool,
+    window_s: tuple[float, float] | None,
+) -> tuple[Array, Index, list[str]]:
+    """Return the times (k,) and the indices (k,) of the rows to read, and notes.
+
+    The rows of a window are those from the first time in it to the last before a time after it.
+    Only the times of rows that are read are validated, and only if `is_timed`.
+    """
+    every = np.arange(len(grid.cells))
+    if column is None:
+        return every.astype(float), every, []
+    place, factor = column
+    times = grid.numbers_where_possible(place) * factor
+    rows = every
+    if window_s is not None:
+        first_s, last_s = window_s[0] - TIME_TOLERANCE_S, window_s[1] + TIME_TOLERANCE_S
+        begun = np.flatnonzero((times >= first_s) & (times <= last_s))
+        rows = every[begun[0] :] if len(begun) else every[:0]
+        ended = np.flatnonzero(times[rows] > last_s)
+        rows = rows[: ended[0]] if len(ended) else rows
+        if not len(rows):
+            known = times[np.isfinite(times)]
+            span = f", {known.min():g} s to {known.max():g} s" if len(known) else ""
+            raise InputError(
+                f"found [{window_s[0]:g}, {window_s[1]:g}], which contains no sample; expected a "
+                f"window within the times of the table{span}",
+                where="window_s",
+            )
+    kept = grid.with_rows(rows)
+    try:
+        return times_in_column(kept, place, factor), rows, []
+    except InputError as error:
+        if is_timed:
+            raise
+        note = (
+            f"times are not in order ({error.where}: {error.message}); the rows are taken as they "
+            "stand, because the law does not depend on times"
+        )
+        return np.arange(float(len(rows))), rows, [note]
 
 
 # Choice of columns --------------------------------------------------------------------------------
@@ -276,10 +470,12 @@ def read_columns(
 
 def _find_columns(
     grid: Table,
+    among: Table,
     quantities: Sequence[Quantity],
     mapped: Mapping[str, str],
     column_advice: Callable[[Table], str] | None = None,
 ) -> dict[str, tuple[int, float]]:
+    """Columns that the user did not name are recognised by their names in `among`."""
     by_key = {quantity.key: quantity for quantity in (TIME, *quantities)}
     for key in mapped:
         if key not in by_key:
@@ -293,7 +489,7 @@ def _find_columns(
         quantity.key: column
         for quantity in (TIME, *sought)
         if quantity.key not in chosen
-        and (column := find_column(grid, quantity, sought, advice=column_advice)) is not None
+        and (column := find_column(among, quantity, sought, advice=column_advice)) is not None
     }
     return chosen | recognised
 
@@ -311,18 +507,25 @@ def _column_named_by_user(
             f"{where or f'columns.{quantity.key}'} is {name!r}, which {fault}; the columns are "
             f"{', '.join(grid.columns)}{hint_at(name, grid.columns)}"
         )
-    units = [each for each in (name_and_unit(column)[1], unit_of_user) if each]
+    if _is_blank(grid, grid.columns.index(column)):
+        raise grid.error_at(
+            f"{where or f'columns.{quantity.key}'} is {name!r}, which has no values; expected "
+            f"another of the columns {', '.join(grid.columns)}"
+        )
+    own = name_and_unit(column)[1]
+    is_part_of_name = quantity.unitless or column.endswith(f"_{own}")
+    if own and is_part_of_name and not any(si_factor(own, each) for each in UNITS):
+        own = None
+    units = [each for each in (own, unit_of_user if column == bare else own) if each]
     unit = next((each for each in units if not each.isdigit()), "1" if "1" in units else None)
     if unit is None and quantity.unitless:
         unit = quantity.unit
-    if quantity in (STRAIN, STRESS) and _words(column) & _DEFORMED:
-        raise grid.error_at(
-            f"column {column} refers to the deformed specimen; expected engineering "
-            f"{quantity.key}, relative to the undeformed length or area"
-        )
+    if contradiction := _other_measure(column, quantity):
+        raise grid.error_at(contradiction)
     factor = None if unit is None else si_factor(unit, quantity.dimension)
     if factor is None:
-        raise _unit_error(grid, column, unit=unit, quantity=quantity)
+        key = where or f"columns.{quantity.key}"
+        raise _unit_error(grid, column, unit=unit, quantity=quantity, stated_by=key)
     return grid.columns.index(column), factor
 
 
@@ -366,7 +569,9 @@ def find_column(
         return fitting[0]
     explained = {k for other in others for k, _ in _fitting_columns(grid, other)}
     if (wrong := next((k for k in units if k not in explained), None)) is not None:
-        raise _unit_error(grid, grid.columns[wrong], unit=units[wrong], quantity=quantity)
+        raise _unit_error(
+            grid, grid.columns[wrong], unit=units[wrong], quantity=quantity, advice=advice
+        )
     return None
 
 
@@ -419,7 +624,7 @@ def similar_column_names(grid: Table, quantity: Quantity) -> list[str]:
 
     These are columns of quantities whose unit, which is no number, fits, as "s_mpa" for a stress,
     and of `unitless` quantities those with one of its words and no unit but a number, as "lambda_2" for
-    a second stretch. Names that fit another known quantity are left out.
+    a second stretch. Names and units that fit another known quantity are left out.
     """
     names = []
     for column in grid.columns:
@@ -440,19 +645,115 @@ def similar_column_names(grid: Table, quantity: Quantity) -> list[str]:
             is_similar
             and not _other_word(column)
             and not _words(name) & _DEFORMED
-            and not any(_name_fits(column, each) for each in others)
+            and not any(
+                _name_fits(column, each) and unit and si_factor(unit, each.dimension) is not None
+                for each in others
+            )
         ):
             names.append(column)
     return names
 
 
-def deformed_column_names(grid: Table, quantity: Quantity) -> list[str]:
-    """Return the names of all columns that hold a quantity of the deformed specimen, such as a true
-    stress or a logarithmic strain, in their order.
+def _contradictions(
+    grid: Table, quantities: Sequence[Quantity], other_kinds: Mapping[str, str]
+) -> dict[str, str]:
+    """Return why columns do not hold quantities although they have their words, by name."""
+    found: dict[str, str] = {}
+    for column in grid.columns:
+        if any(
+            _name_fits(column, q) and not _stated_kinds(column, q, other_kinds) for q in quantities
+        ):
+            continue
+        for quantity in quantities:
+            if _key_of(name := name_and_unit(column)[0]) == quantity.key:
+                continue
+            if not _words(name) & set(quantity.words.split()):
+                continue
+            why = _other_measure(column, quantity)
+            if not why and _name_fits(column, quantity):
+                kind = _stated_kinds(column, quantity, other_kinds)[0]
+                why = _kind_text(column, quantity, kind, remedy=other_kinds[kind])
+            if why:
+                found.setdefault(column, why)
+    return found
+
+
+def _kind_text(column: str, quantity: Quantity, kind: str, remedy: str) -> str:
+    statement = column_statement({quantity.key: column})
+    return (
+        f"the name of column {column} states {kind}, which contradicts its reading; expected {remedy}, "
+        f"or {statement} if the column holds the {quantity.text} of this table"
+    )
+
+
+def _other_measure(column: str, quantity: Quantity) -> str:
+    """Return why a column is no engineering strain or stress, or ""."""
+    words = _words(name_and_unit(column)[0])
+    if "strain" in quantity.key:
+        for word in sorted(words & STRAIN_MEASURES.keys()):
+            what, stretch = STRAIN_MEASURES[word]
+            return (
+                f"column {column} holds {what}; expected an engineering strain, or the stretch, "
+                f"which is {stretch}: convert its values, then call it stretch"
+            )
+    if quantity.key in (STRESS.key, SECOND_STRESS.key):
+        if words & _DEFORMED:
+            return (
+                f"column {column} holds a true stress, force over deformed area; expected an "
+                "engineering stress, force over undeformed area"
+            )
+        if words & _OTHER_MEASURES:
+            return (
+                f"the name of column {column} states another measure of stress; expected an "
+                "engineering stress, force over undeformed area"
+            )
+    return ""
+
+
+def _stated_kinds(column: str, quantity: Quantity, other_kinds: Mapping[str, str]) -> list[str]:
+    """Return those of some kinds of `KINDS` that the name of a quantity's column states.
+
+    Kinds of tests are those of strains, stresses and moduli: machines call forces tensile in any
+    test.
     """
-    words = set(quantity.words.split())
-    named = ((column, _words(name_and_unit(column)[0])) for column in grid.columns)
-    return [column for column, own in named if own & words and own & _DEFORMED]
+    name = name_and_unit(column)[0].lower()
+    if _key_of(name) == quantity.key:
+        return []
+    is_of_test = quantity.dimension in ("ratio", "pressure")
+    is_modulus = quantity.key in (MODULUS.key, STORAGE.key, LOSS.key)
+    return [
+        kind
+        for kind in other_kinds
+        if (is_of_test or kind in "xyz")
+        and (
+            KINDS[kind].search(name)
+            or (is_modulus and kind in _MODULUS_SYMBOLS and _MODULUS_SYMBOLS[kind].search(name))
+        )
+    ]
+
+
+def _unknown_words(column: str, quantity: Quantity) -> list[str]:
+    """Return the words of a recognised column's name that are not understood."""
+    name = name_and_unit(column)[0].lower()
+    if _key_of(name) == quantity.key:
+        return []
+    qualifiers = {"storage": "modulus", "loss": "modulus", "factor": "loss"}
+    own = [quantity.qualifier, qualifiers.get(quantity.qualifier, "")]
+    known = {*quantity.words.split(), *_NEUTRAL.split()}
+    known |= set().union(*(QUALIFIERS.get(key, ()) for key in own), quantity.key.split("_"))
+    patterns = [*KINDS.values(), *(_MODULUS_SYMBOLS.values() if "modulus" in own else ())]
+    known |= {*"futp"} if "modulus" in own or len(own[0]) == 0 else set()
+
+    def is_known(word: str) -> bool:
+        if _words(word) & known and not _COMPOUND.fullmatch(word):
+            return True
+        if compound := _COMPOUND.fullmatch(word):
+            first, last = compound["first"], compound["last"]
+            return word in known or (last in known and is_known(first))
+        return any(pattern.search(word) for pattern in patterns)
+
+    plain = _FIRST_PIOLA.sub("nominal", re.sub(r"['’]s\b", "", name))
+    return [word for word in re.findall(r"[^\W\d_]+", plain) if not is_known(word)]
 
 
 def column_statement(names: Mapping[str, str]) -> str:
@@ -496,7 +797,10 @@ def other_columns_text(grid: Table, quantities: Sequence[Quantity] = ()) -> str:
 
 def _other_word(column: str, own: Collection[str] = ()) -> str:
     """Return the word that makes a column another quantity than any that is read, or ""."""
-    keys = ("other", "difference", "storage", "loss", "modulus", *(("deformed",) if own else ()))
+    keys = (
+        *("other", "measure", "difference", "storage", "loss", "modulus"),
+        *(("deformed",) if own else ()),
+    )
     words = _words(name_and_unit(column)[0])
     others = (words & QUALIFIERS[key] for key in keys if key not in own)
     return next((word for found in others for word in sorted(found)), "")
@@ -532,7 +836,7 @@ def names_compression(column: str) -> bool:
 
 def _words(name: str) -> set[str]:
     """Return sequences of letters in lower case, also as singulars and parts of compounds."""
-    words = set(re.findall(r"[^\W\d_]+", name.lower()))
+    words = set(re.findall(r"[^\W\d_]+", _FIRST_PIOLA.sub("nominal", name.lower())))
     words |= {word[: -len(end)] for word in words for end in ("s", "es") if word.endswith(end)}
     compounds = [*filter(None, map(_COMPOUND.fullmatch, words))]
     firsts = {c["first"] for c in compounds} & _ALL_QUALIFIERS
@@ -542,9 +846,11 @@ def _words(name: str) -> set[str]:
 # Errors -------------------------------------------------------------------------------------------
 
 
-def _require_known_columns(grid: Table, quantities: Sequence[Quantity], all_of: bool) -> None:
+def _require_known_columns(
+    grid: Table, columns: Collection[str], quantities: Sequence[Quantity], all_of: bool
+) -> None:
     known = {quantity.key for quantity in KNOWN_QUANTITIES}
-    for column in grid.columns:
+    for column in filter(None, columns):
         if name_and_unit(column)[0].lower() not in known:
             hint = hint_at(column, [quantity.column for quantity in quantities])
             raise _columns_error(
@@ -569,7 +875,15 @@ def _columns_error(
     )
 
 
-def _unit_error(grid: Table, column: str, unit: str | None, quantity: Quantity) -> InputError:
+def _unit_error(
+    grid: Table,
+    column: str,
+    unit: str | None,
+    quantity: Quantity,
+    stated_by: str = "",
+    advice: Callable[[Table], str] | None = None,
+) -> InputError:
+    """The remedy states columns where that is possible: by the user (`stated_by`), or by advice."""
     name = name_and_unit(column)[0] or column
     has = f"has the unit {unit}" if unit else "names no unit"
     remedy = (
@@ -577,6 +891,14 @@ def _unit_error(grid: Table, column: str, unit: str | None, quantity: Quantity) 
         if unit
         else f"add the unit that it has, for example {name} ({quantity.unit})"
     )
+    if not unit and stated_by:
+        with_unit = json.dumps(f"{column} ({quantity.unit})", ensure_ascii=False)
+        remedy = f"add the unit that it has, for example {stated_by} = {with_unit}"
+    statement = "" if advice is None else advice(_without_names(grid, [column]))
+    if MISSING in statement and advice is not None:
+        statement = advice(grid)
+    if statement and MISSING not in statement:
+        remedy = f"state {statement}; or {remedy}"
     return grid.error_at(
         f"column {column} {has}; expected {expected_units(unit or '', quantity.dimension)}: "
         f"{remedy}"

@@ -32,13 +32,17 @@ def open_source(path: str | Path) -> Table | bytes:
         raise InputError(f"the file cannot be read: {error.strerror}") from error
 
 
-def as_table(source: Table | bytes) -> Table:
-    """Return the table of a source, whose text is parsed; errors as of `decode` and
+def as_table(
+    source: Table | bytes, header_line: int | None = None, names_required: bool = True
+) -> Table:
+    """Return the table of a source, whose text is parsed; arguments and errors as of `decode` and
     `parse_table`.
     """
-    return source if isinstance(source, Table) else parse_table(decode(source))
+    if isinstance(source, Table):
+        return source
+    return parse_table(decode(source), header_line, names_required)
 
 
-def read_table(path: str | Path) -> Table:
+def read_table(path: str | Path, header_line: int | None = None) -> Table:
     """Return the table of a file or of a topic; errors as of `open_source` and `as_table`."""
-    return as_table(open_source(path))
+    return as_table(open_source(path), header_line)

@@ -12,14 +12,14 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import wraps
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.array_types import Array
-from ...errors import InputError, excerpt, located
+from ...common.array_types import Array, Index
+from ...errors import InputError, excerpt, listed, located
 from ..sample_times import first_unordered_time
 from .units import UNITS, si_factor
 
@@ -31,7 +31,10 @@ LARGEST_NUMBER = 1e100
 # by this factor.
 MISSING_CODES = (-999.0, -9999.0, -99999.0, -999999.0, 9999.0, 99999.0, 999999.0)
 CODE_RATIO = 10.0
-_ENCODINGS = ("utf-8-sig", "utf-16", "cp1252")
+_NOT_MEASURED = ("nan", "na", "n/a", "null", "none", "-", "--", "inf")
+# Encodings, and the position of the zero byte of Latin letters in those of two bytes without a mark.
+_ENCODINGS = ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252")
+_ZERO_BYTES = {"utf-16-le": 1, "utf-16-be": 0}
 _CONTROL = re.compile("[\x01-\x08\x0e-\x1f]")
 _SEPARATOR = re.compile("[,;\t]")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
@@ -67,6 +70,18 @@ class Table:
         names = [name for k, name in enumerate(self.columns) if k != place]
         return replace(self, columns=names, cells=np.delete(self.cells, place, axis=1))
 
+    def with_rows(self, rows: Index) -> Table:
+        """Return the table of rows, by their indices."""
+        return replace(self, cells=self.cells[rows], lines=[self.lines[k] for k in rows.tolist()])
+
+    def numbers_where_possible(self, place: int) -> Array:
+        """Return the numbers (rows,) of a column, NaN where a cell is none."""
+        cells = self.cells[:, place]
+        if cells.dtype != object:
+            return np.asarray(cells, dtype=float)
+        numbers = np.vectorize(_number_of_cell, otypes=[float])(cells)
+        return np.where(np.isfinite(numbers), numbers, np.nan)
+
     def error_at(self, message: str, row: int | None = None) -> InputError:
         """Return an `InputError` about a row, by its index from 0, or about the column names if
         `row` is None; the error names the line.
@@ -91,7 +106,7 @@ def names_file_in_errors(
 
 
 def decode(content: bytes) -> str:
-    """Return the text of bytes in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
+    """Return the text of bytes in UTF-8, UTF-16 or Windows-1252.
 
     Raises
     ------
@@ -113,6 +128,11 @@ def _decoded(content: bytes, encoding: str) -> str | None:
     """Return the text of bytes in an encoding; None if it is not text in that encoding."""
     # Encodings that decode anything must also have separators and no control characters.
     if encoding == "utf-16" and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return None
+    # Latin letters in two bytes without a byte order mark.
+    if (place := _ZERO_BYTES.get(encoding)) is not None and (
+        len(content) % 2 or 2 * content[place::2].count(0) < 0.9 * len(content)
+    ):
         return None
     try:
         text = content.decode(encoding)
@@ -180,7 +200,9 @@ def tab_rows(text: str) -> list[Row]:
     return [Row(k, [cell.strip() for cell in line.split("\t")]) for k, line in lines if line]
 
 
-def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> Table:
+def table_of_rows(
+    columns: list[str], rows: list[Row], names_line: int = 1, remedy: str = ""
+) -> Table:
     """Return a table of rows that are as wide as their column names.
 
     Blank columns at the end of all rows are cut.
@@ -189,6 +211,8 @@ def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> T
     ----------
     names_line : int
         Line of the column names, counted from 1.
+    remedy : str
+        Added to the message about a row of another length.
 
     Raises
     ------
@@ -207,37 +231,102 @@ def table_of_rows(columns: list[str], rows: list[Row], names_line: int = 1) -> T
         if len(row.cells) != width:
             raise InputError(
                 f"the row has {len(row.cells)} cells; expected {width}, as many as the header has "
-                "columns",
+                f"columns{remedy}",
                 where=f"line {row.line}",
             )
     cells = np.array([row.cells for row in rows], dtype=object)
     return Table(columns, cells, [row.line for row in rows], names_line)
 
 
-def parse_table(text: str) -> Table:
+def parse_table(text: str, header_line: int | None = None, names_required: bool = True) -> Table:
     """Return a table from text of separated cells with a row of column names.
 
-    Lines above the names are skipped; units in a row of their own are joined to the names, as in
-    "Load (N)".
+    Of several tables, the longest is returned. Other lines above the names are skipped; units in a
+    row of their own are joined to the names, as in "Load (N)".
+
+    Parameters
+    ----------
+    header_line : int, optional
+        Line of the column names.
+    names_required : bool
+        Whether a row of numbers in place of the names is refused.
 
     Raises
     ------
     InputError
-        If the text is no such table, has no rows, or rows of different lengths.
+        If the text is no such table, has no rows, rows of different lengths, or two long tables.
     """
     rows = separated_rows(text)
-    # The names are above the first row that holds several cells, of numbers only.
-    numeric = (
-        k
-        for k, row in enumerate(rows)
-        if len(row.cells) > 1 and all(is_number(c.replace(",", ".")) for c in row.cells if c)
-    )
-    names = 0 if "t_s" in rows[0].cells else max(next(numeric, 0) - 1, 0)
+    numeric = [_is_numeric(row) for row in rows]
+    if header_line is None:
+        names = _longest_table(rows, numeric)
+    else:
+        names = next((k for k, row in enumerate(rows) if row.line == header_line), None)
+        if names is None or numeric[names]:
+            found = "no text" if names is None else "numbers"
+            raise InputError(
+                f"line {header_line} has {found}; expected the row of the column names",
+                where="header_line",
+            )
+        units = rows[names + 1].cells if names + 1 < len(rows) else []
+        if units and not numeric[names + 1] and all(map(_is_unit, units)):
+            names += 1
+    if names_required and numeric[names]:
+        raise InputError(
+            "found a row of numbers and no row of column names above it; expected names with units, "
+            'such as "time (s)"',
+            where=f"line {rows[names].line}",
+        )
     header = rows[names].cells
-    if names and all(map(_is_unit, header)):
+    if names and not numeric[names] and all(map(_is_unit, header)):
         above = rows[names - 1].cells
         header = [f"{a} ({u.strip('()[]')})" for a, u in zip_longest(above, header, fillvalue="")]
-    return table_of_rows(header, rows[names + 1 :], names_line=rows[names].line)
+    line = rows[names].line
+    remedy = (
+        f" in line {line}; specimens and test benches state another line as header_line"
+        if line > 1
+        else ""
+    )
+    return table_of_rows(header, rows[names + 1 :], names_line=line, remedy=remedy)
+
+
+def _is_numeric(row: Row) -> bool:
+    """Return whether a row has several cells, of numbers only."""
+    return len(row.cells) > 1 and all(is_number(c.replace(",", ".")) for c in row.cells if c)
+
+
+def _longest_table(rows: list[Row], numeric: list[bool]) -> int:
+    """Return the index of the names of the longest table.
+
+    Names of a further table are a row of texts only above a row of numbers: a row of the table with
+    a wrong cell is none. Tables above the longest one are skipped.
+    """
+    first = max(numeric.index(True) - 1, 0) if True in numeric else 0
+    if "t_s" in rows[0].cells:
+        return 0
+    further = range(first + 1, len(rows) - 1)
+    starts = [first, *(k for k in further if numeric[k + 1] and _is_header(rows[k]))]
+    counts = [sum(numeric[a:b]) for a, b in pairwise([*starts, len(rows)])]
+    best = starts[counts.index(max(counts))]
+    rivals = [
+        k
+        for k, count in zip(starts, counts, strict=True)
+        if 2 * count > max(counts) or rows[k].cells == rows[best].cells
+    ]
+    if len(rivals) > 1:
+        lines = [rows[k].line for k in rivals]
+        raise InputError(
+            f"found tables below the lines {listed(map(str, lines))}, none of which is the longest "
+            "by far; expected one table, or header_line, the line of its names, which tables of "
+            "specimens and test benches have"
+        )
+    return best
+
+
+def _is_header(row: Row) -> bool:
+    """Return whether a row has texts and no number."""
+    texts = [cell for cell in row.cells if cell and cell.lower() not in _NOT_MEASURED]
+    return len(texts) > 1 and not any(is_number(cell.replace(",", ".")) for cell in texts)
 
 
 def _is_unit(cell: str) -> bool:
@@ -305,24 +394,19 @@ def _require_no_codes(grid: Table, column: int, values: Array, blank_allowed: bo
         )
 
 
-def times_in_column(grid: Table, column: int, factor: float = 1.0, is_timed: bool = True) -> Array:
+def times_in_column(grid: Table, column: int, factor: float = 1.0) -> Array:
     """Return the times (rows,) [s] in a column.
 
     Parameters
     ----------
     factor : float
         Factor from the column's unit to seconds.
-    is_timed : bool
-        Whether times must be numbers that increase; otherwise cells that are no numbers are NaN.
 
     Raises
     ------
     InputError
         If a cell is blank or not a number, or time does not increase; the line is named.
     """
-    if not is_timed:
-        values = np.array([_number_of_cell(str(cell)) for cell in grid.cells[:, column]])
-        return factor * np.where(np.isfinite(values), values, np.nan)
     t_s = factor * numeric_cells(grid, [column], blank_allowed=False)[:, 0]
     if fault := first_unordered_time(t_s):
         raise grid.error_at(fault[1], fault[0])

@@ -24,7 +24,13 @@ UNITS: dict[str, dict[str, float]] = {
         **{"kgf": 9.80665, "kp": 9.80665, "gf": 9.80665e-3, "lbf": 4.4482216152605},
         **{"cn": 1e-2, "dan": 10.0, "dyn": 1e-5, "ozf": 0.27801385095378},
     },
-    "torque": {"nm": 1.0, "nmm": 1e-3, "mnm": 1e-3},
+    "torque": {
+        **{"nm": 1.0, "nmm": 1e-3, "mnm": 1e-3, "ncm": 1e-2, "µnm": 1e-6},
+        **{"n-m": 1.0, "n-mm": 1e-3, "n-cm": 1e-2, "mn-m": 1e-3},
+        **{"lbfin": 0.1129848290276167, "lbf-in": 0.1129848290276167, "in-lbf": 0.1129848290276167},
+    },
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "°": math.pi / 180}
+    | {"rev": 2 * math.pi, "degree": math.pi / 180, "degrees": math.pi / 180},
     "pressure": {
         **{"pa": 1.0, "mPa": 1e-3, "hpa": 1e2, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9},
         **{"n/m²": 1.0, "n/cm²": 1e4, "n/mm²": 1e6, "kn/m²": 1e3, "MN/m²": 1e6, "mn/m²": 1e-3},
@@ -48,12 +54,13 @@ _WRITTEN = {
     **{"n/mm²": "N/mm²", "kn/m²": "kN/m²", "mn/m²": "mN/m²", "mmhg": "mmHg", "cmh₂o": "cmH₂O"},
     **{"hz": "Hz", "khz": "kHz", "cn": "cN", "dan": "daN", "inhg": "inHg", "inh2o": "inH2O"},
 }
-_TORQUES = {"nm": "N m", "nmm": "N mm", "mnm": "mN m"}
+_TORQUES = {"nm": "N m", "nmm": "N mm", "mnm": "mN m", "ncm": "N cm", "µnm": "µN m"}
 # A negative exponent, as in N mm^-2 or N·m⁻².
 _PER_AREA = re.compile(r"[ ·*.]+(m|cm|mm)(?:\^?[-−]2|⁻²)$")
 # Second spellings, which messages leave out.
 _UNWRITTEN = (
     *("um", "un", "us", "cmh2o", "seconds", "second", "msec", "minutes", "hours", "lb/in²"),
+    *("n-m", "n-mm", "n-cm", "mn-m", "lbf-in", "in-lbf", "degree", "degrees"),
     *("percent", "pct", "permille", "um/m", "ue", "ustrain", "µstrain", "microstrain"),
 )
 # What people write where a force is meant.
