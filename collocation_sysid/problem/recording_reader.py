@@ -312,9 +312,9 @@ class RecordingReader:
             at_s, values, sigmas = self._read_wrench(section, key, notes)
             self._add_notes(*(f"{name}: {note}" for note in notes))
             displacement = self.section.moved_sections[k].displacement
-            if displacement is not None and displacement.point_m is not None:
+            if displacement is not None and displacement.point_m and not section.states_axes:
                 # Torques of a machine are about the axis of its rotation.
-                arguments.setdefault("point_m", displacement.point_m)
+                arguments["point_m"] = displacement.point_m
             mounting = self._frames.sensor_mounting(section, key, k=k)
             if note := self._frames.sensor_note(section, mounting):
                 self._add_notes(note)

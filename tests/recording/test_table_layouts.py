@@ -9,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.problem import Problem
 from collocation_sysid.recording import read_displacement, read_wrench
 from collocation_sysid.recording.specimen_files import SpecimenLayout, read_specimen
+from collocation_sysid.result.synthesis import write_data
 
 SAMPLES = "Time,Extension,Load\n(s),(mm),(N)\n" + "".join(
     f'"{0.5 * k}","{0.5 * k}","{2 * k}"\n' for k in range(9)
@@ -164,3 +166,44 @@ def test_angle_and_torque_turn_about_a_point(written, header):
     assert np.isnan(np.delete(values, 4, axis=1)).all()
     with pytest.raises(InputError, match="found a column of angles, but not point_m"):
         read_displacement(file, axis="y")
+
+
+TORSION = """[object]
+box_m = [0.02, 0.02, 0.04]
+edge_length_m = 0.02
+density_kg_m3 = 1000.0
+[parameters]
+young_pa = { guess = 1e5 }
+poisson = 0.45
+gamma_r_s = 0.0
+gamma_m_1_s = 0.0
+[[experiment]]
+name = "turn"
+kind = "static"
+gravity_m_s2 = [0, 0, 0]
+file = "turn.csv"
+[[experiment.grasp]]
+nodes = { face = "bottom" }
+[[experiment.grasp]]
+nodes = { face = "top" }
+displacement = { axis = "z", point_m = [0.01, 0.01, 0.0] }
+wrench = { axis = "z", sigma_nm = 1e-5 }
+"""
+
+
+def test_a_bench_for_torsion_is_simulated_and_read_back(tmp_path):
+    header = "Time (s),Rotation (deg),Torque (N mm)\n"
+    (tmp_path / "turn.csv").write_text(header + "".join(f"{k},{10 * k},{k}\n" for k in range(4)))
+    (tmp_path / "problem.toml").write_text(TORSION)
+    (read,) = Problem.read(tmp_path / "problem.toml").experiments
+    wrench = read.grasps[1].wrench
+    assert wrench is not None
+    np.testing.assert_allclose(wrench.point_m, [0.01, 0.01, 0.0])
+    assert wrench.component_names == ("tz",)
+    problem = Problem.read(tmp_path / "problem.toml", simulation=True)
+    (file,) = write_data(problem, tmp_path / "twin")
+    written = read_displacement(file, point_m=[0.01, 0.01, 0.0], timed=False)
+    poses = read.grasps[1].poses
+    np.testing.assert_allclose(written.quaternions_xyzw, poses.quaternions_xyzw, atol=1e-9)
+    np.testing.assert_allclose(written.positions_m, poses.positions_m, atol=1e-9)
+    assert (np.diff(read_wrench(file, timed=False)[1][:, 5]) > 0).all()
