@@ -237,7 +237,7 @@ def with_volume_of(
     areas = np.linalg.norm(normals, axis=1)
     normals /= areas[:, None]
     middles = (corners + np.roll(corners, -1, axis=1)) / 2  # their mean is exact for arcs
-    samples, planes = _samples_of(scan_m[scan], np.sqrt(areas.min()) / 2)
+    samples, planes = _samples_of(scan_m[scan], np.sqrt(np.median(areas)) / 4)
     nearest = KDTree(samples).query(middles)[1]
     heights = np.einsum("fki,fki->fk", samples[nearest] - middles, planes[nearest])
     gaps = np.einsum("fk,fki,fi->f", heights, planes[nearest], normals) / 3

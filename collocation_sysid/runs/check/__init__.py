@@ -88,8 +88,11 @@ LONGEST_START_S = 8.0
 COST_FACTOR = 1.2
 DESCRIPTION_FACTOR = 3.0
 DERIVATIVE_FACTOR = 5.0
-# Power of the edge length in the time of a sweep: that of a finger with 600 and 3,300 nodes.
+# Powers of the edge length and of the number of nodes in the time of a sweep: those of a finger with 600
+# and 3,300 nodes; and the time of a step with 600 nodes, where none was measured [s].
 EDGE_POWER = 4.5
+NODE_POWER = 1.65
+STEP_S = 0.05
 # Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
 # Largest relative deviation from fourth-order central differences that rounding explains.
@@ -360,8 +363,11 @@ def check_problem(
     if problem.substeps == "auto" and findings.motions:
         steps = problem.choose_first_substeps()
         notes.append(SUBSTEPS_NOTE if steps == 1 else IMPACT_NOTE.format(steps))
-    least_s = TYPICAL_SWEEPS * LONGEST_START_S * _grid_rows(collocation) / _grid_rows(first)
-    search_s = least_s if first_s == np.inf else (chosen_cost and chosen_cost.time_s)
+    search_s = chosen_cost.time_s if chosen_cost else None
+    if first_s == np.inf:
+        nodes = max(body.nodes for body in findings.bodies)
+        step_s = STEP_S * (nodes / 600) ** NODE_POWER
+        search_s = TYPICAL_SWEEPS * _grid_rows(collocation) * step_s
     findings = replace(
         findings, concerns=concerns, edge_of_a_minute_m=_edge_of_a_minute_m(findings, search_s)
     )
