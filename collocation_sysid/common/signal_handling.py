@@ -7,6 +7,7 @@ the imports ends the program without a traceback.
 from __future__ import annotations
 
 import _thread
+import atexit
 import os
 import signal
 import sys
@@ -20,15 +21,20 @@ COMMAND = "collocation-sysid"
 # Name of a thread that is left in a library's code, which no signal reaches.
 ABANDONED_THREAD = "left behind"
 # Files in whose functions an exception may be lost: the importer, and the wrappers of CasADi, whose
-# conversions of arguments call functions of Python and clear their errors.
-LOSING = ("<frozen importlib._bootstrap>", os.path.join("casadi", "casadi.py"))
+# conversions of arguments call functions of Python and clear their errors. A pool of threads that an
+# exception leaves while it starts one never ends that thread, for which the interpreter then waits.
+LOSING = (
+    "<frozen importlib._bootstrap>",
+    os.path.join("casadi", "casadi.py"),
+    os.path.join("concurrent", "futures", "thread.py"),
+)
 # Time after which a deferred signal tries again [s]: a person does not notice it.
 RETRY_S = 0.05
 
 
 class Interrupts:
-    """Handler of signals that raises `KeyboardInterrupt`, but not within imports, functions of CasADi
-    and `deferred`.
+    """Handler of signals that raises `KeyboardInterrupt`, but not within imports, functions of CasADi,
+    pools of threads and `deferred`.
 
     Libraries convert an exception within their imports into an error of their own, and CasADi drops
     one within its conversions. There the first signal is deferred until the import or the function
@@ -130,17 +136,33 @@ def heed_interrupts() -> None:
     nothing is changed.
     """
     INTERRUPTS.number = int(signal.SIGINT)
+    ENDED.status = None
     if threading.current_thread() is threading.main_thread():
         sys.unraisablehook = INTERRUPTS.note_unraisable
     _handle(INTERRUPTS, (signal.SIG_DFL, signal.default_int_handler, _leave_at_once))
 
 
 def ignore_interrupts() -> None:
-    """Ignore the signals that `INTERRUPTS` has handled, until the interpreter has ended: the exit code
-    remains that of the command. `KeyboardInterrupt` is raised if a signal is deferred.
+    """Ignore the signals that `INTERRUPTS` has handled, until `leave`. `KeyboardInterrupt` is raised if
+    a signal is deferred.
     """
-    _handle(signal.SIG_IGN, (INTERRUPTS,))
+    _handle(ENDED, (INTERRUPTS,))
     INTERRUPTS.raise_deferred()
+
+
+class Ended:
+    """Handler of signals after the end of a command: the process ends at once with the exit code that
+    is known, for example where it waits for a thread.
+    """
+
+    status: int | None = None
+
+    def __call__(self, _number: int, _frame: FrameType | None) -> None:
+        if self.status is not None:
+            os._exit(self.status)
+
+
+ENDED = Ended()
 
 
 def raises_interrupt(handler: object) -> bool:
@@ -154,14 +176,17 @@ def leave(code: object) -> NoReturn:
     """End the process with an exit code: `code` if it is an integer, else 1 (also for None).
 
     If a thread with the name `ABANDONED_THREAD` is still inside library code that would crash at
-    exit, streams are flushed and the process ends without cleaning up; otherwise by `SystemExit`.
+    exit, the process ends without cleaning up; otherwise by `SystemExit`, and a signal until then ends
+    it with the same code.
     """
-    if not any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
-        sys.exit(code if isinstance(code, int) else 1)
+    status = code if isinstance(code, int) else 1
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):
             stream.flush()
-    os._exit(code if isinstance(code, int) else 1)
+    if any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
+        os._exit(status)
+    ENDED.status = status
+    sys.exit(status)
 
 
 def _is_losing(frame: FrameType | None) -> bool:
@@ -174,3 +199,6 @@ def _is_losing(frame: FrameType | None) -> bool:
 
 
 _end_quietly()
+# While the interpreter clears its modules, it sets other handlers to the default. What is registered
+# first is called last.
+atexit.register(_handle, signal.SIG_IGN, (ENDED,))

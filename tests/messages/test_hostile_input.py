@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures.thread
 import contextlib
 import io
 import json
@@ -9,12 +10,15 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
 import weakref
 import zipfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
 
@@ -492,10 +496,10 @@ def test_a_solver_that_hears_no_signal_is_left_behind(tiny: Path):
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_two_signals_end_a_solve_at_once(tiny: Path):
     done = ended(DEAF.format(name="SIGINT", times=2))
-    assert done.returncode == 130
-    assert "nothing was written to run" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not (tiny / "run").exists()
+    assert (done.returncode, done.stderr) == (130, "")
+    # Of the search for the initial point, which has ended.
+    result = json.loads((tiny / "run" / "result.json").read_text())
+    assert result["status"] == "interrupted"
 
 
 @pytest.mark.long
@@ -574,13 +578,50 @@ def test_a_signal_within_a_conversion_of_casadi_is_not_lost():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_signal_while_a_thread_of_a_pool_starts_leaves_no_thread_behind(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    start = threading.Thread.start
+
+    def interrupted(thread: threading.Thread) -> None:
+        start(thread)
+        if thread.name.startswith("ThreadPool"):
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with ThreadPoolExecutor(1) as pool:
+        with heeded(), pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            pool.submit(time.sleep, 0)
+            (thread,) = pool._threads
+            time.sleep(5)
+        assert thread in concurrent.futures.thread._threads_queues
+
+
+ENDED = """
+import atexit, os, signal, time
+from collocation_sysid import cli
+atexit.register(lambda: (os.kill(os.getpid(), signal.SIGTERM), time.sleep(60)))
+cli.main()
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_signal_after_the_end_of_a_command_keeps_its_exit_code():
+    done = subprocess.run(
+        [sys.executable, "-c", ENDED, "--version"], capture_output=True, text=True, timeout=50
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip() == version("collocation-sysid")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_signal_that_is_still_deferred_at_the_end_is_not_lost():
     code = compile("import signal; signal.raise_signal(signal.SIGINT)", LOSING[0], "exec")
     with heeded():
         exec(code)
         with pytest.raises(KeyboardInterrupt):
             ignore_interrupts()
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        signal.raise_signal(signal.SIGINT)  # without effect
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
