@@ -30,7 +30,7 @@ CASES = (
     ("foam_cylinder", NO_GUESS),
     ("foam_cylinder", COARSE),
     ("foam_cylinder", ("--method", "interior-point")),
-    ("noisy_cylinder", ()),
+    ("wrist_sensor", ()),
 )
 # The command, which writes the time of its first simulation into a file.
 COMMAND = """
