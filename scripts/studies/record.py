@@ -22,6 +22,8 @@ from collocation_sysid.statistics.description_texts import MESSAGES
 
 PAGE = Path(__file__).parents[2] / "docs" / "studies" / "mistakes.md"
 BEGIN, END = "<!-- record -->\n", "<!-- end of the record -->\n"
+# Cases of a code that the table names.
+SHOWN = 3
 # Codes that no study names, with the tests whose simulated mistakes they name.
 TESTED = {
     "frames": "problem/test_recording_frames.py",
@@ -97,11 +99,17 @@ def rows(files: Sequence[Path]) -> Iterator[tuple[str, str, str, str]]:
         right, wrong = by_code[code][True], by_code[code][False]
         if f"description/{code}" in OPEN_CAUSES:
             continue
-        tested = f"`tests/{TESTED[code]}`" if code in TESTED else "none"
-        cases = "; ".join(dict.fromkeys(right)) or tested
+        cases = _listed(right) or (f"`tests/{TESTED[code]}`" if code in TESTED else "none")
         if wrong:
-            cases += f"; wrong: {'; '.join(dict.fromkeys(wrong))}"
+            cases += f"; wrong: {_listed(wrong)}"
         yield code, str(len(right)), str(len(wrong)), cases
+
+
+def _listed(cases: Sequence[str]) -> str:
+    """Return the first cases as text, and how many others there are."""
+    first, others = cases[:SHOWN], len(cases) - SHOWN
+    more = [f"{others} more"] if others > 0 else []
+    return "; ".join([*dict.fromkeys(first), *more])
 
 
 def main() -> None:

@@ -521,7 +521,7 @@ def main() -> None:
         print(row(errors[name], answers), flush=True)
         for answer in answers if options.json else ():
             right = [RIGHT[name]] if name in RIGHT else []
-            record.append(options.json, errors[name], right, answer["named"])
+            record.append(options.json, f"bar: {name}", right, answer["named"])
 
 
 def row(text: str, answers: Sequence[Mapping[str, Any]]) -> str:
