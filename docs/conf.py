@@ -47,7 +47,7 @@ if (data_folder() / "hyperelastic_curves" / "data.h5").is_file():
 else:
     print(
         "measured_brain and measured_silicone are shown without results: "
-        "cs.datasets.fetch('hyperelastic_curves') gets their data"
+        "cs.datasets.fetch('hyperelastic_curves') says where their data belong"
     )
 sphinx_gallery_conf = {
     "examples_dirs": "gallery",

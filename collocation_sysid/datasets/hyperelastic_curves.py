@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.files import damage_refused, reason
 from ..errors import InputError, require_among
 from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
@@ -48,11 +49,11 @@ def hyperelastic_curves(
 ) -> list[Experiment]:
     """Return material tests of one author from the public collection `hyperelastic_curves`.
 
-    The file is downloaded at the first use (`fetch`), and needs the extra `datasets`. Stretches or
-    amounts of shear against engineering stresses; the units of the file are MPa, and kPa for Budday
-    and Katashima. The names of the tests begin with their kind: UT and UC (uniaxial tension and
-    compression), ET (equibiaxial), PS (planar), BT (biaxial, for example "BT_lambda_1d3" with a
-    second stretch of 1.3), SS (simple shear) and CSS (simple shear at an axial stretch, for example
+    A copy of the file (`fetch`) and the extra `datasets` are needed. Stretches or amounts of shear
+    against engineering stresses; the units of the file are MPa, and kPa for Budday and Katashima.
+    The names of the tests begin with their kind: UT and UC (uniaxial tension and compression), ET
+    (equibiaxial), PS (planar), BT (biaxial, for example "BT_lambda_1d3" with a second stretch of
+    1.3), SS (simple shear) and CSS (simple shear at an axial stretch, for example
     "CSS_corona_radiata_lambda_0d75").
 
     Source: repository Chongran-Zhao/Calibration-Hyperelasticity on GitHub, MIT licence; its author
@@ -103,7 +104,12 @@ def hyperelastic_curves(
             where="dataset",
         ) from error
     file = fetch("hyperelastic_curves") / FILE
-    with h5py.File(file) as content:
+    remedy = "put a copy of the file there"
+    try:
+        opened = h5py.File(file)
+    except OSError as error:
+        raise InputError(f"the file is damaged ({reason(error)}); {remedy}", file) from error
+    with opened as content, damage_refused(file.parent, FILE, remedy):
         groups: Any = content[author]
         known = [name for name in groups if name not in LEFT_OUT.get(author, ())]
         chosen = known if tests is None else [*tests]

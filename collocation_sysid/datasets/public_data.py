@@ -22,7 +22,8 @@ INSTALLATION = "pip install 'collocation-sysid[datasets]'"
 class PublicCollection:
     """Files of a commit of a public repository on GitHub.
 
-    `files` has the SHA-256 checksum of each path in the repository; None where it is not known.
+    `files` has the SHA-256 checksum of each path in the repository; a file whose checksum is not
+    known (None) is not downloaded.
     """
 
     repository: str
@@ -116,15 +117,16 @@ def fetch(name: str) -> Path:
     """Return the folder with the files of a data set, which are downloaded at the first use.
 
     A data set of the package (`DATASETS`) needs no network. The public collections need the extra
-    `datasets`, and come from a fixed commit of a repository on GitHub; files whose checksum is
-    known are compared with it at every use. They are kept in the folder that the environment
-    variable ``COLLOCATION_SYSID_DATA`` names, by default the cache folder of the package; a copy
-    that is put there in NAME/ needs no network, either.
+    `datasets`, and come from a fixed commit of a repository on GitHub; files are compared with their
+    checksums at every use. They are kept in the folder that the environment variable
+    ``COLLOCATION_SYSID_DATA`` names, by default the cache folder of the package; a copy that is put
+    there in NAME/ needs no network, either.
 
     - ``hyperelastic_curves``: stress and stretch of rubbers, gels, silicone and brain tissue,
       `data.h5`, which `hyperelastic_curves` reads. MIT licence; repository
       Chongran-Zhao/Calibration-Hyperelasticity. Cite the paper of each curve, which
-      `hyperelastic_curves` lists. The checksum is not known.
+      `hyperelastic_curves` lists. Its checksum is not known, so that it is not downloaded: put a
+      copy of the file there.
     - ``plate_fingerprint``: simulated plate with a hole, a mesh (.msh), and displacements and
       reactions (.npz) of three laws without noise and with 1 %. MIT licence; repository
       Material-Fingerprinting/material-fingerprinting-hyperelasticity. Cite M. Flaschel, D.
@@ -170,6 +172,14 @@ def _download(name: str, collection: PublicCollection, folder: Path) -> None:
     checksums = dict(zip(urls, collection.files.values(), strict=True))
     downloads = pooch.create(folder, "", registry=checksums, urls=urls)
     for file, url in urls.items():
+        if checksums[file] is None:
+            if not (folder / file).is_file():
+                raise InputError(
+                    f"{url} of the data set {name!r} is not downloaded, because its checksum is not "
+                    f"known; expected a copy of the file as {folder / file}",
+                    where="dataset",
+                )
+            continue
         try:
             downloads.fetch(file)
         except ValueError as error:  # pooch's, for another checksum

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Sequence
 from copy import deepcopy
@@ -12,22 +11,10 @@ from typing import Any
 import tomli_w
 from pydantic import ValidationError
 
-from ..common.files import require_regular, require_size
-from ..errors import InputError, excerpt, located
+from ..common.text_files import DEEPEST, HAND_WRITTEN_BYTES, beyond_limits, parse_toml, read_text
+from ..errors import InputError, located
 from .schema import ProblemFile
 from .validation_messages import explain_validation_error
-
-# Levels of tables and lists that a problem file may have: it needs seven.
-DEEPEST = 20
-# A dotted key of more parts, 100 at least; no part is looked at twice.
-_ENDLESS_KEY = re.compile(
-    r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){100}"""
-)
-# What the TOML parser says where people see something simpler.
-_PLAINER = {
-    "Cannot overwrite a value": "this key is given twice",
-    "Illegal character '\\n'": "a text lacks its closing quote",
-}
 
 
 def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[ProblemFile, str]:
@@ -51,7 +38,7 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
         Names the file, the key or line, what was found and what was expected.
     """
     path = Path(path)
-    text = read_text(path)
+    text = read_text(path, "a problem file (TOML)", HAND_WRITTEN_BYTES)
     content = parse_toml(text, path)
     with located("--set"):
         for override in overrides:
@@ -62,92 +49,6 @@ def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[
         return ProblemFile.model_validate(content), text
     except ValidationError as error:
         raise explain_validation_error(error, content, path=path) from error
-
-
-def parse_toml(text: str, path: Path) -> dict[str, Any]:
-    """Return the content of a TOML text; `path` is only for messages.
-
-    Raises
-    ------
-    InputError
-        For invalid syntax, with the line if it is known, for more than `DEEPEST` nested levels,
-        keys of 100 or more parts, and integers with too many digits.
-    """
-    try:
-        if _ENDLESS_KEY.search(text) is not None:  # on which the parser would spend minutes
-            raise RecursionError
-        content = tomllib.loads(text)
-        if _nesting_level_count(content) > DEEPEST:
-            raise RecursionError
-        return content
-    except tomllib.TOMLDecodeError as error:
-        raise _bad_syntax(str(error), text, path=path) from error
-    except (RecursionError, ValueError) as error:  # Python's limits of nesting and of digits
-        raise InputError(_beyond_limits(error), path) from error
-
-
-def _nesting_level_count(content: Any) -> int:
-    """Return the nested levels, itself included, up to `DEEPEST` + 1."""
-    level = [content]
-    level_count = 0
-    while level and level_count <= DEEPEST:
-        tables = [each.values() if isinstance(each, dict) else each for each in level]
-        level = [each for table in tables for each in table if isinstance(each, (dict, list))]
-        level_count += 1
-    return level_count
-
-
-def _beyond_limits(error: Exception) -> str:
-    """Return the message for a file beyond the limits of its parser."""
-    if isinstance(error, RecursionError):
-        return f"tables or lists are nested too deeply; expected at most {DEEPEST} levels"
-    return "an integer has too many digits; expected fewer than 4,300"
-
-
-# Largest file that is written by hand [bytes].
-LARGEST_BYTES = 10_000_000
-
-
-def read_text(path: Path, what: str = "a problem file (TOML)") -> str:
-    """Return the text of a file (UTF-8), without a byte order mark.
-
-    Parameters
-    ----------
-    what : str
-        Kind of file that is expected, for messages.
-
-    Raises
-    ------
-    InputError
-        If the file does not exist or is not a text file.
-    """
-    require_regular(path)
-    require_size(path, LARGEST_BYTES)
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"there is no such file; expected {what}", path) from None
-    except IsADirectoryError:
-        raise InputError(f"this is a folder; expected {what}", path) from None
-    except UnicodeDecodeError:
-        raise InputError(f"this is not a text file; expected {what}", path) from None
-    except OSError as error:
-        raise InputError(f"the file cannot be read: {error.strerror}", path) from error
-
-
-def _bad_syntax(complaint: str, text: str, path: Path) -> InputError:
-    reason, _, place = complaint.rpartition(" (at ")
-    reason = _PLAINER.get(reason, reason)
-    matched = re.match(r"line (\d+)", place)
-    if matched is None:
-        return InputError(
-            f"the file is not valid TOML: {reason or complaint}, at the end of the file", path
-        )
-    number = int(matched[1])
-    line = excerpt(text.splitlines()[number - 1].strip())
-    return InputError(
-        f"the file is not valid TOML: {reason} in: {line}", path, where=f"line {number}"
-    )
 
 
 # Overrides ----------------------------------------------------------------------------------------
@@ -225,4 +126,4 @@ def _parse_value(text: str, key: str) -> Any:
             raise InputError(f"{message}, {example}") from None
         return text.strip()
     except (RecursionError, ValueError) as error:
-        raise InputError(_beyond_limits(error), where=key) from error
+        raise InputError(beyond_limits(error), where=key) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..common.array_types import Array
 from ..common.files import damage_refused, is_own
+from ..common.text_files import parse_xml, read_text
 from ..errors import InputError
 from .replay import MotionRecord
 from .run_writers import FRAMES_FILE
@@ -59,7 +59,7 @@ def frame_files(run: Path, experiment: str) -> list[tuple[float, Path]]:
     if listing is None:
         raise _missing_frames(run, experiment)
     with _damaged_frames_refused(run):
-        sets = ElementTree.parse(listing).getroot().iter("DataSet")
+        sets = parse_xml(read_text(listing, "a list of frames")).iter("DataSet")
         frames = [(float(s.attrib["timestep"]), listing.parent / s.attrib["file"]) for s in sets]
         if not frames or not all(is_own(run, file) for _, file in (*frames, (0.0, listing))):
             raise ValueError(

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.files import replaced_file
+from ..common.text_files import parse_toml
 from ..common.validated_classes import validated
 from ..common.validated_types import Count, NotNegative, Positive
 from ..common.written_files import (
@@ -32,7 +33,6 @@ from ..problem.bench_files import (
     has_displacement_table,
     table_name,
 )
-from ..problem.reading import parse_toml
 from ..problem.recording_reader import by_marker
 from ..problem.recording_schema import ExperimentSection, ForceSensorSection
 from ..problem.schema import ProblemFile

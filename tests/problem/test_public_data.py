@@ -111,6 +111,36 @@ def test_every_collection_states_licence_repository_and_citation():
         assert f"Cite {collection.citation}" in entry
 
 
+def test_a_file_without_a_checksum_is_not_downloaded(served, data, monkeypatch):
+    (path,) = public_data.COLLECTIONS[NAME].files
+    unknown = replace(public_data.COLLECTIONS[NAME], files={path: None})
+    monkeypatch.setitem(public_data.COLLECTIONS, NAME, unknown)
+    with pytest.raises(cs.InputError, match=r"its checksum is not known; expected a copy .*a\.npz"):
+        cs.datasets.fetch(NAME)
+    assert not any(data.rglob("*.npz"))
+    (data / NAME).mkdir(parents=True)
+    (data / NAME / "a.npz").write_bytes(CONTENT)
+    assert cs.datasets.fetch(NAME) == data / NAME
+
+
+def test_every_checksum_is_known_or_the_page_says_that_there_is_none():
+    text = " ".join(cs.datasets.fetch.__doc__.split())
+    for collection in public_data.COLLECTIONS.values():
+        for checksum in collection.files.values():
+            assert checksum is None or len(bytes.fromhex(checksum)) == 32
+    unknown = [n for n, c in public_data.COLLECTIONS.items() if None in c.files.values()]
+    assert unknown == ["hyperelastic_curves"]
+    assert "Its checksum is not known, so that it is not downloaded" in text
+
+
+@pytest.mark.parametrize("content", [b"", b"no HDF5", b"\x89HDF\r\n\x1a\n" + bytes(100)])
+def test_a_damaged_file_of_curves_is_refused(data, content):
+    (data / "hyperelastic_curves").mkdir(parents=True)
+    (data / "hyperelastic_curves" / "data.h5").write_bytes(content)
+    with pytest.raises(cs.InputError, match=r"data\.h5"):
+        cs.datasets.hyperelastic_curves("Meunier_2008", "yeoh")
+
+
 @pytest.mark.parametrize("name", ["plate_fingerprint", "viscoelastic_curves"])
 def test_checksums_are_those_of_the_files(name):
     if FOLDER is None or not (FOLDER / name).is_dir():

@@ -28,6 +28,7 @@ from kit.silhouettes import (
 from PIL import Image
 
 import collocation_sysid as cs
+from collocation_sysid.common import array_files
 from collocation_sysid.features.outlines.doubts import hypotheses
 from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
 from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
@@ -247,6 +248,10 @@ def test_masks_of_a_folder_are_in_the_order_of_their_numbers(tmp_path: Path) -> 
     assert [int(mask.sum()) // 2 for mask in read_masks(tmp_path)] == [1, 2, 10]
 
 
+def run_lengths(size: Any, counts: Any) -> str:
+    return json.dumps({"size": size, "counts": counts})
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -254,12 +259,45 @@ def test_masks_of_a_folder_are_in_the_order_of_their_numbers(tmp_path: Path) -> 
         ('{"size": [2, 2], "counts": [1, 2]}', "the counts have 3 pixels for 2 x 2"),
         ('{"mask": 1}', "found no run lengths"),
         ("[]", "0 masks|no mask|empty"),
+        ("[" * 100_000, "cannot be read"),
+        ("9" * 5000, "cannot be read"),
+        (run_lengths([2, 2], [2**62, 2**62, 2**62, 2**62 + 4]), "the count 4611686018427387904 "),
+        (run_lengths([2, 2], [5, -1]), "found the count 5 after 0 of 2 x 2 pixels"),
+        (run_lengths([2, 2], [1, -1, 4]), "found the count -1 after 1 of 2 x 2"),
+        (run_lengths([2, 2], [1e30]), "the count 1e"),
+        (run_lengths([2, 2], [float("inf")]), "the count inf"),
+        (run_lengths([2, 2], [1, float("nan")]), "the count nan"),
+        (run_lengths([2, 2], [True, 3]), "the count True"),
+        (run_lengths([2, 2], [[[4]]]), r"the count \[\[4\]\]"),
+        (run_lengths([2, 2], 4), "the counts have 0 pixels"),
+        (run_lengths([2, 2], "P" * 1_000_000), "a text of counts"),
+        (run_lengths([2, 2], "0P"), "ends within a number"),
+        (run_lengths([2, 2], "0\u0431"), "a text of counts"),
+        (run_lengths([2, -2], [1]), "no run lengths"),
+        (run_lengths([1e10, 1], [1]), "no run lengths"),
+        (run_lengths([10**10, 1], [10**10]), "mask of 10000000000 x 1 pixels; expected at most"),
+        (f"[{', '.join([run_lengths([9000, 9000], [81_000_000])] * 500)}]", "takes .* GB"),
     ],
 )
-def test_files_that_are_no_masks_are_refused(tmp_path: Path, content: str, message: str) -> None:
+def test_files_that_are_no_masks_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, message: str
+) -> None:
+    monkeypatch.setattr(array_files, "machine_memory_mb", lambda: 1000.0)
     (tmp_path / "front.json").write_text(content)
     with pytest.raises(cs.InputError, match=message):
         cs.Problem.read(folder_with(tmp_path, "front.json"))
+
+
+def test_a_sparse_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    with (tmp_path / "front.json").open("wb") as file:
+        file.truncate(100_000_000_000)
+    with pytest.raises(cs.InputError, match="this file has 100,000 MB"):
+        read_masks(tmp_path / "front.json")
+
+
+def test_long_compressed_counts_are_decoded() -> None:
+    text = "111" + "0" * 999_997  # counts of one; from the fourth on differences
+    assert decoded({"size": [1000, 1000], "counts": text}).sum() == 500_000
 
 
 def png(size_px: tuple[int, int], second_chunk: bytes) -> bytes:

@@ -295,10 +295,41 @@ def test_the_pose_of_an_anipose_camera_is_that_of_opencv(tmp_path: Path) -> None
     np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-9)
 
 
+def expanding(form: str) -> str:
+    """YAML in which each of 40 lines states the value of the line before twice."""
+    lines = [f"a{k + 1}: &a{k + 1} {form.format(f'*a{k}')}" for k in range(40)]
+    return "\n".join(["a0: &a0 {x: 1}", *lines])
+
+
+def test_a_calibration_may_have_aliases_and_comments(tmp_path: Path) -> None:
+    file = tmp_path / "cam.dat"
+    for text in (
+        "K: &a [2, 0, 0, 0, 2, 0, 0, 0, 1]\nprojection: *a\n",
+        "<opencv_storage><!-- a <K> --><K>2 0 0 0 2 0 0 0 1</K></opencv_storage>",
+    ):
+        file.write_text(text)
+        assert np.array_equal(read_calibration(file).matrix, np.diag([2, 2, 1]))
+
+
 @pytest.mark.parametrize(
     ("text", "name", "message"),
     [
         ("just words", None, r"cam.dat: found neither YAML, JSON, XML, TOML nor cameras.txt"),
+        (
+            expanding("[{0}, {0}]"),
+            None,
+            "aliases stand for more values than the text has characters",
+        ),
+        (expanding("{{<<: [{0}, {0}]}}"), None, "aliases stand for more values"),
+        ("K: &a [*a]", None, "aliases stand for more values"),
+        ("K: " + "[" * 100_000, None, r"cam.dat: found neither YAML"),
+        ("<" + "<!--" * 200_000, None, r"cam.dat: found neither YAML"),
+        (
+            "<opencv_storage>" + "<!-- -->" * 100_000 + "<K>1 2 3</K></opencv_storage>",
+            None,
+            "K: found 3 numbers",
+        ),
+        ("a." * 300_000 + "b = 1", None, r"cam.dat: found neither YAML"),
         ("a: 1", None, r"cam.dat: found the keys a; expected the matrix of a camera"),
         ("K: [1, 2, 3]", None, r"cam.dat: K: found 3 numbers; expected the nine"),
         ("K: [1, x, 3]", None, r"cam.dat: K: found \[1, 'x', 3\]; expected numbers"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
+from ...common.text_files import parse_json
 from ...errors import InputError
 from ...features.image_tracks.tracks import ImageTracks
 from ...problem import Problem
@@ -206,8 +206,8 @@ def _array(raw_values: Any, shape: tuple[int, ...]) -> Array:
 def _json_object(text: str) -> Mapping[str, Any]:
     """Return the JSON object of a line, which has a time and known keys."""
     try:
-        stated = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also Python's limits of digits and of nesting
+        stated = parse_json(text)
+    except ValueError as error:  # also Python's limits of digits and of nesting
         reason = getattr(error, "msg", "a number is too long, or brackets are nested too deeply")
         raise InputError(
             f"this line is not valid JSON ({reason}); expected one JSON object per line"

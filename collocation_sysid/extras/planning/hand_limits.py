@@ -10,9 +10,9 @@ from pydantic import Field, ValidationError, model_validator
 
 from ...common.array_types import Array
 from ...common.schema_tables import Section, Vector
+from ...common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
 from ...common.validated_types import Positive
 from ...errors import InputError
-from ...problem.reading import parse_toml, read_text
 from ...problem.validation_messages import explain_validation_error
 from .hand_motion import TimeDerivatives, angular_motion
 
@@ -61,7 +61,8 @@ class Limits(Section):
             message names the file, the key or line, what was found and what was expected.
         """
         file = Path(path)
-        content = parse_toml(read_text(file, "a file of limits (TOML)"), file)
+        text = read_text(file, "a file of limits (TOML)", HAND_WRITTEN_BYTES)
+        content = parse_toml(text, file)
         try:
             return cls.model_validate(content)
         except ValidationError as error:

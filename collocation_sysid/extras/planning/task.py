@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from ...common.array_types import Array
 from ...common.schema_tables import Section, Vector, require_one
+from ...common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
 from ...common.validated_types import (
     AboveOne,
     AtLeastOne,
@@ -27,7 +28,6 @@ from ...common.validated_types import (
     Text,
 )
 from ...errors import InputError, hint_at, listed, located
-from ...problem.reading import parse_toml, read_text
 from ...problem.schema import CodeSection
 from ...problem.validation_messages import explain_validation_error
 from ...recording.sources.columns import find_time
@@ -451,7 +451,8 @@ class Task(Section):
             names the file, the key or line, what was found and what was expected.
         """
         file = Path(path)
-        content = parse_toml(read_text(file, "a task of a planned motion (TOML)"), file)
+        text = read_text(file, "a task of a planned motion (TOML)", HAND_WRITTEN_BYTES)
+        content = parse_toml(text, file)
         try:
             task = cls.model_validate(content)
         except ValidationError as error:

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...common.files import require_regular, require_size
-from ...errors import InputError, require_among
+from ...common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
+from ...errors import InputError, located, require_among
 from ...methods import METHODS, require_method
-from ...problem.reading import parse_toml
 from ...problem.validation_messages import shortened
 
 
@@ -82,19 +81,9 @@ def _truth_table(item: str) -> tuple[Path | None, Mapping[str, Any]]:
         pairs = [pair.partition("=") for pair in item.split(",") if pair.strip()]
         return None, {name.strip(): value.strip() for name, _, value in pairs}
     path = Path(item)
-    require_regular(path, "--truth")
-    require_size(path)
-    try:
-        content = parse_toml(path.read_text(encoding="utf-8-sig"), path)
-    except FileNotFoundError:
-        raise InputError(
-            "there is no such file; expected a TOML file of true values, or name=value such as "
-            "mu_pa=300",
-            path,
-            where="--truth",
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"this file cannot be read: {error}", path, where="--truth") from error
+    with located(where="--truth"):
+        what = "a TOML file of true values, or name=value such as mu_pa=300"
+        content = parse_toml(read_text(path, what, HAND_WRITTEN_BYTES), path)
     table = content.get("parameters", content)
     if not isinstance(table, Mapping):
         raise InputError(

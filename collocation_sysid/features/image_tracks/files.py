@@ -18,7 +18,6 @@ and archives with `t_s` or `fps`, state times.
 from __future__ import annotations
 
 import io
-import json
 import pickle
 import re
 import zipfile
@@ -34,6 +33,7 @@ from ...common.array_files import load_arrays, require_plausible_size
 from ...common.array_types import Array
 from ...common.checked_arrays import float_array
 from ...common.files import DAMAGE
+from ...common.text_files import parse_json
 from ...errors import InputError, listed
 from ...recording.sources.columns import find_time
 from ...recording.sources.source import open_source
@@ -402,7 +402,7 @@ def _sleap_tracks(content: Any) -> TrackFile:
 def _sleap_labels(content: Any) -> TrackFile:
     """Points that a person placed have the likelihood one, and precede predicted ones."""
     try:
-        stated = json.loads(_text(content["metadata"].attrs["json"]))
+        stated = parse_json(_text(content["metadata"].attrs["json"]))
         nodes = [each["name"] for each in stated["nodes"]]
         order = [each["id"] for each in stated["skeletons"][0]["nodes"]]
         frames, instances = _dataset(content, "frames"), _dataset(content, "instances")

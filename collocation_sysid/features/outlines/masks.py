@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
+import reprlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from ...common.array_files import require_plausible_size
 from ...common.files import in_counting_order, reason
-from ...errors import InputError
+from ...common.text_files import parse_json, read_text
+from ...errors import InputError, located
 
 Mask = NDArray[np.bool_]
 # Values of a PNG: brighter ones are the body; more of the pixels in between show a photograph.
 BRIGHT = 127
 MOST_GREY = 0.05
+# Bits before the last character of a number: counts have 32.
+LONGEST_SHIFT = 30
 # What the library raises for damaged files (a wrong chunk is a SyntaxError), and for more pixels than
 # memory may hold.
 UNREADABLE = (
@@ -29,7 +33,7 @@ UNREADABLE = (
     Image.DecompressionBombWarning,
 )
 EXPECTED = (
-    "expected masks as .png, a folder of these, or .json with run lengths of COCO: "
+    "masks as .png, a folder of these, or .json with run lengths of COCO: "
     '{"size": [rows, columns], "counts": …}, or a list of these'
 )
 
@@ -46,23 +50,36 @@ def read_masks(path: Path) -> list[Mask]:
     if path.is_dir():
         files = in_counting_order(path.glob("*.png"))
         if not files:
-            raise InputError(f"the folder has no .png; {EXPECTED}", path)
-        return [_read_png(file) for file in files]
+            raise InputError(f"the folder has no .png; expected {EXPECTED}", path)
+        return _within_memory(_read_png(file) for file in files)
     if path.suffix.lower() == ".png":
         return [_read_png(path)]
+    text = read_text(path, EXPECTED)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise InputError(f"cannot be read ({reason(error)}); {EXPECTED}", path) from error
+        content = parse_json(text)
+    except ValueError as error:
+        raise InputError(f"cannot be read ({reason(error)}); expected {EXPECTED}", path) from error
     if isinstance(content, dict) and "annotations" in content:
         content = content["annotations"]
     entries = content if isinstance(content, list) else [content]
     if not entries:
-        raise InputError(f"found 0 masks; {EXPECTED}", path)
-    try:
-        return [decoded(entry.get("segmentation", entry)) for entry in entries]
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"found no run lengths ({reason(error)}); {EXPECTED}", path) from error
+        raise InputError(f"found 0 masks; expected {EXPECTED}", path)
+    with located(path):
+        return _within_memory(
+            decoded(entry.get("segmentation", entry) if isinstance(entry, dict) else entry)
+            for entry in entries
+        )
+
+
+def _within_memory(masks: Iterable[Mask]) -> list[Mask]:
+    """Return the masks as a list, unless this machine's memory cannot take them."""
+    kept: list[Mask] = []
+    size_bytes = 0
+    for mask in masks:
+        kept.append(mask)
+        size_bytes += mask.size
+        require_plausible_size("of all masks", (len(kept), *mask.shape), size_bytes, size_bytes)
+    return kept
 
 
 def _read_png(file: Path) -> Mask:
@@ -78,7 +95,7 @@ def _read_png(file: Path) -> Mask:
                 elif image.mode in ("P", "I", "I;16") or (np.ptp(grey) and grey.max() <= BRIGHT):
                     grey = np.where(np.asarray(image) > 0, 255, 0)  # numbers of objects
     except UNREADABLE as error:
-        raise InputError(f"cannot be read ({reason(error)}); {EXPECTED}", file) from error
+        raise InputError(f"cannot be read ({reason(error)}); expected {EXPECTED}", file) from error
     if np.mean((grey > 16) & (grey < 239)) > MOST_GREY:
         raise InputError(
             "found a photograph, not a mask: many pixels are neither black nor white; expected white "
@@ -94,18 +111,45 @@ def decoded(run_lengths: Any) -> Mask:
 
     Raises
     ------
-    ValueError
-        If the counts do not have the size.
+    InputError
+        If there is no size or it is too large, or the counts do not have it.
     """
-    rows, columns = (int(each) for each in run_lengths["size"])
+    rows, columns = _size(run_lengths)
     counts = run_lengths["counts"]
-    if isinstance(counts, str):
-        counts = _uncompressed(counts)
-    lengths = np.asarray(counts, dtype=np.int64)
-    if lengths.ndim != 1 or (lengths < 0).any() or lengths.sum() != rows * columns:
-        raise ValueError(f"the counts have {lengths.sum()} pixels for {rows} x {columns}")
+    counts = _uncompressed(counts) if isinstance(counts, str) else counts
+    pixels = rows * columns
+    lengths: list[int] = []
+    end = 0
+    for count in counts if isinstance(counts, Iterable) else ():
+        if type(count) is not int or not 0 <= count <= pixels - end:
+            raise InputError(
+                f"found the count {reprlib.repr(count)} after {end} of {rows} x {columns} pixels; expected "
+                f"whole numbers of pixels whose sum is {pixels}"
+            )
+        end += count
+        lengths.append(count)
+    if end != pixels:
+        raise InputError(f"the counts have {end} pixels for {rows} x {columns}")
     inside = np.arange(len(lengths)) % 2 == 1
     return np.repeat(inside, lengths).reshape(columns, rows).T
+
+
+def _size(run_lengths: Any) -> tuple[int, int]:
+    """Return rows and columns of run lengths."""
+    stated = isinstance(run_lengths, dict) and "counts" in run_lengths
+    size = run_lengths.get("size") if stated else None
+    if not (
+        isinstance(size, list | tuple)
+        and len(size) == 2
+        and all(type(each) is int and each > 0 for each in size)
+    ):
+        raise InputError(f"found no run lengths; expected {EXPECTED}")
+    rows, columns = size
+    if rows * columns > (Image.MAX_IMAGE_PIXELS or np.inf):
+        raise InputError(
+            f"found a mask of {rows} x {columns} pixels; expected at most {Image.MAX_IMAGE_PIXELS}"
+        )
+    return rows, columns
 
 
 def encoded(mask: Mask) -> dict[str, Any]:
@@ -116,20 +160,24 @@ def encoded(mask: Mask) -> dict[str, Any]:
     return {"size": list(mask.shape), "counts": counts.tolist()}
 
 
-def _uncompressed(text: str) -> Sequence[int]:
-    """Return the counts of a text, in which a character has five bits of a number and one that says
+def _uncompressed(text: str) -> Iterator[int]:
+    """Yield the counts of a text, in which a character has five bits of a number and one that says
     whether more follow; from the third on, numbers are differences from the last but one.
     """
-    counts: list[int] = []
-    value = shift = 0
+    before = last = value = shift = index = 0
     for character in text:
         bits = ord(character) - 48
+        if not 0 <= bits < 64 or shift > LONGEST_SHIFT:
+            raise InputError(f"found {character!r} in a text of counts; expected those of COCO")
         value |= (bits & 31) << shift
         shift += 5
         if bits & 32:
             continue
         if bits & 16:
             value -= 1 << shift
-        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+        before, last = last, value + (before if index > 2 else 0)
+        yield last
+        index += 1
         value = shift = 0
-    return counts
+    if shift:
+        raise InputError("a text of counts ends within a number; expected a complete text")

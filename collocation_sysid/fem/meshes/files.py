@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.files import require_regular
+from ...common.files import require_regular, require_size
 from ...errors import InputError
 from .checks import straightening_notes
 from .meshio_reader import MeshContent, read_content
@@ -203,6 +203,7 @@ def _read_with_meshio(path: str | Path) -> Iterator[MeshContent]:
     if not Path(path).is_file():
         raise InputError("there is no such file", path)
     require_regular(path)
+    require_size(path)
     try:
         content = read_content(path)
     except InputError as error:

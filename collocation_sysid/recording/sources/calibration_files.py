@@ -18,23 +18,20 @@ poses of cameras relative to each other, and the world of COLMAP has no scale.
 
 from __future__ import annotations
 
-import json
 import re
-import tomllib
-import xml.etree.ElementTree as ElementTree
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.spatial.transform import Rotation
 
 from ...common.array_files import load_arrays
 from ...common.array_types import Array
-from ...common.files import DAMAGE, require_size
+from ...common.files import DAMAGE, reason, require_regular, require_size
+from ...common.text_files import parse_json, parse_toml, parse_xml, parse_yaml, read_text
 from ...errors import InputError, listed
 from ..camera import Lens
 from .camera_messages import is_camera_model, message_field
@@ -131,6 +128,7 @@ def read_calibration(path: str | Path, camera: str | None = None) -> Calibration
     file = Path(path)
     address = TopicAddress.from_path(path)
     if address is None:
+        require_regular(file)
         require_size(file, LARGEST_BYTES)
     try:
         return _camera_of_topic(address) if address else _camera_of_file(file, camera)
@@ -157,14 +155,9 @@ def _camera_of_topic(address: TopicAddress) -> Calibration:
 def _camera_of_file(file: Path, camera: str | None) -> Calibration:
     if zipfile.is_zipfile(file):
         return _opencv_camera(_archive(file))
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read as text ({error}); expected a calibration of OpenCV, ROS, Kalibr, "
-            "Anipose or COLMAP"
-        ) from error
-    cameras = _colmap_cameras(text) if _is_colmap(text) else _cameras_of(_parsed(text))
+    what = "a calibration of OpenCV, ROS, Kalibr, Anipose or COLMAP"
+    text = read_text(file, what, LARGEST_BYTES)
+    cameras = _colmap_cameras(text) if _is_colmap(text) else _cameras_of(_parsed(text, file))
     if camera is None and len(cameras) == 1:
         return cameras[0]
     chosen = [c for k, c in enumerate(cameras) if camera in (c.name, str(k))]
@@ -199,35 +192,27 @@ def _archive(file: Path) -> Mapping[str, Any]:
         ) from error
 
 
-def _parsed(text: str) -> Mapping[str, Any]:
+def _parsed(text: str, file: Path) -> Mapping[str, Any]:
     # OpenCV writes a directive and tags that other readers of YAML refuse.
     plain = re.sub(r"^%YAML[: ][^\n]*\n", "", text.lstrip("\ufeff")).replace("!!opencv-matrix", "")
-    readers: tuple[Callable[[str], Any], ...] = (
-        json.loads,
-        tomllib.loads,
-        _opencv_xml,
-        yaml.safe_load,
-    )
+    readers = (parse_json, lambda text: parse_toml(text, file), _opencv_xml, parse_yaml)
+    fault = "no table"
     for read in readers:
         try:
             content = read(plain)
-        # Readers of YAML raise anything for wrong tags.
-        except (*DAMAGE, ElementTree.ParseError, yaml.YAMLError):
+        except ValueError as error:
+            fault = reason(error)
             continue
         if isinstance(content, Mapping):
             return content
     raise InputError(
         "found neither YAML, JSON, XML, TOML nor cameras.txt; expected a calibration of OpenCV, ROS, "
-        "Kalibr, Anipose or COLMAP"
+        f"Kalibr, Anipose or COLMAP (the last error is {fault})"
     )
 
 
 def _opencv_xml(text: str) -> Any:
-    if not text.lstrip().startswith("<") or "<!" in re.sub(
-        r"<!--.*?-->", "", text, flags=re.DOTALL
-    ):
-        return None
-    root = ElementTree.fromstring(text)
+    root = parse_xml(text.lstrip())
     if root.tag != "opencv_storage":
         return None
     content: dict[str, Any] = {}
@@ -235,7 +220,7 @@ def _opencv_xml(text: str) -> Any:
         data = each.find("data")
         words = ((each if data is None else data).text or "").split()
         if data is None and len(words) == 1:
-            content[each.tag] = yaml.safe_load(words[0])
+            content[each.tag] = parse_yaml(words[0])
         else:
             content[each.tag] = words
     return content

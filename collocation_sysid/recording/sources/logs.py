@@ -21,6 +21,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.files import reason, require_regular
+from ...common.text_files import parse_json, read_text
 from ...errors import InputError, hint_at, listed
 from .messages import measurement_time_s
 
@@ -238,7 +239,7 @@ class _Json:
 def _dataset(path: Path, episode: int | None) -> Iterator[Log]:
     """The topics are the features, the messages the frames of an episode, like joint states."""
     require_packages("pyarrow")
-    info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+    info = parse_json(read_text(path / "meta" / "info.json", "the list of features of a dataset"))
     features = {
         name: feature
         for name, feature in info["features"].items()

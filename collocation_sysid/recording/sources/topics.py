@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.files import require_regular
+from ...common.text_files import HAND_WRITTEN_BYTES, read_text
 from ...errors import InputError, hint_at
 from ..gap_interpolation import interpolate_without_gaps
 from .camera_messages import camera_data_kind, is_camera_model, use_of_camera_message
@@ -247,15 +247,15 @@ def _poses_from_joints(
     from pytransform3d.urdf import UrdfTransformManager
 
     assert address.robot is not None
-    require_regular(address.robot)
     if address.frames is None:
         raise InputError(
             f"found no frames after {address.robot.name}; expected two, as in "
             f"{address.robot.name}#base>tool"
         )
     robot = UrdfTransformManager(check=False)
+    text = read_text(address.robot, "a description of the robot (URDF)", HAND_WRITTEN_BYTES)
     try:
-        robot.load_urdf(address.robot.read_text(encoding="utf-8"))
+        robot.load_urdf(text)
     except Exception as error:  # lxml's and the library's own
         raise InputError(f"this is not a valid URDF file: {error}", address.robot) from error
     parent, child = address.frames
