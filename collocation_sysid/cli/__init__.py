@@ -14,7 +14,9 @@ Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 
 from __future__ import annotations
 
 import ast
+import io
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -29,11 +31,15 @@ from rich.text import Text
 from typer.core import TyperGroup
 from typer.main import get_command, get_command_from_info
 
+from ..common.files import reason
 from ..common.installation import package_version
+from ..common.machine import machine_memory_mb
 from ..common.signal_handling import INTERRUPTS, heed_interrupts, ignore_interrupts, leave
 from ..errors import ImplausibleMarkersError, InputError, SimulationError, hint_at
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console
 
+# Memory that libraries need to be loaded [MB]: 1200 suffice on two cores, with 800 some hang.
+LEAST_MEMORY_MB = 1200
 FAMILIES = (
     "problem_commands",
     "study_commands",
@@ -114,12 +120,15 @@ class LazyCommands(TyperGroup):
 app = typer.Typer(
     name="collocation-sysid",
     cls=LazyCommands,
-    help="Identify the material parameters of a soft object from motion capture.\n\n"
+    help="Identify the material parameters of a soft object from video, motion capture or bench "
+    "tests, and plan motions with it.\n\n"
     "\b\nStart with\n"
-    "  collocation-sysid new my_object                    a commented problem file\n"
+    "  collocation-sysid new my_object --kind video       a problem file for a video\n"
+    "  collocation-sysid new my_object --kind specimen    or for a bench test\n"
     "  collocation-sysid check my_object/problem.toml     find mistakes before a solve\n"
     "  collocation-sysid solve my_object/problem.toml     parameters with error bars\n"
-    "  collocation-sysid report runs/my_object            all results as a web page",
+    "  collocation-sysid report runs/my_object            all results as a web page\n"
+    "  collocation-sysid plan runs/my_object task.toml    a motion of the hand for a task",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -154,6 +163,10 @@ def main() -> None:
     """Run the command line and end the process: errors become one message on stderr and an exit
     code, see the module; it does not return.
     """
+    # Libraries start Python themselves, which must not search the working folder for modules.
+    os.environ["PYTHONSAFEPATH"] = "1"
+    if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may be ASCII
+        sys.stdout.reconfigure(errors="backslashreplace")
     # Trial steps of a search overflow, and are then shortened.
     warnings.filterwarnings("ignore", category=RuntimeWarning)
     try:
@@ -173,9 +186,13 @@ def _run_command() -> None:
     # That it builds its cache of fonts, or where, is no news to who solves a problem.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
+        _require_memory()
         _root_command()(prog_name="collocation-sysid")
     except InputError as error:
         _exit_with_error("error", error, code=EXIT_BAD_INPUT, end=_likely_cause(error))
+    except (ImportError, MemoryError) as error:
+        cause = "the installation is damaged, or this process has too little memory"
+        _exit_with_error("error", InputError(f"{cause} ({reason(error)})"), code=EXIT_BAD_INPUT)
     except OSError as error:
         where = error.filename or "standard output, or a temporary file"
         _exit_with_error(
@@ -185,6 +202,16 @@ def _run_command() -> None:
         _exit_with_error("simulation failed", error, code=EXIT_NOT_CONVERGED)
     finally:
         ignore_interrupts()
+
+
+def _require_memory() -> None:
+    """Refuse a limit of memory with which libraries crash or hang while they are loaded."""
+    memory_mb = machine_memory_mb()
+    if memory_mb is not None and memory_mb < LEAST_MEMORY_MB:
+        raise InputError(
+            f"this process may have {memory_mb:.0f} MB of memory (ulimit -v, or a container); expected "
+            f"at least {LEAST_MEMORY_MB} MB"
+        )
 
 
 def _likely_cause(error: BaseException | None) -> str:

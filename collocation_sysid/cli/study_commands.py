@@ -183,7 +183,7 @@ def _run_study(
     if study.dry_run:
         if output.as_json:
             listed = [run.as_dict() for run in planned]
-            typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
+            typer.echo(json.dumps(listed, indent=1))
         else:
             print_result(plan_table(planned))
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -11,12 +12,16 @@ import pytest
 from kit.problem_files import pictures_drawn, run_command, settings, write_problem
 
 import collocation_sysid
+from collocation_sysid import cli
 from collocation_sysid.common.installation import python_command
 from collocation_sysid.common.isolated_process import run_isolated
 from collocation_sysid.extras.studies import run_execution
 from collocation_sysid.installation_check import _working_linear_solvers
 
-PLANTED = ("numpy", "casadi", "json", "scipy", "pydantic", "meshio", "matplotlib", "ezc3d", "email")
+PLANTED = (
+    *("numpy", "casadi", "json", "scipy", "pydantic", "meshio", "matplotlib", "ezc3d", "email"),
+    *("ctypes", "mujoco", "encodings", "os", "importlib"),
+)
 REDUCED = settings("solver.method=reduced-space")
 PACKAGE = Path(collocation_sysid.__file__).parent
 
@@ -98,12 +103,49 @@ def test_a_command_executes_nothing_of_the_working_folder(tmp_path: Path, words:
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.parametrize("command", cli.command_sources())
+def test_python_that_a_library_starts_does_not_search_the_working_folder(
+    monkeypatch: pytest.MonkeyPatch, command: str
+):
+    monkeypatch.setenv("PYTHONSAFEPATH", "")
+    assert run_command(command, "--help").code == 0
+    assert os.environ["PYTHONSAFEPATH"] == "1"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("export", "run", "--to", "mujoco", "--verify"),
+        ("animate", "run", "--to", "film.gif", "--fps", "2"),
+        ("report", "run"),
+        ("plot", "run"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_command_of_a_run_executes_nothing_of_the_working_folder(
+    tmp_path: Path, words: tuple[str, ...]
+):
+    pytest.importorskip("mujoco")
+    write_problem(tmp_path, {"swing": 8})
+    solved = run_command(
+        *("solve", tmp_path / "problem.toml", *REDUCED, "--no-pictures", "-q"),
+        *("--out", tmp_path / "run"),
+    )
+    assert solved.code in (0, 1), solved.err
+    plant(tmp_path)
+    done = run_program(*words, folder=tmp_path)
+    assert "Traceback" not in done.stderr, done.stderr
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "executed").exists()
+
+
 @pytest.mark.long
 def test_the_module_as_a_program_leaves_the_working_folder_alone(tmp_path: Path):
     write_problem(tmp_path, {"swing": 8})
     plant(tmp_path)
-    (tmp_path / "email.py").unlink()  # Python itself imports it before the package
-    (tmp_path / "json.py").unlink()
+    for name in ("email", "json", "ctypes", "os", "importlib", "encodings"):
+        (tmp_path / f"{name}.py").unlink()  # Python itself imports it before the package
     done = subprocess.run(
         [
             sys.executable,

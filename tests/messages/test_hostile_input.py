@@ -34,6 +34,7 @@ from kit.problem_files import (
     settings,
 )
 
+from collocation_sysid import cli
 from collocation_sysid.common import files, machine
 from collocation_sysid.common.files import read_json
 from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
@@ -70,6 +71,44 @@ def refused(*words: object) -> str:
     assert len(outcome.err.strip().splitlines()) == 1
     assert len(outcome.err) < 2000
     return outcome.err
+
+
+# Streams and memory -------------------------------------------------------------------------------
+
+ASCII = {"LANG": "C", "LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+
+
+@pytest.mark.long
+def test_the_output_may_be_in_ascii(tiny: Path):
+    for words in (("methods",), ("methods", "--json"), ("check", "problem.toml")):
+        done = subprocess.run(
+            [sys.executable, "-c", COMMAND_LINE, *words],
+            cwd=tiny, env={**os.environ, **ASCII}, capture_output=True, timeout=300,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, b"")
+        text = done.stdout.decode("ascii")
+        if "--json" in words:
+            assert json.loads(text)
+        else:
+            assert "\\x" in text or "\\u" in text
+
+
+def test_too_little_memory_is_one_line(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cli, "machine_memory_mb", lambda: 700.0)
+    assert "may have 700 MB of memory" in refused("methods")
+
+
+@pytest.mark.parametrize(
+    "failure", [MemoryError(), ImportError("libx.so: failed to map segment from shared object")]
+)
+def test_a_library_that_cannot_be_loaded_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception
+):
+    def command(**_: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(cli, "_root_command", lambda: command)
+    assert f"too little memory ({type(failure).__name__}:" in refused("methods")
 
 
 # Files --------------------------------------------------------------------------------------------

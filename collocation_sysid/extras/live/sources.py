@@ -101,4 +101,4 @@ def as_json(answer: LiveUpdate | Run) -> str:
     else:
         trust = answer.trust
         known = {"trust": {"verdict": trust.verdict, "reasons": trust.reasons}}
-    return json.dumps({"parameters": parameters, **known}, ensure_ascii=False)
+    return json.dumps({"parameters": parameters, **known})
