@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 
 from ..common.validated_types import expectation
 from ..errors import InputError, excerpt, hint_at
+from .recording_schema import ExperimentSection, registered_tables
 from .schema import SPECIMEN_TAG, ProblemFile, with_experiment_defaults
 from .specimen_schema import SpecimenSection
 
@@ -164,7 +165,8 @@ def _schema_field(key: Sequence[Part], root: type[BaseModel]) -> tuple[FieldInfo
 
 
 def _fields_by_key(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    return {field.alias or name: field for name, field in model.model_fields.items()}
+    fields = {field.alias or name: field for name, field in model.model_fields.items()}
+    return fields | registered_tables().model_fields if model is ExperimentSection else fields
 
 
 def _table_model(annotation: Any) -> type[BaseModel] | None:
