@@ -16,7 +16,7 @@ from rich.text import Text
 
 from ..common.console import PlainConsole
 from ..common.display import Shown, Table
-from ..common.pages import glossary_terms, page_files, page_text, page_title
+from ..common.pages import glossary_terms, page_files, page_text, page_title, search_pages
 from ..common.serialisation import as_json as json_text
 from ..errors import InputError, hint_at, located
 from .command_options import AsJson, command, option
@@ -69,7 +69,7 @@ def methods(
             if name
             else {each: method_summary(each) for each in METHODS}
         )
-        typer.echo(json.dumps(listed, indent=1, ensure_ascii=False))
+        typer.echo(json.dumps(listed, indent=1))
     else:
         parts = _options_table(name) if name else _methods_table()
         print_result(parts)
@@ -89,6 +89,7 @@ def schema() -> None:
     "explain trust",
     "explain budget scheme",
     "explain resample_hz",
+    "explain mirrored",
     "explain theory | less",
 )
 def explain(
@@ -96,12 +97,14 @@ def explain(
     topics: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="TOPIC", help="Topics of the pages to show, or keys of the problem file."
+            metavar="TOPIC",
+            help="Topics of the pages to show, keys of the problem file, or words to search for.",
         ),
     ] = None,
 ) -> None:
     """Show pages of the documentation, or list their topics; describe keys of the problem file, and
-    words of the output, such as constants and rows of the uncertainty budget.
+    words of the output, such as constants and rows of the uncertainty budget; list the pages with
+    any other word.
 
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
@@ -119,9 +122,9 @@ def explain(
     console = PlainConsole()
     for topic in [_known_topic(each) for each in topics]:
         if topic not in page_files():
-            for table in (_key_table(topic), _word_table(topic)):
-                if table.rows:
-                    print_result(table)
+            tables = [each for each in (_key_table(topic), _word_table(topic)) if each.rows]
+            for table in tables or [_found_table(topic)]:
+                print_result(table)
         elif console.is_terminal:
             console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)
         else:
@@ -135,13 +138,20 @@ def _known_topic(topic: str) -> str:
     for each in (topic, topic.split(" of ")[0]):
         if each in page_files() or find_keys(each) or _word_table(each).rows:
             return each
+    if search_pages(topic):
+        return topic
     names = [each.path.rpartition(".")[2] for each in all_keys()]
     known = [*page_files(), *dict.fromkeys(names)]
     raise InputError(
-        f"found {topic!r}; expected one of {', '.join(page_files())}, a key of the problem "
-        f"file, or a word of the output{hint_at(topic, known)}",
+        f"found {topic!r}; expected a topic that `explain` lists, a key of the problem file, or a word "
+        f"of the output or of a page{hint_at(topic, known)}",
         where="TOPIC",
     )
+
+
+def _found_table(text: str) -> Table:
+    rows = tuple((f"explain {topic}", *where) for topic, *where in search_pages(text))
+    return Table("", ("page", "section", "first line"), rows=rows, names=2, texts=1)
 
 
 def _key_table(name: str) -> Table:

@@ -81,6 +81,26 @@ def page_text(topic: str) -> str:
     return _LINK_TO_PAGE.sub(named, page_files()[topic].read_text(encoding="utf-8"))
 
 
+def search_pages(text: str, count: int = 5) -> list[tuple[str, str, str]]:
+    """Return topic, heading and first line with a word of `text` of the pages, at most `count`, that
+    have all its words in one section; a word in a heading counts as ten in the text.
+    """
+    words = text.lower().split()
+    found = {}
+    for topic, file in page_files().items():
+        for section in re.split(r"^#+ ", file.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
+            heading, _, body = section.partition("\n")
+            counts = [10 * heading.lower().count(w) + body.lower().count(w) for w in words]
+            if counts and all(counts) and sum(counts) > found.get(topic, (0,))[0]:
+                lines = [
+                    each for each in body.splitlines() if any(w in each.lower() for w in words)
+                ]
+                line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", lines[0].strip()) if lines else ""
+                found[topic] = sum(counts), heading, line
+    best = sorted(found, key=lambda topic: -found[topic][0])[:count]
+    return [(topic, *found[topic][1:]) for topic in best]
+
+
 def explain_command(*topics: str) -> str:
     """Return the command that shows pages in a terminal: "collocation-sysid explain TOPIC …", for
     any number of topics.

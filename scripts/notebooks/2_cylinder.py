@@ -71,9 +71,7 @@ plt.rcParams.update(
         "lines.markersize": 4,
     }
 )
-FOLDERS = [Path.cwd(), *Path.cwd().parents]
-PROBLEMS = next(path / "problems" for path in FOLDERS if (path / "problems").is_dir())
-CYLINDER = PROBLEMS / "foam_cylinder"
+CYLINDER = cs.datasets.fetch("foam_cylinder")
 
 # %% [markdown]
 # ## 2.1 Problem file

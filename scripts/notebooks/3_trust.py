@@ -35,7 +35,6 @@
 # %%
 # %matplotlib inline
 from dataclasses import replace
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -65,8 +64,6 @@ plt.rcParams.update(
         "lines.markersize": 4,
     }
 )
-FOLDERS = [Path.cwd(), *Path.cwd().parents]
-PROBLEMS = next(path / "problems" for path in FOLDERS if (path / "problems").is_dir())
 
 # %% [markdown]
 # ## 3.1 Correlation of the estimates
@@ -100,7 +97,7 @@ def print_estimates(run):
         print(f"{name:12}{estimate.value:10.4g} {text:15} true value {TRUE_VALUES[name]:.4g}")
 
 
-problem = cs.Problem.read(PROBLEMS / "foam_cylinder" / "problem.toml")
+problem = cs.Problem.read(cs.datasets.fetch("foam_cylinder") / "problem.toml")
 cylinder = problem.experiments[0]
 markers = cylinder.markers
 measured_m = markers.positions_m

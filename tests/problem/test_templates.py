@@ -85,7 +85,7 @@ def cases() -> Iterator[tuple[str, int, int]]:
             yield kind, first, end
 
 
-@pytest.mark.parametrize(("kind", "first", "end"), cases())
+@pytest.mark.parametrize(("kind", "first", "end"), [*cases()])
 def test_a_commented_line_is_accepted_where_it_stands(
     tmp_path: Path, kind: str, first: int, end: int
 ) -> None:

@@ -67,7 +67,9 @@ def test_all_notebooks_are_tested() -> None:
 
 @pytest.mark.long
 @each_notebook
-def test_the_cells_run_from_top_to_bottom(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cells_run_from_top_to_bottom_in_any_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The texts state numbers; the assertions of the cells check them."""
     count = 0
 
@@ -78,11 +80,11 @@ def test_the_cells_run_from_top_to_bottom(name: str, monkeypatch: pytest.MonkeyP
             count += 1
         plt.close("all")
 
-    monkeypatch.chdir(FOLDER)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", draw)
     with plt.rc_context():
         plt.switch_backend("agg")
-        runpy.run_path(f"{name}.py")
+        runpy.run_path(str(FOLDER / f"{name}.py"))
     assert count == FIGURES[name]
 
 
