@@ -7,9 +7,12 @@ Beside the body a panel shows the distance of the markers from their measurement
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -30,6 +33,7 @@ from .figure_style import (
     GREEN,
     LINE_PT,
     TEXT_PT,
+    VERMILION,
     add_legend_above,
     own_settings,
     style_axes,
@@ -69,6 +73,8 @@ HEADLINE_HEIGHT_MM = 5.0
 ERROR_PANEL_WIDTH_MM = 60.0
 # Colour of the paths of measured markers.
 MARKER_PATH_COLOUR = "#C4CBD4"
+# Colours of the paths of a film.
+PATH_COLOURS = (BLACK, BLUE)
 # Frames of a film: more take minutes and hundreds of megabytes.
 MAX_FILM_FRAMES = 3000
 # Samples per second of a static experiment, whose recording may have taken a second or a day.
@@ -130,6 +136,8 @@ def film(
     slowdown: float = 1.0,
     names: tuple[str, str] = TRAJECTORY_NAMES,
     headline: str = "",
+    measured: str = "measured",
+    paths_m: Mapping[str, Array] = MappingProxyType({}),
 ) -> Path:
     """Film one experiment and return the file; an existing file is replaced at the end.
 
@@ -148,6 +156,8 @@ def film(
         Labels of the fitted and of the simulated trajectory.
     headline : str
         Text above the body; empty for none.
+    measured, paths_m
+        See `FilmFigure`.
 
     Raises
     ------
@@ -155,7 +165,7 @@ def film(
         If ffmpeg is missing for .mp4, the film would have too many frames, or the file cannot be
         written.
     """
-    picture = FilmFigure(replay, names, headline=headline)
+    picture = FilmFigure(replay, names, headline, measured, paths_m)
     t_s = replay.t_s
     if replay.static:  # which may take a second or a day
         t_s = np.arange(len(t_s)) / STATIC_SAMPLES_PER_SECOND
@@ -166,7 +176,7 @@ def film(
         writer = _frame_writer(fps, ffmpeg)
         with (
             replaced_file(file) as draft,
-            writer.saving(picture.figure, str(draft), dpi),
+            _saving(writer, picture.figure, draft, dpi),
             counted_phase(StepUnit.FRAME, len(shown)),
         ):
             for t in shown:
@@ -250,6 +260,10 @@ class FilmFigure:
         Labels of the fitted and of the simulated trajectory.
     headline : str
         Text above the body; empty for none.
+    measured : str
+        Label of the measured markers.
+    paths_m : mapping of name to (T, k, 3)
+        Up to two sets of paths to draw, with dots where they are at the sample [m].
 
     Attributes
     ----------
@@ -260,9 +274,15 @@ class FilmFigure:
     figure: Figure
 
     def __init__(
-        self, replay: MotionRecord, names: tuple[str, str] = TRAJECTORY_NAMES, headline: str = ""
+        self,
+        replay: MotionRecord,
+        names: tuple[str, str] = TRAJECTORY_NAMES,
+        headline: str = "",
+        measured: str = "measured",
+        paths_m: Mapping[str, Array] = MappingProxyType({}),
     ) -> None:
         self.replay = replay
+        self.measured = measured
         trajectories = (
             (names[0], replay.positions_m, replay.markers_m),
             (names[1], replay.rolled_out_positions_m, replay.rolled_out_m),
@@ -274,6 +294,7 @@ class FilmFigure:
         surface_m = surface_m[is_finite]
         camera = ParallelCamera.facing_motion(surface_m, replay.up)
         everything = _points_to_show_m(replay, surface_m, samples=is_finite)
+        everything = np.vstack([everything, *(each.reshape(-1, 3) for each in paths_m.values())])
         compared = [
             (n, m) for n, _, m in shown if m.size and np.isfinite(m - replay.measured_m).any()
         ]
@@ -290,6 +311,11 @@ class FilmFigure:
         view = SheetView.fit_points(
             camera, everything, room_mm=(width - 8, height), corner_mm=(4, FOOT_HEIGHT_MM)
         )
+        # Paths (T, k, 2) on the sheet and dots by name.
+        self.paths = [
+            self._draw_paths(axes, name, view.to_sheet_mm(own_m), colour)
+            for (name, own_m), colour in zip(paths_m.items(), PATH_COLOURS, strict=False)
+        ]
         self._draw_bodies(
             axes, view, trajectories=shown, top_mm=total - 3 - (head - HEAD_HEIGHT_MM)
         )
@@ -314,8 +340,11 @@ class FilmFigure:
         `drawings` for each trajectory; the first body is shaded, further ones are wire frames.
         """
         replay = self.replay
+        style: Any = {"color": MARKER_PATH_COLOUR, "lw": 0.6, "zorder": 0.2}
+        if self.paths:  # which would hide them
+            style = {"color": VERMILION, "lw": 1.2, "zorder": 3.6, "ls": (0, (3, 3))}
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
-            axes.plot(*view.to_sheet_mm(path_m).T, color=MARKER_PATH_COLOUR, lw=0.6, zorder=0.2)
+            axes.plot(*view.to_sheet_mm(path_m).T, **style)
         for k, (name, positions, markers) in enumerate(trajectories):
             wire = GREEN if k else None
             title = axes.text(
@@ -331,6 +360,13 @@ class FilmFigure:
                 edge_colour=wire,
             )
             self.drawings.append((name, positions, markers, body, title))
+
+    @staticmethod
+    def _draw_paths(axes: Axes, name: str, paths_mm: Array, colour: str) -> tuple[Array, Line2D]:
+        for path_mm in np.moveaxis(paths_mm, 1, 0):
+            axes.plot(*path_mm.T, color=colour, lw=0.8, zorder=3.5)
+        style: Any = {"ls": "", "marker": "o", "ms": 4.5, "color": colour, "label": name}
+        return paths_mm, axes.add_line(Line2D([], [], zorder=4.5, **style))
 
     def _draw_errors(
         self,
@@ -358,7 +394,8 @@ class FilmFigure:
             squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
             style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
             panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
-        style_axes(panel, "", xlabel="time [s]", ylabel="marker error, RMS [mm]")
+        distance = f"distance from {self.measured}" if self.paths else "marker error"
+        style_axes(panel, "", xlabel="time [s]", ylabel=f"{distance}, RMS [mm]")
         panel.set_ylim(bottom=0.0)
         add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
@@ -366,10 +403,12 @@ class FilmFigure:
     def _draw_annotations(self, axes: Axes, camera: ParallelCamera, mm_per_m: float) -> None:
         draw_directions(axes, camera, origin_mm=(7.0, 4.0))
         draw_scale(axes, mm_per_m, corner_mm=(FILM_WIDTH_MM * 0.17, 4.0))
-        markers = ["measured", "behind the body"] if len(self.replay.marker_names) else []
+        markers = [self.measured, "behind the body"] if len(self.replay.marker_names) else []
+        markers = markers[:1] if self.paths else markers
         named = ["grasped", *markers]
         camera_points = LEGEND_ENTRY if self.replay.visible_points else ""
         handles = legend_handles(*named, camera_points=camera_points)
+        handles += [dot for _, dot in self.paths]
         draw_legend(
             axes, handles, corner_mm=(FILM_WIDTH_MM * (0.42 if len(handles) < 4 else 0.35), 5.5)
         )
@@ -394,10 +433,28 @@ class FilmFigure:
             off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
             is_compared = measured.size and markers_m is not replay.measured_m
             title.set_text(f"{name}: {off}" if is_compared else name)
+        for path_mm, dot in self.paths:
+            dot.set_data(*path_mm[sample].T)
         if self.cursor is not None:
             now_s = replay.t_s[sample] - replay.t_s[0]
             self.cursor.set_xdata([now_s, now_s])
         self.time_label.set_text(f"{replay.t_s[sample] - replay.t_s[0]:.2f} s")
+
+
+@contextmanager
+def _saving(writer: AbstractMovieWriter, figure: Figure, file: Path, dpi: float) -> Iterator[None]:
+    """Context in which frames are grabbed; after an exception the film is not finished, which would
+    replace the exception by another.
+    """
+    writer.setup(figure, str(file), dpi)
+    try:
+        yield
+    except BaseException:
+        if (process := getattr(writer, "_proc", None)) is not None:
+            process.kill()
+            process.communicate()
+        raise
+    writer.finish()
 
 
 def _points_to_show_m(replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]) -> Array:

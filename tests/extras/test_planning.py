@@ -1851,6 +1851,23 @@ def test_a_plan_that_misses_its_band_exceeds_the_error():
     assert any("tip misses its reference by 1.15 mm" in str(line) for line in plan_summary(outside))
 
 
+def test_the_film_of_a_plan_has_reference_point_and_hand():
+    plan = bar_plan()
+    (reference,) = plan.program.references
+    record = planning_folder.motion_record(plan)
+    counted = np.isfinite(reference.position_m)
+    shown = record.measured_m[:, 0]
+    assert shown[counted] == pytest.approx(reference.position_m[counted])
+    assert np.isfinite(shown[counted.any(axis=1)]).all()
+    off = np.linalg.norm(record.markers_m - record.measured_m, axis=2)
+    assert np.nanmax(off) == pytest.approx(plan.tracking_error(reference).largest_m)
+    paths_m = planning_folder.drawn_paths_m(plan)
+    assert paths_m["points"][:, 0] == pytest.approx(plan.points_m["tip"])
+    middle_m = hung_bar().experiments[0].grasps[0].nodes
+    held_m = plan.fine.positions_m[:, middle_m].mean(axis=1)
+    assert paths_m["hand"][:, 0] == pytest.approx(held_m, abs=1e-5)
+
+
 @pytest.mark.parametrize("interrupted", ["save_pictures", "film"])
 def test_an_interrupt_of_pictures_keeps_the_plan(tmp_path, monkeypatch, interrupted):
     def interrupt(*_: object, **__: object) -> None:

@@ -156,6 +156,20 @@ def test_mp4_is_written_where_ffmpeg_is(run, tmp_path):
     assert file.read_bytes()[4:8] == b"ftyp"
 
 
+@pytest.mark.parametrize("ending", [".gif", ".mp4"])
+def test_an_interrupted_film_is_an_interrupt_and_leaves_no_file(run, tmp_path, monkeypatch, ending):
+    if ending == ".mp4" and not (shutil.which("ffmpeg") or find_spec("imageio_ffmpeg")):
+        pytest.skip("needs ffmpeg")
+
+    def interrupt(self: FilmFigure, sample: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FilmFigure, "show_sample", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        animate(run, tmp_path / f"film{ending}")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_without_ffmpeg_the_remedy_is_named(run, tmp_path, monkeypatch):
     monkeypatch.setattr(animation.shutil, "which", lambda name: None)
     monkeypatch.setattr(animation, "find_spec", lambda name: None)

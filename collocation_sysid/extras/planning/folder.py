@@ -5,6 +5,7 @@ plan.json.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from ...common.array_types import Array
 from ...common.display import Line, Picture, Shown, Table, TitledParts
+from ...common.files import write_text_file
 from ...common.serialisation import as_json
 from ...common.signal_handling import INTERRUPTS
 from ...errors import listed
@@ -60,8 +62,8 @@ def write_plan(
     with_mcap: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Write the folder of a plan atomically, and return its path; Ctrl-C leaves out the remaining
-    pictures, the report and the film.
+    """Write the folder of a plan atomically, and return its path; pictures, report and film are drawn
+    into the finished folder, and Ctrl-C leaves out the remaining ones.
 
     It contains poses.csv (poses in the format of the problem), hand.csv (the hand with velocity and
     acceleration), command_<name>.csv of each planned tendon and pressure, predicted_points.csv,
@@ -87,30 +89,37 @@ def write_plan(
         If the folder contains anything but an earlier plan, or cannot be written, or a package for
         the MCAP file is missing.
     """
-    target = Path(folder)
-    with replaced_folder(target, marker_file=PLAN_FILE, content_word="plan") as place:
-        try:
-            with INTERRUPTS.deferred():
+    target, is_written = Path(folder), False
+    try:
+        with INTERRUPTS.deferred():
+            with replaced_folder(target, marker_file=PLAN_FILE, content_word="plan") as place:
                 _write_results(plan, place, target, rate_hz=rate_hz, with_mcap=with_mcap)
-            figures = plan_figures(plan)
-            save_pictures(place, figures)
-            pictures = (Picture(place / f"{name}.png", CAPTIONS[name]) for name in figures)
-            title = f"Plan for {plan.program.body.template.name!r}"
-            report = TitledParts(title, (*plan_summary(plan), *pictures), level=1)
-            (place / REPORT_FILE).write_text(report_html(report), encoding="utf-8")
-            if with_film:
-                say("rendering the film of the motion (Ctrl-C keeps the plan)")
-                replay = MotionRecord.from_experiment(
-                    plan.fine.experiment, (plan.fine.positions_m, _references_m(plan))
-                )
-                film(
-                    replay, place / FILM_FILE, fps=FRAMES_PER_SECOND, names=("predicted", "wanted")
-                )
-        except KeyboardInterrupt:
-            if not (place / PLAN_FILE).is_file():  # the second one
-                raise
-            (place / FILM_FILE).unlink(missing_ok=True)
+            is_written = True
+        _draw(plan, target, with_film, say)
+    except KeyboardInterrupt:
+        if not is_written:
+            raise
     return target
+
+
+def _draw(plan: MotionPlan, folder: Path, with_film: bool, say: Callable[[str], None]) -> None:
+    """Draw the pictures into the folder of a plan, and write its report and film."""
+    figures = plan_figures(plan)
+    save_pictures(folder, figures)
+    pictures = (Picture(folder / f"{name}.png", CAPTIONS[name]) for name in figures)
+    title = f"Plan for {plan.program.body.template.name!r}"
+    report = TitledParts(title, (*plan_summary(plan), *pictures), level=1)
+    write_text_file(folder / REPORT_FILE, report_html(report))
+    if with_film:
+        say("rendering the film of the motion (Ctrl-C keeps the plan)")
+        film(
+            motion_record(plan),
+            folder / FILM_FILE,
+            fps=FRAMES_PER_SECOND,
+            names=("predicted", ""),
+            measured="reference",
+            paths_m=drawn_paths_m(plan),
+        )
 
 
 def _write_results(
@@ -165,14 +174,29 @@ def hand_columns(plan: MotionPlan, t_s: Array) -> dict[str, Array]:
     }
 
 
-def _references_m(plan: MotionPlan) -> Array:
-    """Return the wanted positions (T, P, 3) of the points of the plan, NaN where free."""
-    wanted = {name: np.full((len(plan.t_s), 3), np.nan) for name in plan.points_m}
+def drawn_paths_m(plan: MotionPlan) -> dict[str, Array]:
+    """Return the paths (T, 1, 3) of the hand and (T, P, 3) of the points of a plan [m]."""
+    hand_m = plan.program.frame.position_m + plan.motion.derivatives(plan.t_s).value[:, :3]
+    return {"hand": hand_m[:, None], "points": np.stack([*plan.points_m.values()], axis=1)}
+
+
+def motion_record(plan: MotionPlan) -> MotionRecord:
+    """Return the predicted motion, with the references of positions in place of measured markers."""
+    wanted: dict[str, Array] = {}
     for each in plan.program.references:
-        wanted[each.name] = np.where(
-            np.isfinite(each.position_m), each.position_m, wanted[each.name]
-        )
-    return np.stack([*wanted.values()], axis=1) if wanted else np.zeros((len(plan.t_s), 0, 3))
+        known = wanted.setdefault(each.name, np.full((len(plan.t_s), 3), np.nan))
+        wanted[each.name] = np.where(np.isfinite(each.position_m), each.position_m, known)
+    wanted = {name: path_m for name, path_m in wanted.items() if np.isfinite(path_m).any()}
+    fine = plan.fine
+    record = MotionRecord.from_experiment(fine.experiment, (fine.positions_m, fine.markers_m))
+    predicted_m = np.zeros((len(plan.t_s), len(wanted), 3))
+    reference_m = np.zeros_like(predicted_m)
+    for k, (name, path_m) in enumerate(wanted.items()):
+        predicted_m[:, k] = plan.points_m[name]
+        # A free coordinate is shown as predicted.
+        known = np.where(np.isfinite(path_m), path_m, plan.points_m[name])
+        reference_m[:, k] = np.where(np.isfinite(path_m).any(axis=1, keepdims=True), known, np.nan)
+    return replace(record, marker_names=[*wanted], measured_m=reference_m, markers_m=predicted_m)
 
 
 def plan_json(plan: MotionPlan) -> dict[str, Any]:
