@@ -38,7 +38,7 @@ def plan(
         ),
     ] = "reduced-space",
     robust: Annotated[
-        bool, option("Minimise the mean over the uncertainty of a run's constants.")
+        bool, option("Minimise the mean over the noise of a run's constants.")
     ] = False,
     rate: Annotated[float | None, option("Rate of the poses for the robot.", "HZ")] = None,
     mcap: Annotated[bool, option("Write trajectory.mcap, a trajectory of ROS, too.")] = False,

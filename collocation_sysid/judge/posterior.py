@@ -38,10 +38,12 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..fem.laws.constants import without_region
 from ..model.parameters import Parameters
+from ..program.transcription import Transcription
+from ..recording.nuisance import GRIP, PLACE
 from ..statistics.budget.combined_intervals import NORMAL_95, ReportedEstimate, combine
 from ..statistics.budget.consider_analysis import ResidualChanges
 from ..statistics.budget.discretisation_error import estimate_changes
-from ..statistics.budget.effect_estimates import EffectEstimate, effect_row
+from ..statistics.budget.effect_estimates import EFFECT, EffectEstimate, JointPosterior, effect_row
 from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
 from ..statistics.distributions import student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
@@ -132,8 +134,10 @@ class Effects:
             self.deviations[kept],
         )
 
-    def added_to(self, fit: LinearisedFit, parameters: Parameters) -> LinearisedFit:
-        """Return the fit with the effects as its last parameters."""
+    def added_to(self, fit: LinearisedFit, parameters: Parameters) -> tuple[LinearisedFit, Array]:
+        """Return the fit with the effects as its last parameters, and their definition: the matrix
+        (p + a, p + a) that turns these parameters into those of the body.
+        """
         blocks = []
         for block, change in zip(fit.blocks, self.blocks, strict=True):
             more = change * (block.compute_root_weight() * block.is_measured)[..., None]
@@ -148,7 +152,16 @@ class Effects:
             at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
             effect_count=count,
         )
-        return self._as_defined(wide, parameters)
+        definition = self._definition(wide, parameters)
+        changed = [
+            replace(b, jacobian=b.jacobian @ definition) if self._redefining else b
+            for b in wide.blocks
+        ]
+        return replace(wide, blocks=tuple(changed)), definition
+
+    @property
+    def _redefining(self) -> list[int]:
+        return [k for k, name in enumerate(self.names) if effect_row(name).redefines]
 
     @property
     def _unique_names(self) -> list[str]:
@@ -158,31 +171,29 @@ class Effects:
             for k, name in enumerate(known)
         ]
 
-    def _as_defined(self, fit: LinearisedFit, parameters: Parameters) -> LinearisedFit:
-        """Return the fit in which constants that an effect redefines are those of its absence: the
-        change of the constants with the effect belongs to the column of the effect.
+    def _definition(self, fit: LinearisedFit, parameters: Parameters) -> Array:
+        """Return the matrix of `added_to`: constants that an effect redefines are those of its absence,
+        and the change of the constants with the effect belongs to the column of the effect.
 
         Forces of an alternative may be K times those of the answer, as viscosities that contain the
         bulk modulus of a nearly incompressible body. With 1/K of the constant they agree; only 1/K of
         what they differ in otherwise is the effect.
         """
         first = len(fit.names) - len(self.names)
-        rows = {k: effect_row(name) for k, name in enumerate(self.names, start=first)}
-        redefining = [k for k, row in rows.items() if row.redefines]
-        changed = [block.jacobian.copy() for block in fit.blocks]
+        redefining = [first + k for k in self._redefining]
+        matrix = np.eye(len(fit.names))
         for k in redefining:
+            redefined = effect_row(self.names[k - first]).redefines
             defined = [
                 j
                 for j, item in enumerate(parameters.free)
-                if without_region(item.name) in rows[k].redefines and not fit.at_bound[j]
+                if without_region(item.name) in redefined and not fit.at_bound[j]
             ]
             slopes = _conditional_slopes(fit, k, redefining)
             ratio = 1.0 - min(0.0, *(float(slopes[j]) for j in defined)) if defined else 1.0
-            for block, jacobian in zip(fit.blocks, changed, strict=True):
-                own = block.jacobian[..., k] + block.jacobian[..., defined] @ slopes[defined]
-                jacobian[..., k] = own / ratio
-        pairs = zip(fit.blocks, changed, strict=True)
-        return replace(fit, blocks=tuple(replace(b, jacobian=each) for b, each in pairs))
+            matrix[defined, k] = slopes[defined] / ratio
+            matrix[k, k] = 1 / ratio
+        return matrix
 
 
 def _conditional_slopes(fit: LinearisedFit, column: int, left_out: Sequence[int]) -> Array:
@@ -208,6 +219,7 @@ class Posterior:
     start: Array  # (nq,): q at which `fit` is linearised
     effects: Effects  # that are learnt
     considered: Effects  # that are not
+    definition: Array  # (p + a, p + a): turns parameters and learnt effects into those of the body
     step: Array  # (p + a,): step of all parameters and learnt effects
     uncertainty: Uncertainty  # of the fit after the step
     reported_q: Array  # (nq,): q of `uncertainty`, after the step
@@ -237,7 +249,7 @@ class Posterior:
         """
         none = effects.only(())
         learnt, considered = (effects, none) if is_learnt else (none, effects)
-        wide = learnt.added_to(fit, parameters)
+        wide, definition = learnt.added_to(fit, parameters)
         step = gauss_newton_step(wide)
         after = wide.after_step(step)
         step = step + estimate_changes(wide, considered.blocks) @ considered.means
@@ -246,7 +258,7 @@ class Posterior:
             after = replace(after, derived=derived_at(there))
         uncertainty = uncertainty_from_fit(after, parameters, there, error_model)
         wide = replace(wide, derived=after.derived)
-        return cls(wide, parameters, q, learnt, considered, step, uncertainty, there)
+        return cls(wide, parameters, q, learnt, considered, definition, step, uncertainty, there)
 
     @cached_property
     def q(self) -> Array:
@@ -278,9 +290,14 @@ class Posterior:
         """Names of the effects, and changes (nq, a) of q if each is off by the standard deviation of
         its prior; mesh and time step occur again, once for each channel.
         """
-        count = len(self.start)
-        ways = [self.covariance[:count, self._of_effects]]
-        ways.append(estimate_changes(self.fit, self.considered.blocks)[:count])
+        names, ways = self._sources
+        return names, ways[: len(self.start)]
+
+    @cached_property
+    def _sources(self) -> tuple[tuple[str, ...], Array]:
+        """The same for all parameters and learnt effects (p + a, a)."""
+        ways = [self.covariance[:, self._of_effects]]
+        ways.append(estimate_changes(self.fit, self.considered.blocks))
         rows = {row.name for row in DISCRETISATION}
         again = [k for k, name in enumerate(self.effects.names) if name in rows]
         names = (*self.effects.names, *self.considered.names)
@@ -291,7 +308,7 @@ class Posterior:
         return names, np.hstack(ways)
 
     def _changes_by_channel(self, k: int) -> Array:
-        """Return the changes (nq, c) of q by each channel of effect k alone, as large as it is
+        """Return the changes (p + a, c) by each channel of effect k alone, as large as it is
         estimated; a channel is one number of a marker over time.
         """
         place = self._of_effects[k]
@@ -300,7 +317,7 @@ class Posterior:
             for block in self.fit.blocks
         ]
         flat = np.hstack([each.reshape(len(each), -1) for each in scores])
-        return -self.step[place] * self.covariance[: len(self.start)] @ flat
+        return -self.step[place] * self.covariance @ flat
 
     @property
     def _of_effects(self) -> Index:
@@ -321,8 +338,50 @@ class Posterior:
         fit = self.fit.only(kept, effect_count=len(kept) - first)
         considered = self.considered.without(left_out)
         learnt = self.effects.without(left_out)
+        definition = self.definition[np.ix_(kept, kept)]
         step = gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
-        return replace(self, fit=fit, effects=learnt, considered=considered, step=step)
+        return replace(
+            self, fit=fit, effects=learnt, considered=considered, definition=definition, step=step
+        )
+
+    def joint(self, transcriptions: Iterable[Transcription]) -> JointPosterior:
+        """Return the joint posterior of what acts on the body in the fitted experiments, without the
+        grips, which another session does not have.
+        """
+        count, learnt = len(self.fit.names), len(self.effects.names)
+        rows = {name: (k, 1.0) for k, name in enumerate(self.fit.names[: len(self.start)])}
+        for each in transcriptions:
+            entries = each.nuisance.entries
+            places = each.nuisance_indices.indices.tolist()
+            for place, name, entry in zip(places, each.nuisance.names, entries, strict=True):
+                acts = entry.row == PLACE or entry.row.changes_motion
+                if acts and entry.row not in GRIP:
+                    rows[name] = place, entry.sigma
+        effects = (*self.effects.names, *self.considered.names)
+        for k, name in enumerate(effects, start=count - learnt):
+            row = effect_row(name)
+            if row.effect is not None or row in DISCRETISATION:
+                rows[EFFECT + name] = k, 1.0
+        own = len(self.considered.names)
+        ways = np.pad(self._sources[1], ((0, own), (0, 0)))
+        ways[count:, :own] = np.eye(own)
+        covariance = np.pad(self.uncertainty.noise_covariance, (0, own)) + ways @ ways.T
+        scatter = self.uncertainty.scatter
+        if scatter is not None:
+            between = scatter.sensitivities
+            covariance[: len(between), : len(between)] += between @ between.T
+        offset = self.definition @ self.step
+        definition = np.eye(count + own)
+        definition[:count, :count] = self.definition
+        kept, units = (np.array(each) for each in zip(*rows.values(), strict=True))
+        of_body = units[:, None] * definition[kept]
+        return JointPosterior(
+            tuple(rows),
+            units * np.append(offset, self.considered.means)[kept],
+            of_body @ covariance @ of_body.T,
+            tuple(name.partition(" ")[0] for name in effects),
+            of_body @ ways[:, : len(effects)],
+        )
 
     @cached_property
     def derivatives(self) -> dict[str, Array]:
@@ -504,7 +563,7 @@ class Posterior:
         found = {}
         before = least_squares_of_fit(fit).loss(self.step)
         for k, name in enumerate(others.names):
-            wide = replace(others.only([k]), means=np.zeros(1)).added_to(fit, self.parameters)
+            wide, _ = replace(others.only([k]), means=np.zeros(1)).added_to(fit, self.parameters)
             step = gauss_newton_step(wide)
             if step[-1] > 0 or not effect_row(name).is_one_sided:
                 found[name] = before - least_squares_of_fit(wide).loss(step)

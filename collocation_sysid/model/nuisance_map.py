@@ -63,8 +63,6 @@ LARGEST_DELAY_FRACTION = 0.25
 LARGEST_JOINING_DELAY_SIGMAS = 4.0
 # Factor that keeps a joining load inside the recording: at its ends it would join at once or never.
 INSIDE_RECORDING_FACTOR = 1 - 1e-9
-# What a row must change (see `Deviation.changes`) to affect the motion.
-CHANGES_OF_MOTION = {"gravity", "grasps", "loads", "drives", "stiffness"}
 
 
 class TimedLoad(NamedTuple):
@@ -236,7 +234,7 @@ class NuisanceMap(RecordingQuantities):
         """Indices in φ, ascending, of the parameters that affect the motion: gravity, grasps,
         obstacles, loads, actuators.
         """
-        return self._indices_where(lambda e: not CHANGES_OF_MOTION.isdisjoint(e.row.changes))
+        return self._indices_where(lambda e: e.row.changes_motion)
 
     @cached_property
     def actuator_indices(self) -> Index:

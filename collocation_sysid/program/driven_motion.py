@@ -270,10 +270,3 @@ class DrivenMotion:
             if t < sweep.dynamics.first_row:
                 out[t] = march.past[0]
         return out[..., 0], out[..., 1:], march.violation_n
-
-    def respond_to_parameters(self, drive: Drive, x: Array) -> Array:
-        """Return the derivatives (N, 3n, nq) of a motion x (N, 3n) [m] by the parameters q."""
-        stated = self._stated
-        _, by_q = stated.inputs.evaluate_at(stated.p)
-        equations = replace(self.equations(drive.without_controls), input_derivatives=by_q)
-        return np.array([*self._sweep.sensitivities(x, equations)])

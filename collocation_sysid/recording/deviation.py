@@ -33,6 +33,8 @@ Component = Literal[
 ModelPart = Literal[
     "reading", "clock", "sensor", "gravity", "grasps", "loads", "drives", "depth", "stiffness"
 ]
+# Parts of which a change affects the motion, not only the measurements.
+OF_MOTION = {"gravity", "grasps", "loads", "drives", "stiffness"}
 # Readable units: factor and text by SI unit.
 READABLE_UNITS = {
     "m": (1e3, " mm"),
@@ -192,6 +194,11 @@ class Deviation:
         alone without axes.
         """
         return tuple(f"{self.name} {axis}" for axis in self.axes.split()) or (self.name,)
+
+    @property
+    def changes_motion(self) -> bool:
+        """Whether a nuisance parameter of this kind changes the motion."""
+        return not OF_MOTION.isdisjoint(self.changes)
 
     def usual_considered(self, *origins: str | None) -> float | None:
         """Return the deviation in the budget for a body of some origins (`Body.made` and

@@ -727,6 +727,8 @@ IMAGE_DRIFT = _image_error(
     description="drift of each track: standard deviation of a random walk after one second",
 )
 
+# Of one session: the next one grips the body anew.
+GRIP = (GRASP_TURN, GRASP_SHIFT)
 # In the order of φ; neighbours of one component stand together.
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, Deviation))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.

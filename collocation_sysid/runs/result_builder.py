@@ -81,6 +81,7 @@ def build_result(answer: SolvedProblem) -> Result:
         basis=tuple(_reference_sentences(answer, scale)),
         budget={name: line.shares for name, line in answer.budget.items()},
         effects=answer.effects,
+        joint=answer.joint,
         scale=scale,
         places=answer.places,
         nuisance=_nuisance(answer),

@@ -20,7 +20,7 @@ from ..methods.starts.start import ScanSummary
 from ..statistics.assessment import Assessment
 from ..statistics.budget.combined_intervals import ReportedEstimate
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
-from ..statistics.budget.effect_estimates import EffectEstimate
+from ..statistics.budget.effect_estimates import EffectEstimate, JointPosterior
 from ..statistics.combinations import Combination, Direction
 from ..statistics.profile_likelihood import Profile
 from ..statistics.remedies import remedy_for
@@ -255,6 +255,9 @@ class Result:
     effects : tuple of EffectEstimate
         Prior and posterior of each effect of the budget, the most surprising first; empty without
         error bars.
+    joint : JointPosterior or None
+        Joint posterior of what acts on the body, for predictions of other motions; None without error
+        bars.
     scale : ScaleReference or None
         The stated mass to which moduli are relative; None if a force or a prior sets their scale.
     places : mapping of experiment to mapping of marker to MarkerPlace
@@ -305,6 +308,7 @@ class Result:
     basis: tuple[str, ...]
     budget: Mapping[str, Mapping[str, float]]
     effects: tuple[EffectEstimate, ...]
+    joint: JointPosterior | None
     scale: ScaleReference | None
     places: Mapping[str, Mapping[str, MarkerPlace]]
     nuisance: Mapping[str, Mapping[str, NuisanceResult]]

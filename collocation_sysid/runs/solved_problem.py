@@ -27,7 +27,7 @@ from ..statistics.assessment import (
 )
 from ..statistics.budget.combined_intervals import ReportedEstimate, combine
 from ..statistics.budget.discretisation_error import Refinement
-from ..statistics.budget.effect_estimates import EffectEstimate, effect_concerns
+from ..statistics.budget.effect_estimates import EffectEstimate, JointPosterior, effect_concerns
 from ..statistics.budget.systematic_effects import DISCRETISATION
 from ..statistics.combinations import (
     Combination,
@@ -189,6 +189,13 @@ class SolvedProblem:
         bars.
         """
         return () if self.posterior is None else self.posterior.effect_estimates
+
+    @property
+    def joint(self) -> JointPosterior | None:
+        """Joint posterior of what acts on the body, relative to the solution; None without error bars."""
+        return None if self.posterior is None else self.posterior.joint(
+            self.solution.collocation.transcriptions
+        )  # fmt: skip
 
     @cached_property
     def is_consistent(self) -> bool:

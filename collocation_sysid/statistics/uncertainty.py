@@ -134,6 +134,8 @@ class Uncertainty(ErrorBasis):
         Finite covariance of the same quantities for normal 95 % intervals: directions without
         information have the standard deviation `UNDETERMINED`, and parameters at a bound are free.
         Differences between recordings are not contained.
+    noise_covariance : (p, p) array
+        The same of all parameters and effects of the fit in the solver's coordinates.
     correlation : (nq, nq) array
         Correlations; NaN where a variance is not finite.
     quantiles : (nq,) array
@@ -163,6 +165,7 @@ class Uncertainty(ErrorBasis):
     names: tuple[str, ...]
     covariance: Array
     complete_covariance: Array
+    noise_covariance: Array
     correlation: Array
     quantiles: Array
     estimates: Mapping[str, Estimate]
@@ -221,9 +224,9 @@ def uncertainty_from_fit(
         )
     covariance, determined, of_noise, basis = _error_bars(fit, factored, requested=error_model)
     of_effects = factored.fit.root @ factored.fit.root[len(fit.names) - fit.effect_count :].T
+    determined = determined - of_effects @ of_effects.T
     of_effects[fit.shared_count :] = 0.0  # nuisance parameters and effects keep the complete one
-    of_effects = of_effects @ of_effects.T
-    covariance, determined = covariance - of_effects, determined - of_effects
+    covariance = covariance - of_effects @ of_effects.T
     of_all, bounded = _reported_covariance(covariance, fit, parameters=parameters, q=q)
     scatter = _compare_recordings(fit.with_known_effects, parameters, q=q, errors=error_model)
     of_q, quantiles, widening = _widen_by_scatter(of_all[:shared, :shared], of_noise, scatter)
@@ -243,14 +246,14 @@ def uncertainty_from_fit(
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     # One factor for all: different ones would widen combinations that are known well.
     factor = np.nanmax(of_noise, initial=normal_isf(0.025)) / normal_isf(0.025)
-    complete = factor**2 * determined[:shared, :shared]
-    open_ways = sizes[:, None] * factored.fit.null_space[:shared]
+    open_ways = UNDETERMINED * factored.fit.null_space
+    of_noise_alone = factor**2 * determined + open_ways @ open_ways.T
     return Uncertainty(
         **vars(basis),
         names=fit.names[:shared],
         covariance=of_q * np.outer(sizes, sizes),
-        complete_covariance=complete * np.outer(sizes, sizes)
-        + UNDETERMINED**2 * open_ways @ open_ways.T,
+        complete_covariance=of_noise_alone[:shared, :shared] * np.outer(sizes, sizes),
+        noise_covariance=of_noise_alone,
         correlation=correlation_from_covariance(of_q),
         quantiles=quantiles,
         estimates=estimates,

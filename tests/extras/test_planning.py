@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import tomli_w
+from assumed_twins import with_wrong_assumptions
 from kit.problem_files import TRUTH as TRUTH_OF_FILES
 from kit.problem_files import run_command, write_problem
 from scipy.linalg import eigh, expm
@@ -23,6 +24,7 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.planning import durations, motion_plan, reduced_solver
 from collocation_sysid.extras.planning import folder as planning_folder
+from collocation_sysid.extras.planning.band import OTHERS
 from collocation_sysid.extras.planning.folder import (
     command_times_s,
     plan_json,
@@ -51,6 +53,8 @@ from collocation_sysid.extras.planning.trajectory_log import write_trajectory_mc
 from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.recording.pose_files import read_poses
 from collocation_sysid.recording.time_tables import read_pressure
+from collocation_sysid.statistics.budget.effect_estimates import EFFECT, JointPosterior
+from collocation_sysid.statistics.budget.systematic_effects import DEVIATIONS
 
 LIMITS = Limits.model_validate(
     {
@@ -140,22 +144,6 @@ def test_a_motion_corrected_by_sweeps_is_the_simulated_one():
     simulated = planned.simulate(c + step)
     assert np.abs(near - simulated).max() > 1e-7  # the correction has something to do
     assert np.abs(planned.simulate(c + step, near=near) - simulated).max() < 1e-11
-
-
-def test_derivatives_by_constants_are_those_of_simulations():
-    planned = program()
-    c = 0.05 * np.random.default_rng(1).normal(size=planned.space.size)
-    drive = planned.drive(c)
-    found = planned.driven.respond_to_parameters(drive, planned.simulate(c))
-    h = 1e-4
-    for k in range(len(planned.driven.q)):
-        step = h * np.eye(len(planned.driven.q))[k]
-        ends = [
-            replace(planned.driven, q=planned.driven.q + sign * step).simulate(drive)
-            for sign in (1, -1)
-        ]
-        differences = (ends[0] - ends[1]) / (2 * h)
-        assert np.abs(found[..., k] - differences).max() < 1e-5 * np.abs(differences).max() + 1e-12
 
 
 def test_derivatives_of_hand_positions_and_limits_are_their_differences():
@@ -1122,11 +1110,7 @@ def test_the_search_ends_with_intervals_as_narrow_as_wanted():
 
 def test_the_recordings_of_a_run_count():
     deviations = np.array([0.01, 0.01, 0.01, 0.01])
-    body = replace(
-        PlannedBody.read(hung_bar()),
-        covariance=np.diag(deviations**2),
-        statistical_covariance=np.diag(deviations**2),
-    )
+    body = replace(PlannedBody.read(hung_bar()), statistical_covariance=np.diag(deviations**2))
     planned = PlannedProgram.from_task(body, informative(), LIMITS)
     rest = np.zeros(planned.space.size)
     standing = planned.criterion.half_widths(rest, planned.simulate(rest))
@@ -1262,9 +1246,25 @@ def test_obstacles_stay_at_their_pose_at_the_first_sample_also_in_an_execution()
 def known_plan(deviations, **changes) -> MotionPlan:
     """The plan of the bar, with stated standard deviations of the four logarithms."""
     covariance = np.diag(deviations) ** 2
-    body = replace(PlannedBody.read(hung_bar()), covariance=covariance, **changes)
+    joint = JointPosterior((*TRUTH,), np.zeros(4), covariance, (), np.zeros((4, 0)))
+    known = {"joint": joint, "statistical_covariance": covariance}
+    body = replace(PlannedBody.read(hung_bar()), **(known | changes))
     plan = bar_plan()
     return replace(plan, program=replace(plan.program, body=body))
+
+
+def off_by(*names: str, **changes) -> MotionPlan:
+    """The plan of the bar, whose effects are known to be one standard deviation off."""
+    count = len(names)
+    none = np.zeros((count, count))
+    effects = tuple(EFFECT + name for name in names)
+    joint = JointPosterior(effects, np.ones(count), none, (), none[:, :0])
+    return known_plan([0, 0, 0, 0], joint=joint, **changes)
+
+
+def std_m(plan: MotionPlan) -> np.ndarray:
+    """Standard deviations (T, 3) of the tip of a plan with the mean zero."""
+    return plan.half_widths_m["tip"] / plan.band_factor
 
 
 def drawn_tips(plan: MotionPlan, count: int) -> np.ndarray:
@@ -1272,7 +1272,7 @@ def drawn_tips(plan: MotionPlan, count: int) -> np.ndarray:
     planned = plan.program
     at_tip = planned.point_weights("tip").toarray()
     rng = np.random.default_rng(0)
-    draws = rng.multivariate_normal(planned.driven.q, plan.covariance, size=count)
+    draws = rng.multivariate_normal(planned.driven.q, planned.body.joint.covariance, size=count)
     drive = planned.drive(plan.answer.c)
     return np.array(
         [
@@ -1284,19 +1284,16 @@ def drawn_tips(plan: MotionPlan, count: int) -> np.ndarray:
 
 @pytest.mark.long
 def test_the_band_contains_the_whole_motion_of_random_truths():
-    """Truths have constants from the combined covariance, and deviations of the description, which
-    are independent at each time or constant.
+    """Truths have constants from the posterior, and deviations of the description, which are
+    independent at each time or constant.
     """
     plan = known_plan([0.02, 0.01, 0.1, 0.1])
     tips = drawn_tips(plan, 100)
-    std = plan.std_m["tip"]
+    std = std_m(plan)
     peak = std[:, 0].argmax()
     assert np.std(tips, axis=0)[peak, 0] == pytest.approx(std[peak, 0], rel=0.25)
     nominal = plan.answer.x[plan.program.sample_rows] @ plan.program.point_weights("tip").T
     assert (np.abs(tips - nominal) <= plan.half_widths_m["tip"]).all(axis=(1, 2)).sum() >= 95
-    name, share = plan.limiting_constant
-    assert name == "young_pa"
-    assert 0.5 < share <= 1.0
     assert plan.tracking_error(plan.program.references[0]).band_m > 0
     rng = np.random.default_rng(1)
     for deviation_m, shape in ((2e-5, tips.shape), (1e-4, tips.shape), (1e-4, (100, 1, 3))):
@@ -1306,49 +1303,75 @@ def test_the_band_contains_the_whole_motion_of_random_truths():
 
 
 def test_errors_of_the_description_widen_the_band():
-    deviations = [0.02, 0.01, 0.1, 0.1]
-    plan = known_plan(deviations)
-    assert plan.half_widths_m["tip"] == pytest.approx(np.sqrt(9.488) * plan.std_m["tip"], rel=1e-3)
-    wider = known_plan(deviations, description_std_m=5e-4)
-    assert wider.std_m["tip"] == pytest.approx(np.hypot(plan.std_m["tip"], 5e-4), rel=1e-9)
-    values = plan.std_m["tip"].size
+    plan = known_plan([0.02, 0.01, 0.1, 0.1])
+    wider = known_plan([0.02, 0.01, 0.1, 0.1], description_std_m=5e-4)
+    assert std_m(wider) == pytest.approx(np.hypot(std_m(plan), 5e-4), rel=1e-9)
     outside = 2 * norm.sf(wider.band_factor)
-    assert (1 - outside) ** values == pytest.approx(0.95)
+    assert (1 - outside) ** std_m(plan).size == pytest.approx(0.95)
+
+
+@pytest.mark.parametrize(
+    "name", ["mass", "body_scale", "density_gradient x", "stiffness_gradient z"]
+)
+def test_deviations_by_an_effect_are_those_of_another_body(name):
+    plan = off_by(name)
+    planned = plan.program
+    row = DEVIATIONS[name.partition(" ")[0]]
+    moved = planned.moved_experiment(plan.answer.c)
+    tips = [
+        with_wrong_assumptions(moved, TRUTH, {name: way * row.considered}).markers.positions_m[:, 0]
+        for way in (0.5, -0.5)
+    ]
+    change = tips[0] - tips[1]
+    assert np.abs(plan.half_widths_m["tip"] - np.abs(change)).max() < 0.05 * np.abs(change).max()
+
+
+def test_another_session_has_another_grip_than_the_recording():
+    """The plan has the grip of the recording, and the prior of the grip is that of the template."""
+    (hung,) = hung_bar().experiments
+    of_grip = cs.Nuisance.none(hand_eye_m=1e-3, hand_eye_rad=0.01)
+    template = replace(hung, nuisance=of_grip)
+    plan = known_plan([0, 0, 0, 0], template=template)
+    std = std_m(plan)
+    # The tip is 120 mm below the grip, and the bar bends back a little by its weight.
+    assert 1.1e-3 < std[0, 0] < np.hypot(1e-3, 0.01 * 0.12)
+    assert plan.band_contributions[0].source == "grip"
+    text = "\n".join(map(str, plan_summary(plan)))
+    assert "100 % of the band's variance come from grip; to reduce it, grip the body" in text
+    planned = plan.program
+    moved = replace(planned.moved_experiment(plan.answer.c), nuisance=of_grip)
+    (transcription,) = cs.Collocation([moved], hung_bar().parameters).transcriptions
+    phi = np.array([0.1, -0.2, 0.1, 0.3, 0.2, -0.1])
+    gripped = transcription.corrected_experiment(phi)
+    change = np.diff(
+        [
+            cs.simulate(each, TRUTH, "midpoint", substeps=1).markers_m[:, 0]
+            for each in (moved, gripped)
+        ],
+        axis=0,
+    )[0]
+    values = dict(
+        zip(transcription.nuisance.names, phi * transcription.nuisance.scales, strict=True)
+    )
+    regripped = known_plan([0, 0, 0, 0], template=template, grip=values)
+    more = regripped.half_widths_m["tip"] - plan.half_widths_m["tip"]
+    assert np.abs(more - np.abs(change)).max() < 0.05 * np.abs(change).max()
 
 
 def test_the_sources_of_the_budget_divide_the_band():
-    budget = {"young_pa": {"noise": 0.3, "scale": 0.7}, "gamma_r_s": {"noise": 1.0}}
-    plan = known_plan([0.05, 1e-6, 0.02, 1e-6], budget=budget, description_std_m=1e-5)
-    first, *others = plan.band_contributions
-    assert (first.constant, first.source) == ("young_pa", "scale")
-    noise = next(e for e in others if (e.constant, e.source) == ("young_pa", "noise"))
-    assert noise.share == pytest.approx(first.share * 3 / 7)
-    assert sum(each.share for each in plan.band_contributions) == pytest.approx(1.0)
-    assert any(each.constant is None for each in others)
-    name, share = plan.limiting_constant
-    known = sum(each.share for each in plan.band_contributions if each.constant)
-    assert (name, share) == ("young_pa", pytest.approx((first.share + noise.share) / known))
-    text = "\n".join(map(str, plan_summary(plan)))
-    assert "of the band's variance come from the uncertainty of E by scale; to reduce it, " in text
-    assert plan_json(plan)["band_contributions"][0]["source"] == "scale"
-
-
-def test_a_recording_of_the_plan_narrows_the_statistical_part_of_the_band():
-    deviations = np.array([0.05, 0.02, 0.3, 0.3])
-    places = {"marker_places_m": {"tip": np.array([0.01, 0.01, 0.0])}}
-    known = known_plan(deviations, statistical_covariance=np.diag(deviations**2), **places)
-    systematic = known_plan(deviations, statistical_covariance=np.zeros((4, 4)), **places)
-    (reference,) = known.program.references
-    before = known.tracking_error(reference).band_m
-    assert systematic.half_width_after_recording_m == pytest.approx(before)
-    assert known.half_width_after_recording_m < 0.7 * before
-    # The information is that of the tip's coordinates with the noise of the recording.
-    by_q = known.contributions_m["tip"].reshape(-1, 4)
-    covariance = np.linalg.inv(np.diag(deviations**-2) + by_q.T @ by_q / 1e-3**2)
-    counted = np.isfinite(reference.position_m).ravel()
-    variance = np.einsum("tq,qr,tr->t", by_q, covariance, by_q)[counted].max()
-    half_m = known.band_factor * np.sqrt(variance)
-    assert known.half_width_after_recording_m == pytest.approx(half_m, rel=1e-3)
+    """Constants vary with an effect, and alone; the change by the effect cancels in part."""
+    names = (*TRUTH, EFFECT + "mass")
+    by_mass = np.array([[0.009, 0.0, 0.0, 0.0, 1.0]]).T
+    noise = np.diag([0.001, 0, 0, 0, 0]) ** 2
+    covariance = noise + by_mass @ by_mass.T
+    joint = JointPosterior(names, np.zeros(5), covariance, ("mass",), by_mass)
+    plan = known_plan([0.05, 0, 0, 0], joint=joint, description_std_m=1e-6)
+    shares = {each.source: each.share for each in plan.band_contributions}
+    assert set(shares) == {"mass", OTHERS, "description"}
+    assert sum(shares.values()) == pytest.approx(1.0)
+    alone = known_plan([0.009, 0, 0, 0])
+    assert std_m(plan).max() < 0.3 * std_m(alone).max()
+    assert plan_json(plan)["band_contributions"][0]["source"] in shares
 
 
 @pytest.mark.long
@@ -1359,7 +1382,8 @@ def test_a_robust_plan_is_better_on_average_over_the_constants():
     assert len(scenarios) == 4
     mean = np.mean([each.driven.q for each in scenarios], axis=0)
     spread = np.mean([np.outer(*[each.driven.q - mean] * 2) for each in scenarios], axis=0)
-    assert spread[::2, ::2] == pytest.approx(plan.covariance[::2, ::2], abs=1e-9)
+    covariance = planned.body.statistical_covariance
+    assert spread[::2, ::2] == pytest.approx(covariance[::2, ::2], abs=1e-9)
     answer = solve_reduced(planned, scenarios=scenarios)
 
     def average(c, programs):
@@ -1367,7 +1391,7 @@ def test_a_robust_plan_is_better_on_average_over_the_constants():
 
     assert answer.history[-1] == pytest.approx(average(answer.c, scenarios))
     rng = np.random.default_rng(1)
-    draws = rng.multivariate_normal(planned.driven.q, plan.covariance, size=10)
+    draws = rng.multivariate_normal(planned.driven.q, covariance, size=10)
     drawn = [replace(planned, driven=replace(planned.driven, q=q)) for q in draws]
     for programs in (scenarios, drawn):
         assert average(answer.c, programs) < 0.99 * average(plan.answer.c, programs)
@@ -1385,7 +1409,7 @@ def test_a_body_without_guesses_needs_a_run():
 
 
 def test_without_a_run_the_uncertainty_is_unknown():
-    assert bar_plan().limiting_constant is None
+    assert bar_plan().band_contributions == ()
     assert bar_plan().tracking_error(bar_plan().program.references[0]).band_m is None
 
 
@@ -1417,7 +1441,7 @@ def test_a_run_gives_estimates_covariance_and_the_poses_of_its_gripper(tmp_path:
     body = PlannedBody.read(run)
     assert body.q == pytest.approx(run.solution.q)
     low, high = run.interval("young_pa")
-    half_width = 1.96 * np.sqrt(body.covariance[0, 0])
+    half_width = 1.96 * np.sqrt(body.joint.covariance[0, 0])
     assert np.log(high / low) / 2 == pytest.approx(half_width, rel=0.1)
     planned = PlannedProgram.from_task(
         body, task(reference=[{"point_m": (0.01, 0.01, 0.0), "hold": True}]), LIMITS

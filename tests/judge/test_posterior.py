@@ -9,7 +9,7 @@ from study_effects import CONSTANTS, answer
 import collocation_sysid as cs
 from collocation_sysid.judge.posterior import NOISE, NUISANCES, Effects, Posterior
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.statistics.budget.effect_estimates import EffectEstimate
+from collocation_sysid.statistics.budget.effect_estimates import EFFECT, EffectEstimate
 from collocation_sysid.statistics.budget.systematic_effects import DEVIATIONS
 from collocation_sysid.statistics.linearised import LinearisedFit, ResidualBlock
 from collocation_sysid.statistics.uncertainty import ErrorModel
@@ -107,6 +107,64 @@ def test_step_covariance_and_budget_are_those_of_bayes_formula(rng):
         assert own.value == pytest.approx(mean[k] * size)
         assert own.std_error == pytest.approx(np.sqrt(covariance[k, k]) * size)
         assert (own.mean, own.deviation) == pytest.approx((means[k - 4] * size, size))
+
+
+def test_what_acts_alike_in_two_motions_cancels_in_the_joint_posterior(rng):
+    """Deviations of another motion from its prediction have the joint covariance, and the mean by the
+    offset from the answer.
+    """
+    by_parameters = slopes(rng, 4)
+    by_parameters[:, 3] = 0.0  # the time shift
+    # The data hardly tell the effects from constants.
+    columns = by_parameters[:, :3] @ rng.normal(size=(3, 2)) + 0.01 * slopes(rng, 2)
+    names = ("mass", "body_scale")
+    both = np.hstack([by_parameters[:, :3], columns])
+    other = np.hstack([slopes(rng, 3), 0.5 * slopes(rng, 2)])[:1]
+    scores = []
+    for _ in range(200):
+        truth = np.append(0.1 * rng.normal(size=3), rng.normal(size=2))
+        residual = rng.normal(size=len(both)) - both @ truth
+        joint = posterior(linear_fit(by_parameters, residual), columns, *names).joint(())
+        variance = (other @ joint.covariance @ other.T)[0, 0]
+        scores.append((other @ (truth - joint.offset))[0] / np.sqrt(variance))
+    assert joint.names == (*NAMES[:3], *(EFFECT + name for name in names))
+    assert np.mean(scores) == pytest.approx(0, abs=0.25)
+    assert np.std(scores) == pytest.approx(1, abs=0.15)
+    of_constants = both[:, :3] @ joint.covariance[:3, :3] @ both[:, :3].T
+    alike = both @ joint.covariance @ both.T
+    assert np.trace(alike) < 0.1 * np.trace(of_constants)
+    assert joint.by_source[:3] == pytest.approx(joint.covariance[:3, 3:])
+
+
+@pytest.mark.parametrize("is_learnt", [True, False])
+def test_the_joint_posterior_has_the_constants_of_the_body(rng, is_learnt):
+    """A law of damping that redefines γ_r, and effects that the data do not correct."""
+    by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 2)
+    by_parameters[:, 3] = 0.0
+    fit = linear_fit(by_parameters, rng.normal(size=len(columns)))
+    own = effects(columns, "mass", LAWS[0], means=np.array([2.0, 0.0]))
+    found = Posterior.from_fit(fit, own, PARAMETERS, Q, GIVEN, is_learnt=is_learnt)
+    joint = found.joint(())
+    raw = np.hstack([by_parameters[:, :3], columns])
+    if is_learnt:
+        defined = found.fit.blocks[0].jacobian.reshape(len(raw), -1)
+        assert np.abs(defined[:, 5] - columns[:, 1]).max() > 0.1
+        covariance, step = found.covariance, found.step
+    else:
+        # The constants change with an effect such that the measurements do not.
+        by_effect = -np.linalg.lstsq(by_parameters, columns, rcond=None)[0][:3]
+        by_noise = np.linalg.inv(by_parameters[:, :3].T @ by_parameters[:, :3])
+        np.testing.assert_allclose(joint.covariance[:3, 3:], by_effect, atol=1e-9)
+        np.testing.assert_allclose(
+            joint.covariance[:3, :3], by_noise + by_effect @ by_effect.T, atol=1e-9
+        )
+        np.testing.assert_allclose(joint.covariance[3:, 3:], np.eye(2), atol=1e-12)
+        np.testing.assert_allclose(joint.offset[3:], [2.0, 0.0])
+        return
+    np.testing.assert_allclose(
+        raw @ joint.covariance @ raw.T, defined @ covariance @ defined.T, atol=1e-9
+    )
+    np.testing.assert_allclose(raw @ joint.offset, defined @ step, atol=1e-9)
 
 
 def test_effects_without_some_are_those_of_a_fit_without_them(rng):

@@ -76,6 +76,7 @@ def a_result(parameters: Mapping[str, ReportedEstimate] | None = None, **changes
         basis=(),
         budget={},
         effects=(),
+        joint=None,
         scale=None,
         places={},
         nuisance={},

@@ -25,7 +25,9 @@ from ...result.pictures.album import save_pictures
 from ...result.replay import MotionRecord
 from ...result.report import report_html
 from ...result.run_writers import replaced_folder
+from ...statistics.budget.systematic_effects import source_label
 from ...statistics.remedies import remedy_for
+from .band import OF_GRIP, OTHERS
 from .execution_problems import (
     CHECK_FILE,
     POSES_FILE,
@@ -34,7 +36,7 @@ from .execution_problems import (
     write_commands,
 )
 from .hand_motion import angular_motion
-from .motion_plan import UNKNOWN, BandContribution, MotionPlan
+from .motion_plan import DESCRIPTION, BandContribution, MotionPlan
 from .pictures import plan_figures
 from .trajectory_log import write_trajectory_mcap
 
@@ -49,8 +51,14 @@ CAPTIONS = {
     "commands": "Tensions and pressures, with their limits",
     "tracking": "Displacements of the points with their 95 % band, and their references, dashed",
 }
+# What reduces sources of the band that no budget has.
+REMEDIES = {
+    OTHERS: "record longer, measure the places of the markers, or refine the mesh",
+    DESCRIPTION: "use a finer mesh or another law",
+    OF_GRIP: "grip the body at the same place again, and state its prior, hand_eye",
+}
 # Form of plan.json.
-SCHEMA = 1
+SCHEMA = 2
 FRAMES_PER_SECOND = 25.0
 
 
@@ -202,7 +210,6 @@ def motion_record(plan: MotionPlan) -> MotionRecord:
 def plan_json(plan: MotionPlan) -> dict[str, Any]:
     """Return the content of plan.json, in types that JSON has."""
     program = plan.program
-    limiting = plan.limiting_constant
     times_s = command_times_s(plan)
     commands = plan.commands(times_s)
     return {
@@ -225,10 +232,6 @@ def plan_json(plan: MotionPlan) -> dict[str, Any]:
         "residual_vibration_m": plan.residual_vibration_m,
         "time_step_error_m": plan.time_step_error_m,
         "description_std_m": program.body.description_std_m,
-        "half_width_after_recording_m": plan.half_width_after_recording_m,
-        "limiting_constant": None
-        if limiting is None
-        else {"name": limiting[0], "share": limiting[1]},
         "band_contributions": [each._asdict() for each in plan.band_contributions],
         "limits": {}
         if not program.task.hand.free
@@ -347,14 +350,9 @@ def _interval_lines(plan: MotionPlan) -> list[Shown]:
 
 def _improvement(largest: BandContribution) -> str:
     """Return the line about the largest contribution to the band, and what reduces it."""
+    remedy = REMEDIES.get(largest.source) or remedy_for(largest.source)
     percent = f"{100 * largest.share:.0f} % of the band's variance"
-    if largest.constant is None:
-        return f"{percent} come from errors of the description: a finer mesh or another law may reduce them"
-    of_constant = f"the uncertainty of {symbol_of(largest.constant)}"
-    if largest.source == UNKNOWN:
-        return f"{percent} come from {of_constant}"
-    remedy = remedy_for(largest.source)
-    return f"{percent} come from {of_constant} by {largest.source}; to reduce it, {remedy}"
+    return f"{percent} come from {source_label(largest.source)}; to reduce it, {remedy}"
 
 
 def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
@@ -383,18 +381,8 @@ def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
         shown.append(Table("", heads, rows=tuple(rows)))
     if plan.residual_vibration_m is not None:
         shown.append(f"residual vibration: {1e3 * plan.residual_vibration_m:.3g} mm")
-    if (limiting := plan.limiting_constant) is not None:
-        shown.append(
-            f"the uncertainty of {symbol_of(limiting[0])} contributes most to the band "
-            f"({100 * limiting[1]:.0f} % of the constants' variance)"
-        )
     if plan.band_contributions:
         shown.append(_improvement(plan.band_contributions[0]))
-    if plan.half_width_after_recording_m is not None:
-        shown.append(
-            "if this motion is recorded with the same markers, and identified from too, the band "
-            f"becomes ± {1e3 * plan.half_width_after_recording_m:.3g} mm"
-        )
     if plan.fine.experiment.is_static:
         shown.append("static: each sample is an equilibrium")
     else:

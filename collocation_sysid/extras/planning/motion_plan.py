@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 from ...common.array_types import Array
 from ...errors import InputError, SimulationError
@@ -23,10 +23,10 @@ from ...problem.code_loader import CodeLoader
 from ...program.simulation import Trajectory, simulate
 from ...recording import Experiment, Markers, PoseSequence
 from ...runs.solved_problem import SolvedProblem
+from .band import point_deviations
 from .durations import shortest, shortest_of_hand
 from .full_program import require_full_program, solve_full
 from .hand_limits import REACHED, Limits
-from .information import recorded_information, root_after, root_of_covariance
 from .planned_body import PlannedBody
 from .planned_program import POSES_PER_SAMPLE, PlannedProgram
 from .reduced_solver import (
@@ -46,8 +46,8 @@ Solver = Literal["reduced-space", "interior-point"]
 BINDING = 1 - 1e-4
 # Probability with which the whole motion of all points is inside the band.
 BAND = 0.95
-# Sources of the band beside those of a budget.
-DESCRIPTION, UNKNOWN = "description", "all sources"
+# Source of the band beside those of a budget and the grip.
+DESCRIPTION = "description"
 # Limits of a hand that does not move.
 STANDING = Limits.model_validate(
     {
@@ -77,15 +77,12 @@ class TrackingError:
     # Largest half width of the 95 % band of a coordinate [m], see `MotionPlan.half_widths_m`; None
     # if that is not known.
     band_m: float | None
-    # Root mean square distance that is expected with this uncertainty [m].
-    expected_rms_m: float | None
 
 
 class BandContribution(NamedTuple):
     """Contribution to the band of a plan."""
 
-    constant: str | None  # name of the constant; None for errors of the description
-    source: str  # source of its uncertainty in the budget of the run
+    source: str  # effect of the budget, grip, description, or others together
     share: float  # share of the variance of the tracked coordinates
 
 
@@ -238,156 +235,83 @@ class MotionPlan:
         predicted = markers.predict_positions(self.fine.positions_m)
         return {name: predicted[:, k] for k, name in enumerate(markers.names)}
 
-    @cached_property
+    @property
     def time_step_error_m(self) -> float:
         """Largest distance of a point between the time grid of the plan and finer steps [m]."""
-        program = self.program
-        coarse = self.answer.x[program.sample_rows].reshape(len(self.t_s), -1, 3)
-        markers = program.experiment.markers
-        if not markers.names:
-            return 0.0
-        on_grid = markers.predict_positions(coarse)
-        fine = np.stack([*self.points_m.values()], axis=1)
-        return float(np.linalg.norm(on_grid - fine, axis=2).max(initial=0.0))
+        return float(np.linalg.norm(self._change_by_steps_m, axis=2).max(initial=0.0))
 
     @cached_property
-    def std_m(self) -> dict[str, Array] | None:
-        """Standard deviation (T, 3) of each point due to the uncertainty of the constants and to
-        errors of the description [m], by name; None if these are not known.
+    def _change_by_steps_m(self) -> Array:
+        program = self.program
+        coarse = self.answer.x[program.sample_rows].reshape(len(self.t_s), -1, 3)
+        on_grid = program.experiment.markers.predict_positions(coarse)
+        return np.stack([*self.points_m.values()], axis=1) - on_grid
+
+    @cached_property
+    def _deviations(self) -> tuple[Array, dict[str, Array]] | None:
+        """Mean (T, P, 3) [m] and variances [m²] of the deviations of all points from the prediction,
+        see `point_deviations`; None if these are not known.
         """
-        contributions = self.contributions_m
-        return None if contributions is None else {
-            name: self._std_m(by_q, self.covariance) for name, by_q in contributions.items()
-        }  # fmt: skip
+        program = self.program
+        if program.body.joint is None:
+            return None
+        try:
+            mean_m, variances = point_deviations(
+                program.body,
+                program.body.joint,
+                program.moved_experiment(self.answer.c),
+                self.answer.x,
+                self._change_by_steps_m,
+            )
+        except (SimulationError, InputError, np.linalg.LinAlgError):  # must not lose the plan
+            return None
+        of_description = np.full(mean_m.shape, program.body.description_std_m**2)
+        return mean_m, variances | {DESCRIPTION: of_description}
 
     @cached_property
     def half_widths_m(self) -> dict[str, Array] | None:
         """Half width (T, 3) of the 95 % band of each point [m], by name: all coordinates of all
         points at all times are inside at once with a probability of at least 95 %. None if the
-        uncertainty of the constants is not known.
+        uncertainty is not known.
+
+        It is `band_factor` standard deviations, and the mean of the deviation to first order.
         """
-        std = self.std_m
-        return None if std is None else {
-            name: self.band_factor * each for name, each in std.items()
-        }  # fmt: skip
+        if self._deviations is None:
+            return None
+        mean_m, variances = self._deviations
+        half_m = np.abs(mean_m) + self.band_factor * np.sqrt(sum(variances.values()))
+        return dict(zip(self.points_m, np.moveaxis(half_m, 1, 0), strict=True))
 
     @cached_property
     def band_factor(self) -> float:
-        """Half width of the band in standard deviations, the smaller one of two bounds for normal
-        deviations: Šidák's for the number of coordinates and times, whatever their correlation (JASA
-        62, 1967), and Scheffé's for the number of constants, which errors of the description exceed.
+        """Half width of the band in standard deviations for normal deviations: Šidák's bound for the
+        number of coordinates and times, whatever their correlation (JASA 62, 1967).
         """
-        points = self.program.experiment.markers.names
-        values = 3 * len(points) * len(self.t_s)
-        factor = float(norm.ppf(0.5 + 0.5 * BAND ** (1 / values)))
-        if self.program.body.description_std_m:
-            return factor
-        constants = int(np.linalg.matrix_rank(self.covariance, hermitian=True))
-        return min(factor, float(np.sqrt(chi2.ppf(BAND, max(1, constants)))))
-
-    def _std_m(self, by_q: Array, covariance: Array) -> Array:
-        variance = self.program.body.description_std_m**2
-        return np.sqrt(variance + np.einsum("tiq,qr,tir->ti", by_q, covariance, by_q))
-
-    @property
-    def covariance(self) -> Array:
-        """Combined covariance (nq, nq) of the parameters in the solver's coordinates."""
-        covariance = self.program.body.covariance
-        assert covariance is not None
-        return covariance
-
-    @cached_property
-    def contributions_m(self) -> dict[str, Array] | None:
-        """Derivatives (T, 3, nq) of each point by the parameters [m]; None if the uncertainty of
-        the parameters is not known.
-        """
-        program = self.program
-        if program.body.covariance is None:
-            return None
-        return {
-            name: np.einsum("ij,tjq->tiq", program.point_weights(name).toarray(), self._by_q)
-            for name in program.experiment.markers.names
-        }
-
-    @cached_property
-    def _by_q(self) -> Array:
-        """Derivatives (T, 3n, nq) of the motion at the samples by the parameters [m]."""
-        program = self.program
-        by_q = program.driven.respond_to_parameters(program.drive(self.answer.c), self.answer.x)
-        return by_q[program.sample_rows]
-
-    @cached_property
-    def half_width_after_recording_m(self) -> float | None:
-        """Largest half width of the 95 % band of a coordinate that counts, that would remain if this
-        motion were executed, recorded with the same markers, and included in the identification [m];
-        None if that is not known. Systematic effects remain.
-        """
-        program, contributions = self.program, self.contributions_m
-        statistical = program.body.statistical_covariance
-        is_measured = program.body.template.markers.names or program.body.template.wrenches
-        if contributions is None or statistical is None or not is_measured:
-            return None
-        if not program.references:
-            return None
-        moved = program.moved_experiment(self.answer.c)
-        information = recorded_information(program.body, program.driven, moved, self.answer.x)
-        root = root_after(root_of_covariance(statistical), information)
-        remaining = self.covariance - statistical + root @ root.T
-        counted = [
-            self._std_m(contributions[each.name], remaining)[np.isfinite(each.position_m)]
-            for each in self.program.references
-        ]
-        return self.band_factor * float(np.concatenate(counted).max(initial=0.0))
+        values = 3 * len(self.program.experiment.markers.names) * len(self.t_s)
+        return float(norm.ppf(0.5 + 0.5 * BAND ** (1 / values)))
 
     @cached_property
     def band_contributions(self) -> tuple[BandContribution, ...]:
-        """Contributions to the variance of the tracked coordinates, the largest first: of the own
-        uncertainty of each constant, by the sources of its budget, and of errors of the
-        description; empty if the uncertainty of the constants is not known.
+        """Contributions to the variance of the tracked coordinates, the largest first; empty if the
+        uncertainty is not known.
         """
-        contributions = self.contributions_m
-        if contributions is None:
+        if not self.program.references or self._deviations is None:
             return ()
-        body = self.program.body
-        names = [item.name for item in body.problem.parameters.free]
-        of_constants, of_description = np.zeros(len(names)), 0.0
+        weights = np.zeros(self._deviations[0].shape)
+        points = [*self.points_m]
         for reference in self.program.references:
             counted = np.isfinite(reference.position_m)
-            squares = contributions[reference.name][counted] ** 2 / reference.sigma_m**2
-            of_constants += squares.sum(axis=0) * np.diag(self.covariance)
-            of_description += len(squares) * (body.description_std_m / reference.sigma_m) ** 2
-        total = of_constants.sum() + of_description
-        if not total:
-            return ()
-        found = [BandContribution(None, DESCRIPTION, of_description / total)]
-        for name, variance in zip(names, of_constants, strict=True):
-            sources = body.budget.get(name) or {UNKNOWN: 1.0}
-            whole = sum(sources.values())
-            found += [
-                BandContribution(name, source, float(variance * share / (whole * total)))
-                for source, share in sources.items()
-            ]
-        return tuple(sorted((each for each in found if each.share), key=lambda each: -each.share))
-
-    @property
-    def limiting_constant(self) -> tuple[str, float] | None:
-        """Name of the constant whose own uncertainty contributes most to the variance of the
-        tracked coordinates, and its share of the sum of these contributions; None if unknown.
-        """
-        shares: dict[str, float] = {}
-        for each in self.band_contributions:
-            if each.constant is not None:
-                shares[each.constant] = shares.get(each.constant, 0.0) + each.share
-        if not shares:
-            return None
-        first = max(shares, key=lambda name: shares[name])
-        return first, shares[first] / sum(shares.values())
+            weights[:, points.index(reference.name)] += counted / reference.sigma_m**2
+        parts = {name: float(np.sum(weights * v)) for name, v in self._deviations[1].items()}
+        total = sum(parts.values())
+        found = [BandContribution(name, part / total) for name, part in parts.items() if part > 0]
+        return tuple(sorted(found, key=lambda each: -each.share))
 
     def tracking_error(self, reference: Reference) -> TrackingError:
         """Return the predicted deviation of a point from its reference."""
         counted = np.isfinite(reference.position_m)
         if not counted.any():
-            return TrackingError(np.nan, np.nan, np.nan, None, None)
+            return TrackingError(np.nan, np.nan, np.nan, None)
         found = self.points_m[reference.name]
         deviation = np.where(counted, found - reference.position_m, 0.0)
         at = counted.any(axis=1)
@@ -398,17 +322,11 @@ class MotionPlan:
             way_m = _farthest(self.motion.derivatives(self.t_s).value[:, :3])
         half_m = max(way_m / 2, reference.sigma_m)
         stated_m = self.program.task.largest_error_m
-        if self.std_m is None:
-            return TrackingError(rms, largest, stated_m or half_m, None, None)
-        std = np.where(counted, self.std_m[reference.name], 0.0)[at]
-        band_m = self.band_factor * float(std.max())
-        return TrackingError(
-            rms,
-            largest,
-            stated_m or min(half_m, max(band_m, reference.sigma_m)),
-            band_m,
-            float(np.sqrt(np.mean(distance**2 + np.sum(std**2, axis=1)))),
-        )
+        if self.half_widths_m is None:
+            return TrackingError(rms, largest, stated_m or half_m, None)
+        band_m = float(self.half_widths_m[reference.name][counted].max())
+        accepted_m = stated_m or min(half_m, max(band_m, reference.sigma_m))
+        return TrackingError(rms, largest, accepted_m, band_m)
 
     @cached_property
     def residual_vibration_m(self) -> float | None:
@@ -525,7 +443,7 @@ def plan_motion(
         Gauss–Newton steps in the space of the hand's unknowns, or IPOPT after these, with the
         positions of all nodes as variables.
     robust : bool
-        Whether the objective is its mean over the uncertainty of the constants; a run is needed.
+        Whether the objective is its mean over the noise of the constants; a run is needed.
     tolerances : ReducedTolerances, optional
         Tolerances of the search in the reduced space.
     watch : callable, optional
@@ -558,7 +476,7 @@ def plan_motion(
         code = task.hand.joint_limits
         loader = CodeLoader(Path(), is_allowed=allow_code)
         _, pose_limits = loader.function(code.file, code.function, "hand.joint_limits.file")
-    if robust and (body.covariance is None or solver != "reduced-space"):
+    if robust and (body.statistical_covariance is None or solver != "reduced-space"):
         raise InputError(
             "a robust plan needs a run with uncertainties, and the solver reduced-space",
             None,

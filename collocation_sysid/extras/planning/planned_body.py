@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,11 +15,13 @@ from ...common.files import RESULT_FILE, require_run_folder
 from ...errors import InputError, hint_at, located
 from ...problem import Problem
 from ...recording import Experiment, Markers, Nuisance, Obstacle, PoseSequence
+from ...recording.nuisance import GRIP
 from ...result.replay import damaged_run_refused
 from ...runs.result_builder import build_result
 from ...runs.result_content import Result
 from ...runs.solved_problem import SolvedProblem
 from ...runs.warm_start import WarmStart
+from ...statistics.budget.effect_estimates import JointPosterior
 from .signals import Commands, commanded
 
 
@@ -30,8 +32,7 @@ class PlannedBody:
     problem: Problem  # problem with scheme and parameters, whose guesses are the values of the plan
     template: Experiment  # recording with grasps and gravity as identified
     q: Array  # (nq,): parameters in the solver's coordinates
-    covariance: Array | None  # (nq, nq) or None: combined covariance of q; None if it is not known
-    # (nq, nq) or None: its part due to noise, which further recordings reduce.
+    # (nq, nq) or None: covariance of q due to noise; None if it is not known.
     statistical_covariance: Array | None
     # dict of name to (3,): places of the markers on the undeformed body [m]; NaN where a place is
     # not known.
@@ -39,9 +40,11 @@ class PlannedBody:
     # Standard deviation of a coordinate of a point by errors of the description [m]: by how much
     # the residuals of the markers in the fit exceed their noise.
     description_std_m: float = 0.0
-    # mapping of name to mapping of source to float: shares of the sources in the variance of each
-    # constant; empty if they are not known.
-    budget: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    # Joint posterior of what acts on the body, relative to q and the template; None if not known.
+    joint: JointPosterior | None = None
+    # mapping of name to float: pose of the body in the gripper, which the template contains, by name
+    # of the nuisance parameter in its unit.
+    grip: Mapping[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()  # reasons not to rely on the constants without care
     run: Path | None = None  # run folder; None for a problem or a run in memory
     # Folder to which names of files in the problem are relative; None for a problem of Python.
@@ -99,7 +102,7 @@ class PlannedBody:
         template = _select(problem, problem.experiments, experiment)
         places = _stated_places(template)
         guess = problem.parameters.guess_q
-        return cls(problem, template, guess, None, None, places, home=_home(problem))
+        return cls(problem, template, guess, None, places, home=_home(problem))
 
     @classmethod
     def _from_solved(cls, run: SolvedProblem, experiment: str | None) -> PlannedBody:
@@ -116,10 +119,11 @@ class PlannedBody:
             problem,
             part.transcription.corrected_experiment(part.phi),
             problem.parameters.guess_q,
-            *_covariances(result, problem),
+            _statistical_covariance(result, problem),
             places,
             _description_std_m(result),
-            result.budget,
+            result.joint,
+            _grip(part.transcription.nuisance.iterate_values(part.phi)),
             warnings=_warnings(result),
             home=_home(run.problem),
         )
@@ -145,16 +149,18 @@ class PlannedBody:
         phi = answer.apply_to_nuisance(collocation)[0][transcription.nuisance_indices.indices]
         places = dict(zip(chosen.markers.names, transcription.marker_places_m(phi), strict=True))
         with damaged_run_refused(folder):
-            covariances = _covariances(result, problem)
+            covariance = _statistical_covariance(result, problem)
+            _require_shapes(result.joint)
             warnings = _warnings(result)
         return cls(
             problem,
             transcription.corrected_experiment(phi),
             problem.parameters.guess_q,
-            *covariances,
+            covariance,
             places,
             _description_std_m(result),
-            result.budget,
+            result.joint,
+            _grip(transcription.nuisance.iterate_values(phi)),
             warnings=warnings,
             run=folder,
             home=home,
@@ -312,20 +318,37 @@ def _stated_places(experiment: Experiment) -> dict[str, Array]:
     return dict(zip(markers.names, placed, strict=True))
 
 
-def _covariances(result: Result, problem: Problem) -> tuple[Array, Array] | tuple[None, None]:
-    """Return the combined and the statistical covariance (nq, nq) of q, zero for coefficients of
-    fields; the statistical one twice if systematic effects were not evaluated, None without any.
+def _require_shapes(joint: JointPosterior | None) -> None:
+    """Raise a `ValueError` if a stored posterior is damaged."""
+    if joint is None:
+        return
+    r, s = len(joint.names), len(joint.sources)
+    for shape, array in (
+        ((r,), joint.offset),
+        ((r, r), joint.covariance),
+        ((r, s), joint.by_source),
+    ):
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f"joint: expected finite numbers of shape {shape}")
+
+
+def _statistical_covariance(result: Result, problem: Problem) -> Array | None:
+    """Return the statistical covariance (nq, nq) of q, zero for coefficients of fields; None without
+    error bars.
     """
     uncertainty = result.uncertainty
     if uncertainty is None:
-        return None, None
+        return None
     names = [item.name for item in problem.parameters.free]
     places = np.ix_(*[[names.index(name) for name in uncertainty.names]] * 2)
-    known = uncertainty.combined_covariance
-    combined, statistical = np.zeros((2, len(names), len(names)))
+    statistical = np.zeros((len(names), len(names)))
     statistical[places] = uncertainty.covariance
-    combined[places] = uncertainty.covariance if known is None else known
-    return combined, statistical
+    return statistical
+
+
+def _grip(values: Iterable[tuple[Any, str, float]]) -> dict[str, float]:
+    """Return the nuisance parameters of the grip by name, from (entry, name, value) of all."""
+    return {name: value for entry, name, value in values if entry.row in GRIP}
 
 
 def _description_std_m(result: Result) -> float:

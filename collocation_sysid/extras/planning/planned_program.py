@@ -264,15 +264,15 @@ class PlannedProgram:
 
     def scenarios(self) -> tuple[PlannedProgram, ...]:
         """Return programs whose parameters are at 2k points around those of this program, so that
-        means over these points equal means over the distribution of the parameters to second order
-        (k is the rank of the combined covariance).
+        means over these points equal means over their statistical distribution to second order (k is
+        the rank of the covariance): effects act alike in recording and execution.
 
         Raises
         ------
         SimulationError
             If the body has no equilibrium with some of these parameters.
         """
-        covariance = self.body.covariance
+        covariance = self.body.statistical_covariance
         assert covariance is not None
         variances, directions = np.linalg.eigh(covariance)
         chosen = np.flatnonzero(variances > SMALLEST_VARIANCE * variances.max(initial=0.0))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from ...common.array_types import Array
 from ...errors import listed
 from ...recording.deviation import Deviation, in_readable_unit
 from ..concerns import Concern
@@ -15,6 +16,8 @@ from .systematic_effects import DEVIATIONS, source_label
 # Decrease of the loss by another effect, over that by the most surprising one, from which on both
 # explain the residuals.
 AS_WELL = 0.8
+# Beginning of the name of an effect among those of parameters.
+EFFECT = "effect: "
 # Most effects that a message names besides the most surprising one.
 MOST_NAMED = 3
 
@@ -44,6 +47,24 @@ class EffectEstimate:
             f"{source_label(self.name)} of {value:+.2g} ± {error:.1g}{shown}, where {mean:.2g} ± "
             f"{sigma:.2g}{shown} is expected"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class JointPosterior:
+    """Joint posterior of what acts on the body: parameters, nuisance parameters and effects.
+
+    They refer to the body itself: a constant that an effect redefines is the one with the effect.
+    """
+
+    # (r,) parameters, nuisance parameters "experiment: label", and effects "effect: component".
+    names: tuple[str, ...]
+    # (r,): mean less the answer, in the solver's coordinates, in the unit of a label, and in standard
+    # deviations of the prior of an effect.
+    offset: Array
+    covariance: Array  # (r, r)
+    sources: tuple[str, ...]  # (s,): rows of all effects of the budget, once for each component
+    # (r, s): changes if each is off by the standard deviation of its prior; part of the covariance.
+    by_source: Array
 
 
 def effect_row(name: str) -> Deviation:
