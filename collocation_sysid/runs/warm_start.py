@@ -75,8 +75,8 @@ class WarmStart:
             experiment: {name: place.position_m for name, place in named.items()}
             for experiment, named in result.places.items()
         }
-        points = np.array([place for named in places_m.values() for place in named.values()])
         with damage_refused(folder, RESULT_FILE, remedy="solve that problem again"):
+            points = np.array([place for named in places_m.values() for place in named.values()])
             all_values = np.array(
                 [*values.values(), *nuisance.values(), *points.reshape(-1, 3).flat]
             )

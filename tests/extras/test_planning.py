@@ -1875,6 +1875,40 @@ def test_a_plan_that_misses_its_band_exceeds_the_error():
     assert any("tip misses its reference by 1.15 mm" in str(line) for line in plan_summary(outside))
 
 
+@pytest.mark.long
+def test_a_damaged_run_is_refused_in_one_line(tmp_path: Path):
+    words = write_task(tmp_path, GOOD)
+    outcome = run_command("solve", words[1], "--out", tmp_path / "run", "-q")
+    assert outcome.code in (0, 1), outcome.err
+    file = tmp_path / "run" / "result.json"
+    text = file.read_text()
+    damaged = [text[: len(text) // 2]]
+    for keys, value in (
+        (("joint", "offset"), [1.0]),
+        (("joint", "covariance"), [[None]]),
+        (("joint", "names"), "x"),
+        (("joint",), {}),
+        (("places", "swing", "low", "position_m"), []),
+        (("parameters", "mu_pa", "optimum"), "x"),
+        (("nuisance",), []),
+    ):
+        content = json.loads(text)
+        at = content
+        for key in keys[:-1]:
+            at = at[key]
+        assert keys[-1] in at
+        at[keys[-1]] = value
+        damaged.append(json.dumps(content))
+    for each in damaged:
+        file.write_text(each)
+        outcome = run_command("plan", tmp_path / "run", *words[2:])
+        assert outcome.code == 2
+        (line,) = outcome.err.splitlines()
+        assert "result.json" in line
+        assert "is damaged (" in line
+        assert not (tmp_path / "plan").exists()
+
+
 def test_the_film_of_a_plan_has_reference_point_and_hand():
     plan = bar_plan()
     (reference,) = plan.program.references
