@@ -33,6 +33,7 @@ from ...methods.starts.stiffness_scan import (
 )
 from ...model.schemes import as_scheme
 from ...problem import Problem
+from ...problem.size import Size
 from ...program.collocation import Collocation
 from ...program.lifted.collocation import lifted_count, with_lifted_variables
 from ...program.modes.stability import Instability, find_instabilities
@@ -47,15 +48,7 @@ from ...statistics.scale_identifiability import scale_concerns, scale_reference,
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
 from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
-from .cost import (
-    LONG_SOLVE_S,
-    TYPICAL_SWEEPS,
-    MethodCost,
-    cost_concerns,
-    cost_notes,
-    method_costs,
-    nonzeros,
-)
+from .cost import LONG_SOLVE_S, MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
 from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
@@ -88,11 +81,8 @@ LONGEST_START_S = 8.0
 COST_FACTOR = 1.2
 DESCRIPTION_FACTOR = 3.0
 DERIVATIVE_FACTOR = 5.0
-# Powers of the edge length and of the number of nodes in the time of a sweep: those of a finger with 600
-# and 3,300 nodes; and the time of a step with 600 nodes, where none was measured [s].
+# Power of the edge length in the time of a sweep: that of a finger with 600 and 3,300 nodes.
 EDGE_POWER = 4.5
-NODE_POWER = 1.65
-STEP_S = 0.05
 # Time of a fit of the first samples to the markers, in simulations of these samples.
 FIT_SIMULATIONS = 15.0
 # Largest relative deviation from fourth-order central differences that rounding explains.
@@ -365,9 +355,9 @@ def check_problem(
         notes.append(SUBSTEPS_NOTE if steps == 1 else IMPACT_NOTE.format(steps))
     search_s = chosen_cost.time_s if chosen_cost else None
     if first_s == np.inf:
-        nodes = max(body.nodes for body in findings.bodies)
-        step_s = STEP_S * (nodes / 600) ** NODE_POWER
-        search_s = TYPICAL_SWEEPS * _grid_rows(collocation) * step_s
+        largest = max(findings.bodies, key=lambda body: body.nodes)
+        rows = _grid_rows(collocation)
+        search_s = Size(largest.nodes, largest.elements, rows, unknowns=1).time_s()
     findings = replace(
         findings, concerns=concerns, edge_of_a_minute_m=_edge_of_a_minute_m(findings, search_s)
     )
