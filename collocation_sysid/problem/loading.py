@@ -160,13 +160,15 @@ def _load_object(
         if generated:
             corners, elements = generated
             size = _smallest_size(file, corners=corners, elements=elements, simulation=simulation)
-            require_feasible(replace(size, substeps=1), say)
+            require_feasible(replace(size, substeps=1))
         mesh = _load_mesh(file.object, folder)
     size = _smallest_size(
         file, corners=len(mesh.points_m), elements=len(mesh.tetrahedra), simulation=simulation
     )
-    require_feasible(replace(size, substeps=1), None if generated else say)
+    require_feasible(replace(size, substeps=1))
     body = _load_body(with_guessed_densities(file.object, file.parameters), mesh, code=code)
+    size = replace(size, nodes=len(body.nodes.points_m))
+    require_feasible(replace(size, substeps=1), say)
     return body.with_free_densities(body.parts_with_free_density(file.parameters)), size
 
 

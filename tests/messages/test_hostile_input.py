@@ -393,12 +393,16 @@ def test_generated_meshes_have_the_counts_that_were_expected(made: TetMesh, coun
 
 
 def test_long_work_is_announced_at_its_beginning(tiny: Path, monkeypatch: pytest.MonkeyPatch):
+    replace_text("density_kg_m3 = 30.0", 'density_kg_m3 = 30.0\nelement = "tet10"')(tiny)
     announced: list[str] = []
     Problem.read("problem.toml", say=announced.append)
     assert announced == []
     Problem.read("problem.toml", ["transcription.substeps=1000"], say=announced.append)
     assert len(announced) == 1
-    assert "9 samples of 1,000 substeps" in announced[0]
+    body = Problem.read("problem.toml").bodies[0]
+    assert (
+        f"9 samples of 1,000 substeps of a body of {len(body.nodes.points_m)} nodes" in announced[0]
+    )
     assert "a solve takes about" in announced[0]
     monkeypatch.setattr(problem_size, "TEXT_MB_PER_S", 1e-6)
     Problem.read("problem.toml", say=announced.append)
