@@ -86,8 +86,9 @@ def export(
     to: Annotated[
         str,
         option(
-            "Destination: a file .xml (MuJoCo), .usda, .py (Newton), .inp (CalculiX), .feb (FEBio), "
-            ".json or .rrd (Rerun); or a format: mujoco, usd, newton, calculix, febio, json, rerun.",
+            "Destination: a file .xml (MuJoCo), .usda, .py (Newton), .inp (CalculiX), .inc (Abaqus), .feb "
+            "(FEBio), .json or .rrd (Rerun); or a format: mujoco, usd, newton, calculix, abaqus, "
+            "febio, json, rerun.",
             "FILE|FORMAT",
         ),
     ],

@@ -55,6 +55,7 @@ from collocation_sysid.recording import (
     Sphere,
     Wrench,
 )
+from collocation_sysid.statistics.budget.combined_intervals import ReportedEstimate
 
 needs_ccx = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 needs_mujoco = pytest.mark.skipif(
@@ -392,12 +393,7 @@ def test_calculix_gets_the_terms_of_the_foam(count, tmp_path):
 
 @pytest.mark.parametrize(
     ("material", "values", "target"),
-    [
-        ("ogden-4", OGDEN_TERMS[4], "calculix"),
-        ("hyperfoam-4", FOAM_TERMS[4], "calculix"),
-        ("hyperfoam-1", FOAM_TERMS[1], "mujoco"),
-        ("ogden-1", OGDEN_TERMS[1], "mujoco"),
-    ],
+    [("hyperfoam-1", FOAM_TERMS[1], "mujoco"), ("ogden-1", OGDEN_TERMS[1], "mujoco")],
 )
 def test_an_exporter_without_the_material_states_the_replacement(
     material, values, target, tmp_path
@@ -407,6 +403,94 @@ def test_an_exporter_without_the_material_states_the_replacement(
         material in limit and ("neo-Hookean" in limit or "same E and ν" in limit)
         for limit in exported_files.limitations
     )
+
+
+@pytest.mark.parametrize(
+    ("material", "values", "target"),
+    [
+        ("ogden-4", OGDEN_TERMS[4], "calculix"),
+        ("hyperfoam-4", FOAM_TERMS[4], "calculix"),
+        ("hyperfoam-1", FOAM_TERMS[1], "febio"),
+        ("gent", {"mu_pa": 1e4, "gent_limit": 20.0, "kappa_pa": 1e6}, "febio"),
+    ],
+)
+def test_a_law_that_a_program_does_not_have_is_refused(material, values, target, tmp_path):
+    with pytest.raises(InputError, match=f"has no law with the energy of {material}"):
+        write_export(held_bar(material, values), target, tmp_path / target)
+    assert not (tmp_path / target).exists()
+
+
+ISOCHORIC = {
+    "mooney-rivlin": (
+        {"c10_pa": 1e4, "c01_pa": 2e3, "kappa_pa": 1e6},
+        {"type": "Mooney-Rivlin", "c1": "10000.0", "c2": "2000.0"},
+    ),
+    "yeoh": (
+        {"c10_pa": 1e4, "c20_pa": 2e3, "c30_pa": 300.0, "kappa_pa": 1e6},
+        {"type": "Yeoh", "c1": "10000.0", "c2": "2000.0", "c3": "300.0"},
+    ),
+    "ogden-2": (
+        {"mu_1_pa": 1e4, "alpha_1": 2.0, "mu_2_pa": -500.0, "alpha_2": -2.0, "kappa_pa": 1e6},
+        {"type": "Ogden", "c1": "20000.0", "m1": "2.0", "c2": "1000.0", "m2": "-2.0"},
+    ),
+}
+
+
+@pytest.mark.parametrize("material", ISOCHORIC)
+def test_febio_gets_laws_of_isochoric_invariants_and_stretches(material, tmp_path):
+    values, expected = ISOCHORIC[material]
+    folder = exported(held_bar(material, values), "febio", tmp_path)
+    (law,) = ElementTree.parse(folder / "body.feb").getroot().iter("material")
+    found = {each.tag: each.text for each in law}
+    assert law.get("type") == expected["type"]
+    assert {key: found[key] for key in expected if key != "type"} == {
+        key: value for key, value in expected.items() if key != "type"
+    }
+    # κ/2 (J − 1)²
+    assert (float(found["k"] or 0), found["pressure_model"]) == (1e6, "2")
+
+
+def with_memory(material, values) -> IdentifiedBody:
+    """A bar whose stiffness relaxes to 2 / 5 of the instantaneous one."""
+    bar = held_bar(material, values)
+    body = Body(bar.body.mesh, material, 900.0, prony=("slow", "fast"))
+    memory = {"slow.share": 1.0, "slow.tau_s": 2.0, "fast.share": 0.5, "fast.tau_s": 0.1}
+    theta = body.theta_from_values({**values, **OTHERS, **memory})
+    return replace(bar, body=body, theta=theta, experiment=replace(bar.experiment, body=body))
+
+
+@pytest.mark.parametrize(
+    ("material", "kind"),
+    [("yeoh", "uncoupled viscoelastic"), ("st-venant-kirchhoff", "viscoelastic")],
+)
+def test_febio_gets_the_memory_over_the_long_term_stress(material, kind, tmp_path):
+    values = ISOCHORIC[material][0] if material in ISOCHORIC else MODULI
+    folder = exported(with_memory(material, values), "febio", tmp_path)
+    (law,) = ElementTree.parse(folder / "body.feb").getroot().iter("material")
+    assert law.get("type") == kind
+    found = {each.tag: each.text for each in law}
+    assert [found[key] for key in ("g0", "g1", "t1", "g2", "t2")] == [
+        "1.0",
+        "1.0",
+        "2.0",
+        "0.5",
+        "0.1",
+    ]
+    assert len(law.findall("elastic")) == 1
+
+
+def test_abaqus_gets_a_card_with_intervals_and_shares_of_the_instantaneous_modulus(tmp_path):
+    body = with_memory("yeoh", ISOCHORIC["yeoh"][0])
+    known = ReportedEstimate(1e4, combined95=(9e3, 1.1e4))
+    folder = exported(replace(body, parameters={"c10_pa": known}), "abaqus", tmp_path)
+    lines = (folder / "material.inc").read_text().splitlines()
+    assert "** c10_pa = 10000 (95 % interval 9000 to 1.1e+04)" in lines
+    card = [line for line in lines if not line.startswith("**")]
+    assert card[:2] == ["*MATERIAL,NAME=BODY", "*HYPERELASTIC,YEOH"]
+    start = card.index("*VISCOELASTIC,TIME=PRONY") + 1
+    assert card[start : start + 2] == ["0.4,0.4,2", "0.2,0.2,0.1"]
+    assert card[-2:] == ["*DENSITY", "900"]
+    assert len(lines) < 15
 
 
 def test_calculix_gets_mesh_material_and_grasp(run_folder, tmp_path):
@@ -1110,5 +1194,8 @@ def test_constants_of_a_specimen_are_exported_as_a_material_but_not_as_a_body(tm
     (deck,) = exported(body, "calculix", tmp_path).glob("*.inp")
     text = deck.read_text()
     assert "one homogeneous cell with a nominal density" in text
+    assert text.count("*STEP") == text.count("*AMPLITUDE") == 1
+    curve = text.split("*AMPLITUDE,NAME=U4_3\n")[1].split("*")[0].split()
+    np.testing.assert_allclose([float(row.split(",")[1]) / 0.01 for row in curve], [0, *strain])
     with pytest.raises(InputError, match="no body that moves"):
         exported(body, "mujoco", tmp_path)

@@ -2,7 +2,7 @@
 
 `write_export` writes the files of a target in `TARGETS`, `verify_export` runs the target and
 compares its prediction with that of this package. One module per simulator: `mujoco`, `newton`,
-`usd`, `calculix` and `febio`. For all of them, `identified` reads the body from a run
+`usd`, `calculix`, `abaqus` and `febio`. For all of them, `identified` reads the body from a run
 folder, `destination` finds format and place of the option --to, `target` describes
 what a simulator can express, and `obstacle_shapes` converts obstacles. `rerun_recording` writes the
 motion of a run for a viewer instead.
@@ -22,7 +22,7 @@ from ...errors import InputError, hint_at
 from ...recording import write_poses_csv
 from ...result.run_writers import replaced_folder
 from ...runs.solved_problem import SolvedProblem
-from . import calculix, febio, mujoco, newton, rerun_recording, usd
+from . import abaqus, calculix, febio, mujoco, newton, rerun_recording, usd
 from .destination import ExportDestination, parse_destination
 from .identified import IdentifiedBody, read_draws
 from .target import ExportedFiles, ExportTarget, PredictionComparison, values_as_text
@@ -38,6 +38,7 @@ TARGETS: dict[str, ExportTarget] = {
     "calculix": ExportTarget(
         "CalculiX", calculix.DECK, export=calculix.export, verify=calculix.verify
     ),
+    "abaqus": ExportTarget("Abaqus", abaqus.CARD, export=abaqus.export),
     "febio": ExportTarget("FEBio", febio.MODEL, export=febio.export),
     "json": ExportTarget("JSON", IDENTIFIED_FILE, export=lambda body: ExportedFiles({}, ())),
 }

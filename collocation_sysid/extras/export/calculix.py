@@ -89,13 +89,14 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
     for k, (region, part) in enumerate(zip(body.regions, body.body.parts, strict=True)):
-        card, limitation = _material_card(region, linear)
+        card, limitation = material_card(region, linear, "CalculiX", MOST_TERMS)
+        card += "".join(f"** Abaqus: {line}\n" for line in memory_card(region).splitlines())
         name = f"M{k}"
         sections = f"*SOLID SECTION,ELSET=E{k},MATERIAL={name}\n"
         if isinstance(part.material, ReinforcedMaterial):
             fibres = part.material.energy.fibres
             if for_abaqus:
-                card, limitation = _abaqus_fibre_card(region, fibres)
+                card, limitation = abaqus_fibre_card(region, fibres)
                 directions = region.fibre_directions(fibres.families).tolist()
                 sections = _fibre_sections(body, part, k, name, directions)
             elif fibres.is_dispersed:
@@ -106,7 +107,7 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
                 sections = _fibre_sections(body, part, k, name)
         limits += [f"{region.name}: {limitation}"] if limitation else []
         materials += (
-            f"*MATERIAL,NAME={name}\n{card}*DENSITY\n{_format_values(region.density_kg_m3)}\n"
+            f"*MATERIAL,NAME={name}\n{card}*DENSITY\n{format_values(region.density_kg_m3)}\n"
             f"{sections}"
         )
     limits.append("damping is not exported: an equilibrium has none")
@@ -115,7 +116,7 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
             f"{'Abaqus' if for_abaqus else 'CalculiX'} distributes the weight of an element with its "
             "shape functions, this program lumps it at the nodes"
         )
-    nodes = (f"{k},{_format_values(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
+    nodes = (f"{k},{format_values(*point)}\n" for k, point in enumerate(body.nodes_m, start=1))
     mesh = f"*NODE,NSET=ALL\n{''.join(nodes)}"
     kind = "C3D10" if body.is_quadratic else "C3D4"
     for k, region in enumerate(body.regions):
@@ -127,8 +128,12 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
     obstacles = faceted_obstacles(body)
     steps = ""
     totals = "YES" if for_abaqus else "ONLY"
-    for t_s in _step_times_s(body):
-        steps += _step_card(body, obstacles, t_s, linear, totals)
+    times_s = _step_times_s(body)
+    if body.experiment.specimen is not None and len(times_s) > 1:
+        steps = _curve_cards(body, times_s, linear)
+    else:
+        for t_s in times_s:
+            steps += _step_card(body, obstacles, t_s, linear, totals)
     deck = f"{head}{mesh}{materials}{_obstacle_cards(body, obstacles)}{steps}"
     return deck, tuple(limits)
 
@@ -151,23 +156,45 @@ def _obstacle_cards(body: IdentifiedBody, obstacles: Sequence[FacetedObstacle]) 
     for k, wall in enumerate(obstacles):
         deck += f"*NODE,NSET=W{k}\n"
         numbered = enumerate(wall.start_points_m, start=wall.first_node + 1)
-        deck += "".join(f"{i},{_format_values(*point)}\n" for i, point in numbered)
+        deck += "".join(f"{i},{format_values(*point)}\n" for i, point in numbered)
         deck += f"*ELEMENT,TYPE=C3D4,ELSET=W{k}\n"
         for i, nodes in enumerate(wall.build_tetrahedra() + 1, start=wall.first_cell + 1):
             deck += f"{i},{','.join(map(str, nodes))}\n"
         touching = body.body.mesh.surface[wall.faces].tolist()
         sides = "".join(f"{faces[tuple(sorted(face))]}\n" for face in touching)
-        constants = _format_values(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)
+        constants = format_values(float(wall.obstacle.friction), wall.stiffness_pa_m / 2)
         stick = f"*FRICTION\n{constants}\n"
         deck += (
             f"*SOLID SECTION,ELSET=W{k},MATERIAL=WALL\n*SURFACE,NAME=W{k}\nW{k},S1\n"
             f"*SURFACE,NAME=B{k}\n{sides}"
             f"*SURFACE INTERACTION,NAME=W{k}\n*SURFACE BEHAVIOR,PRESSURE-OVERCLOSURE=LINEAR\n"
-            f"{_format_values(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
+            f"{format_values(wall.stiffness_pa_m)}\n{stick if wall.obstacle.has_friction else ''}"
             f"*CONTACT PAIR,INTERACTION=W{k},TYPE=SURFACE TO SURFACE\nB{k},W{k}\n"
         )
-    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{_format_values(body.regions[0].young_pa, 0.3)}\n"
+    material = f"*MATERIAL,NAME=WALL\n*ELASTIC\n{format_values(body.regions[0].young_pa, 0.3)}\n"
     return f"{material}*DENSITY\n1.\n{deck}" if obstacles else ""
+
+
+def _curve_cards(body: IdentifiedBody, times_s: Array, is_linear: bool) -> str:
+    """Return the curve of a specimen as one step, in which sample k is at the time k, from 1 on; the
+    displacements follow amplitudes.
+    """
+    moved_m = body.experiment.prescribed_displacements(times_s)[1] - body.nodes_m
+    cards, held, moving = "", "", ""
+    for n, a in np.argwhere(np.isfinite(moved_m).all(axis=0)).tolist():
+        own_m = moved_m[:, n, a]
+        if not own_m.any():
+            held += f"{n + 1},{a + 1},{a + 1}\n"
+            continue
+        rows = enumerate([0.0, *own_m.tolist()])
+        lines = "".join(f"{format_values(k, value)}\n" for k, value in rows)
+        cards += f"*AMPLITUDE,NAME=U{n + 1}_{a + 1}\n{lines}"
+        moving += f"*BOUNDARY,AMPLITUDE=U{n + 1}_{a + 1}\n{n + 1},{a + 1},{a + 1},1.\n"
+    return (
+        f"{cards}*STEP,INC={1000 * len(times_s)}{'' if is_linear else ',NLGEOM'}\n"
+        f"*STATIC\n1.,{len(times_s)}.,,1.\n*BOUNDARY\n{held}{moving}*NODE PRINT,NSET=ALL\nU\n"
+        "*NODE FILE\nU\n*EL FILE\nS\n*END STEP\n"
+    )
 
 
 def _step_card(
@@ -183,17 +210,17 @@ def _step_card(
     rows = np.concatenate(displacements_m)
     prescribed = np.argwhere(np.isfinite(rows))
     boundary = "".join(
-        f"{n + 1},{a + 1},{a + 1},{_format_values(float(rows[n, a]))}\n" for n, a in prescribed
+        f"{n + 1},{a + 1},{a + 1},{format_values(float(rows[n, a]))}\n" for n, a in prescribed
     )
     prints = "".join(f"*NODE PRINT,NSET=W{k},TOTALS={totals}\nRF\n" for k in range(len(obstacles)))
     loaded = np.argwhere(body.node_loads_n)
     loads = "".join(
-        f"{n + 1},{a + 1},{_format_values(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
+        f"{n + 1},{a + 1},{format_values(float(body.node_loads_n[n, a]))}\n" for n, a in loaded
     )
     pull = float(np.linalg.norm(body.experiment.gravity_m_s2))
     direction = body.experiment.gravity_m_s2 / pull if pull else np.zeros(3)
     weight = (
-        f"*DLOAD\nBODY,GRAV,{_format_values(pull)},{_format_values(*direction)}\n" if pull else ""
+        f"*DLOAD\nBODY,GRAV,{format_values(pull)},{format_values(*direction)}\n" if pull else ""
     )
     return (
         f"*STEP,INC=1000{'' if is_linear else ',NLGEOM'}\n"
@@ -204,13 +231,36 @@ def _step_card(
     )
 
 
-def _format_values(*values: float) -> str:
+def format_values(*values: float) -> str:
     """CalculiX cuts off a number after 20 characters, even within its exponent: 12 digits."""
     return ",".join(f"{float(value):.12g}" for value in values)
 
 
-def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]:
-    """Other materials become neo-Hookean of the same λ and μ at small strain."""
+def memory_card(region: IdentifiedRegion) -> str:
+    """Return the card of the memory in Abaqus, empty without any: shares of the instantaneous shear and
+    bulk modulus, and relaxation times. The constants of a law are those at rest, the long-term ones,
+    which is the default of Abaqus.
+    """
+    at_once = 1 + sum(branch["share"] for branch in region.branches)
+    lines = (
+        format_values(branch["share"] / at_once, branch["share"] / at_once, branch["tau_s"])
+        for branch in region.branches
+    )
+    card = "".join(f"{line}\n" for line in lines)
+    return f"*VISCOELASTIC,TIME=PRONY\n{card}" if card else ""
+
+
+def material_card(
+    region: IdentifiedRegion, is_linear: bool, program: str, most_terms: int
+) -> tuple[str, str]:
+    """Return the card of a law of a program, with at most so many terms in powers of the stretches,
+    and a sentence on what it does not express; that of the matrix of fibres is not used.
+
+    Raises
+    ------
+    InputError
+        If the program has no law with the energy of the material.
+    """
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
     if region.material in ("st-venant-kirchhoff", "linear"):
@@ -220,9 +270,9 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
                 "in an analysis with large displacements the linear material becomes that of St. "
                 "Venant and Kirchhoff"
             )
-        return (f"*ELASTIC\n{_format_values(region.young_pa, region.poisson)}\n", limitation)
+        return (f"*ELASTIC\n{format_values(region.young_pa, region.poisson)}\n", limitation)
     if region.material == "mooney-rivlin":
-        constants = _format_values(c["c10_pa"], c["c01_pa"], volume)
+        constants = format_values(c["c10_pa"], c["c01_pa"], volume)
         return f"*HYPERELASTIC,MOONEY-RIVLIN\n{constants}\n", ""
     if region.material in ("yeoh", "gent"):
         if region.material == "yeoh":
@@ -236,7 +286,7 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
                 "Gent's energy is exported as a series of three terms, accurate for Ī₁ − 3 well "
                 f"below {limit:.4g}"
             )
-        constants = _format_values(
+        constants = format_values(
             factors[0], factors[1], factors[2], volume, ABSENT_TERM, ABSENT_TERM
         )
         return f"*HYPERELASTIC,YEOH\n{constants}\n", limitation
@@ -246,15 +296,22 @@ def _material_card(region: IdentifiedRegion, is_linear: bool) -> tuple[str, str]
             2 * a / stretch ** (2 * i - 2) * i * 3 ** (i - 1)
             for i, a in enumerate(_ARRUDA_BOYCE_COEFFICIENTS, 1)
         )
-        constants = _format_values(c["mu_pa"] / slope, stretch, volume)
+        constants = format_values(c["mu_pa"] / slope, stretch, volume)
         return f"*HYPERELASTIC,ARRUDA-BOYCE\n{constants}\n", (
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
-    if 0 < len(region.power_terms) <= MOST_TERMS:
+    if 0 < len(region.power_terms) <= most_terms:
         is_foam = region.material.startswith("hyperfoam")
         return _power_law_card(region, volume), FOAM_LIMITATION if is_foam else ""
-    constants = _format_values(region.mu_pa / 2, volume)
+    if not region.material.endswith("neo-hookean"):
+        few = f" of {len(region.power_terms)} terms" if region.power_terms else ""
+        raise InputError(
+            f"{program} has no law with the energy of {region.material}{few}; fit a law that it has, such "
+            "as mooney-rivlin, yeoh, ogden-3 or hyperfoam-3, or export to another format",
+            where=f"region '{region.name}'",
+        )
+    constants = format_values(region.mu_pa / 2, volume)
     return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
         "at small strain, but stresses differ in second order of the strain"
@@ -275,7 +332,7 @@ def _fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
     for side in (1, -1)[: fibres.families]:
         values += [0.0, -side * sine, *own]
     lines = (values[k : k + VALUES_PER_LINE] for k in range(0, len(values), VALUES_PER_LINE))
-    card = "".join(f"{_format_values(*line)}\n" for line in lines)
+    card = "".join(f"{format_values(*line)}\n" for line in lines)
     limitation = (
         f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)², and fibres resist "
         "their stretch without the change of volume"
@@ -283,7 +340,7 @@ def _fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
     return f"*USER MATERIAL,CONSTANTS={len(values)}\n{card}", limitation + _compression(fibres)
 
 
-def _abaqus_fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
+def abaqus_fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
     """Return the card of the law of Gasser, Ogden & Holzapfel (2006) in Abaqus, and a sentence on
     what it does not express.
 
@@ -303,7 +360,7 @@ def _abaqus_fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str,
         "fibres resist their stretch without the change of volume"
     )
     keyword = f"*ANISOTROPIC HYPERELASTIC,HOLZAPFEL,LOCAL DIRECTIONS={fibres.families}"
-    return f"{keyword}\n{_format_values(*values)}\n", limitation + _compression(fibres)
+    return f"{keyword}\n{format_values(*values)}\n", limitation + _compression(fibres)
 
 
 def _compression(fibres: FibreLaw) -> str:
@@ -325,13 +382,13 @@ def _fibre_sections(
     tail = ""
     if directions:
         keyword += f",LOCAL DIRECTIONS={len(directions)}"
-        tail = "".join(f"{_format_values(*each)}\n" for each in ((3, 0.0), *directions))
+        tail = "".join(f"{format_values(*each)}\n" for each in ((3, 0.0), *directions))
     for k, (cells, own) in enumerate(body.fibre_axes(part)):
         label = f"F{number}_{k}"
         first, second = (own[:, 0], own[:, 1]) if directions else (own[:, 2], own[:, 1])
         cards += (
             f"*ORIENTATION,NAME={label},{keyword}\n"
-            f"{_format_values(*first, *second)}\n{tail}"
+            f"{format_values(*first, *second)}\n{tail}"
             f"*ELSET,ELSET={label}\n"
             + "".join(f"{cell}\n" for cell in cells + 1)
             + f"*SOLID SECTION,ELSET={label},MATERIAL={name},ORIENTATION={label}\n"
@@ -351,7 +408,7 @@ def _power_law_card(region: IdentifiedRegion, volume: float) -> str:
         values = [value for mu, alpha, _ in terms for value in (mu, alpha)]
         values += [beta / (1 + 2 * beta) for _, _, beta in terms]
     lines = [
-        _format_values(*values[k : k + VALUES_PER_LINE])
+        format_values(*values[k : k + VALUES_PER_LINE])
         for k in range(0, len(values), VALUES_PER_LINE)
     ]
     return f"*{keyword},N={len(terms)}\n" + "".join(f"{line}\n" for line in lines)

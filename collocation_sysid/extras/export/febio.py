@@ -1,7 +1,9 @@
 """FEBio: a model of the body at rest under gravity, in its grasp at the first sample.
 
 The file has the format 4.0. FEBio's fibres of the type "fiber-exp-pow" and its law "HGO
-unconstrained" have the energies of `Fibres`, with the change of volume.
+unconstrained" have the energies of `Fibres`, with the change of volume. Laws of isochoric invariants
+or stretches have the energy ½ κ (J − 1)² of the change of volume (pressure model 2). The stress of a
+memory is that of the law at rest times 1 + Σ g_k exp(−t/τ_k).
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from ...common.array_types import Array, Index
+from ...errors import InputError
 from ...fem.laws.constants import FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
 from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
 from .identified import IdentifiedBody, IdentifiedRegion
@@ -22,15 +25,25 @@ LAWS = {
     "neo-hookean": "neo-Hookean",
     "st-venant-kirchhoff": "isotropic elastic",
     "linear": "isotropic elastic",
+    "mooney-rivlin": "Mooney-Rivlin",
+    "yeoh": "Yeoh",
+    **{f"ogden-{terms}": "Ogden" for terms in range(1, 5)},
 }
+# Laws of which a solid mixture consists, of E and ν.
+COUPLED = ("neo-hookean", "st-venant-kirchhoff", "linear")
+# Most branches of a memory.
+MOST_BRANCHES = 6
 CAPABILITIES = TargetCapabilities(
     LAWS,
-    "{material} becomes the neo-Hookean energy of the same λ and μ at small strain",
+    "",
     mass_damping="",
     node_forces="",
     has_quadratic_elements=True,
     has_fibres=True,
+    has_memory=True,
 )
+# Energy ½ κ (J − 1)² of the change of volume.
+ABAQUS_VOLUME = 2
 # A matrix without stiffness beside another one, and the exponent of the quadratic law, relative to
 # ones that count: FEBio's law of dispersed fibres accepts no zeros.
 NOTHING = 1e-9
@@ -79,6 +92,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             limits.append(
                 f"{region.name}: the linear material becomes that of St. Venant and Kirchhoff"
             )
+        limits += _require_known(region)
         fibres = None
         groups: list[tuple[Index, Array]] = [(part.cells, np.eye(3))]
         if isinstance(part.material, ReinforcedMaterial):
@@ -116,18 +130,72 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     return ExportedFiles({MODEL: text}, tuple(limits))
 
 
+def _require_known(region: IdentifiedRegion) -> Iterable[str]:
+    """Refuse what FEBio does not have, and yield what it changes."""
+    where = f"region '{region.name}'"
+    has_fibres = FIBRE_STIFFNESS.name in region.constants
+    is_isochoric = "pressure_model" in _constants(region)
+    if has_fibres and (is_isochoric or region.material not in LAWS):
+        yield (
+            f"{region.name}: beside fibres {region.material} becomes the neo-Hookean energy of the same "
+            "λ and μ at small strain"
+        )
+    elif region.material not in LAWS:
+        raise InputError(
+            f"FEBio has no law with the energy of {region.material}; expected one of "
+            f"{', '.join(LAWS)}: fit one of these, or export to another format",
+            where=where,
+        )
+    if len(region.branches) > MOST_BRANCHES or (region.branches and has_fibres):
+        raise InputError(
+            f"FEBio has no memory of {len(region.branches)} branches with these constants; expected "
+            f"at most {MOST_BRANCHES}, without fibres",
+            where=where,
+        )
+    if region.branches:
+        yield f"{region.name}: the load is applied within 1 s, after which its stress relaxes"
+    if region.branches and is_isochoric:
+        yield (
+            f"{region.name}: only the stress of the change of shape relaxes, while that of the volume "
+            "does in the identified material, too"
+        )
+
+
+def _constants(region: IdentifiedRegion) -> dict[str, float]:
+    """Return the constants of the law of FEBio."""
+    c = region.constants
+    constants = {"density": region.density_kg_m3}
+    if region.material == "mooney-rivlin":
+        constants |= {"c1": c["c10_pa"], "c2": c["c01_pa"]}
+    elif region.material == "yeoh":
+        constants |= {"c1": c["c10_pa"], "c2": c["c20_pa"], "c3": c["c30_pa"]}
+    elif region.power_terms:  # of which FEBio's energy is c/m² (Σ λ^m − 3)
+        for p, (mu, alpha, _) in enumerate(region.power_terms, start=1):
+            constants |= {f"c{p}": mu * alpha, f"m{p}": alpha}
+    else:
+        return constants | {"E": region.young_pa, "v": region.poisson}
+    return constants | {"k": region.kappa_pa, "pressure_model": ABAQUS_VOLUME}
+
+
 def _material(number: int, region: IdentifiedRegion, fibres: FibreLaw | None, axes: Array) -> str:
     """Fibres have the axes (3, 3)."""
-    law = LAWS.get(region.material, "neo-Hookean")
-    constants = {"density": region.density_kg_m3, "E": region.young_pa, "v": region.poisson}
-    if fibres is None:
-        return _law("material", law, constants, f'id="{number}" name="M{number}" ')
-    solids = _law("solid", law, constants)
-    solids += "".join(_fibre_solids(region, fibres, axes))
-    return (
-        f'    <material id="{number}" name="M{number}" type="solid mixture">\n{solids}'
-        "    </material>\n"
-    )
+    names = f'id="{number}" name="M{number}" '
+    if fibres is not None:
+        constants = {"density": region.density_kg_m3, "E": region.young_pa, "v": region.poisson}
+        matrix = LAWS[region.material] if region.material in COUPLED else "neo-Hookean"
+        solids = _law("solid", matrix, constants)
+        solids += "".join(_fibre_solids(region, fibres, axes))
+        return f'    <material {names}type="solid mixture">\n{solids}    </material>\n'
+    law, constants = LAWS[region.material], _constants(region)
+    if region.branches:
+        memory = {"density": constants.pop("density"), "g0": 1.0}
+        for k, branch in enumerate(region.branches, start=1):
+            memory |= {f"g{k}": branch["share"], f"t{k}": branch["tau_s"]}
+        is_isochoric = "pressure_model" in constants
+        memory |= {name: constants.pop(name) for name in ("k", "pressure_model") if is_isochoric}
+        kind = "uncoupled viscoelastic" if is_isochoric else "viscoelastic"
+        return _law("material", kind, memory, names, _law("elastic", law, constants).strip())
+    return _law("material", law, constants, names)
 
 
 def _fibre_solids(region: IdentifiedRegion, fibres: FibreLaw, axes: Array) -> Iterable[str]:
@@ -164,7 +232,10 @@ def _fibre_solids(region: IdentifiedRegion, fibres: FibreLaw, axes: Array) -> It
 
 
 def _law(tag: str, law: str, constants: dict[str, float], names: str = "", inside: str = "") -> str:
-    lines = [f"<{name}>{float(value)!r}</{name}>" for name, value in constants.items()]
+    lines = [
+        f"<{name}>{value if isinstance(value, int) else repr(float(value))}</{name}>"
+        for name, value in constants.items()
+    ]
     body = "".join(f"      {line}\n" for line in [*lines, inside] if line)
     return f'    <{tag} {names}type="{law}">\n{body}    </{tag}>\n'
 

@@ -97,8 +97,8 @@ class TargetCapabilities:
         (which are split otherwise).
     node_forces, point_masses : str
         Sentences for forces and for point masses on nodes; empty if the simulator has them.
-    has_fibres : bool
-        Whether it has fibres beside a material.
+    has_fibres, has_memory : bool
+        Whether it has fibres beside a material, and branches of a memory.
     has_rounded_edges, has_face_selection : bool
         Whether obstacles may have rounded edges, and be limited to some faces of the body.
     """
@@ -114,6 +114,7 @@ class TargetCapabilities:
     point_masses: str = ""
     has_quadratic_elements: bool = False
     has_fibres: bool = False
+    has_memory: bool = False
     has_rounded_edges: bool = True
     has_face_selection: bool = True
 
@@ -129,7 +130,7 @@ class TargetCapabilities:
         for region in body.regions:
             damped = bool(region.gamma_r_s)
             templates = [
-                *[VISCOELASTICITY] * bool(region.branches),
+                *[VISCOELASTICITY] * (bool(region.branches) and not self.has_memory),
                 *[FIBRES] * ("fibre_pa" in region.constants and not self.has_fibres),
                 *[self.other_materials] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
@@ -291,7 +292,11 @@ def comment_lines(
             f"gamma_r = {region.gamma_r_s:.6g} s ({region.damping}), "
             f"gamma_m = {region.gamma_m_1_s:.6g} 1/s"
         )
-    # No line may end the comment itself.
+    return as_comments(lines, start, end)
+
+
+def as_comments(lines: Iterable[str], start: str, end: str = "") -> str:
+    """Return comment lines as those of `comment_lines`, which no line ends itself."""
     texts = (re.sub("-(?=-)", "- ", " ".join(printable(line).split())) for line in lines)
     return "".join(f"{start}{text}{end}\n" for text in texts)
 

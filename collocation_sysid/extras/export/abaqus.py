@@ -1,0 +1,44 @@
+"""Abaqus: the card of the material, with the estimates and their intervals in comments."""
+
+from __future__ import annotations
+
+from ...fem.laws.fibres import ReinforcedMaterial
+from .calculix import abaqus_fibre_card, format_values, material_card, memory_card
+from .identified import IdentifiedBody
+from .target import ExportedFiles, as_comments
+
+# Abaqus includes a file of any suffix; .inp is that of a deck.
+CARD = "material.inc"
+# Largest number of terms of Ogden's law and of the foam.
+MOST_TERMS = 6
+
+
+def export(body: IdentifiedBody) -> ExportedFiles:
+    """Return the card, one text file, and what Abaqus cannot express; nothing is written.
+
+    Raises
+    ------
+    InputError
+        If Abaqus has no law with the energy of a material.
+    """
+    limits, cards = [], ""
+    for region, part in zip(body.regions, body.body.parts, strict=True):
+        if isinstance(part.material, ReinforcedMaterial):
+            card, limitation = abaqus_fibre_card(region, part.material.energy.fibres)
+        else:
+            card, limitation = material_card(region, False, "Abaqus", MOST_TERMS)
+        limits += [f"{region.name}: {limitation}"] if limitation else []
+        name = region.name.upper()
+        cards += (
+            f"*MATERIAL,NAME={name}\n{card}{memory_card(region)}"
+            f"*DENSITY\n{format_values(region.density_kg_m3)}\n"
+        )
+    lines = [f"{body.title}: SI units; verdict: {body.verdict}"]
+    lines += [f"not expressed: {each}" for each in limits]
+    for name, estimate in body.parameters.items():
+        known = "fixed" if estimate.fixed or estimate.tied else "interval not known"
+        if estimate.combined95 is not None:
+            low, high = estimate.combined95
+            known = f"95 % interval {low:.4g} to {high:.4g}"
+        lines.append(f"{name} = {estimate.value:.6g} ({known})")
+    return ExportedFiles({CARD: as_comments(lines, "** ") + cards}, tuple(limits))
