@@ -2,10 +2,9 @@
 made.
 
 Each hypothesis is one more column of the linearised fit: the change of the residuals along the
-motion of the fit if the body had another law, another width along an axis of the mesh, a round
-section in place of a square one or the reverse, or if its mesh had been made under its weight. The
-decrease of χ² by one Gauss–Newton step says which are worth a refit. Mirror images of the mesh are
-too different for a linear step.
+motion of the fit if the body had another law, a round section in place of a square one or the
+reverse, or if its mesh had been made under its weight. The decrease of χ² by one Gauss–Newton step
+says which are worth a refit. Mirror images of the mesh are too different for a linear step.
 """
 
 from __future__ import annotations
@@ -25,13 +24,7 @@ from ..fem.rest_shape import UnderGravity
 from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
-from ..statistics.budget.systematic_effects import (
-    Effect,
-    ExperimentAtAnswer,
-    section_effect,
-    shape_effect,
-)
-from ..statistics.thresholds import WIDEST
+from ..statistics.budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect
 from .doubt import Correction, Doubt
 
 AXES = "xyz"
@@ -103,7 +96,6 @@ def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
         return
     if other_section(body.mesh, body.nodes.points_m) is not None:
         yield SECTION
-    yield from map(_other_width, range(3))
     if not isinstance(body.rest_shape, UnderGravity):
         yield REST_SHAPE
 
@@ -119,27 +111,6 @@ def _other_laws(material: str, damping: str) -> Doubt:
         return other and (other, {"material": material, "damping": damping})
 
     return Doubt("law/both" if damping else "law", "1", effect=effect, correct=corrected)
-
-
-def _other_width(axis: int) -> Doubt:
-    def effect(at: ExperimentAtAnswer, _: int) -> Effect:
-        moved_m = np.zeros_like(at.body.nodes_m)
-        points_m = at.body.nodes_m
-        dofs = at.iterate.equations.prescribed.dofs
-        moved_m[:, axis] = points_m[:, axis] - points_m[np.unique(dofs // 3), axis].mean()
-        return shape_effect(at, moved_m)
-
-    def corrected(experiment: Experiment, amplitudes: Array) -> Correction:
-        (width,) = amplitudes.tolist()
-        factors = np.ones(3)
-        factors[axis] += width
-        other = None if abs(width) > WIDEST else with_shape(experiment, factors)
-        way = "narrow" if width > 0 else "wide"
-        return other and (other, {"axis": AXES[axis], "percent": 100 * abs(width), "way": way})
-
-    return Doubt(
-        "mesh-width", "1", corrected, effect=effect, axes=AXES[axis], mean=0.0, wide=WIDEST / 2
-    )
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:

@@ -35,8 +35,6 @@ MESSAGES = {
     "{damping}: compare laws with compare-models --materials and --damping",
     "mesh-section": "the section of the body is {real}, and that of the mesh {meshed} and as "
     "wide: mesh the section of the body (object.cylinder_m or box_m)",
-    "mesh-width": "the mesh is about {percent:.2g} % too {way} along its {axis} axis: compare "
-    "its extents with those of the real body",
     "mesh-mirrored": "the mesh is a mirror image of the body, along its {axis} axis: compare it "
     "with the real body",
     "rest-shape": "the mesh is the shape of the body under its weight, with gravity along "

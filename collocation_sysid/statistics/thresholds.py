@@ -182,11 +182,6 @@ LEAST_DECREASE = Threshold(
     "Decrease of χ² by a linear step below which a hypothesis is not fitted again: e⁻⁸ as likely.",
     study="mistakes",
 )
-WIDEST = Threshold(
-    0.25,
-    "Largest relative error of the width of a mesh that is no mistake of another kind.",
-    study="mistakes",
-)
 NOISE_LEVEL = Threshold(
     1.3,
     "Root mean square of residuals and nuisance parameters, in standard deviations, up to "

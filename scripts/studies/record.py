@@ -34,7 +34,6 @@ TESTED = {
     "law": "statistics/test_body_causes.py",
     "law/both": "statistics/test_body_causes.py",
     "mesh-section": "judge/test_first_reasons.py",
-    "mesh-width": "statistics/test_body_causes.py",
     "mesh-mirrored": "judge/test_first_reasons.py",
     "rest-shape": "statistics/test_body_causes.py",
     "tracks-filtered": "statistics/test_body_causes.py",

@@ -460,7 +460,6 @@ FILMED: dict[str, tuple[str, Fault]] = {
 # Right causes of those errors that have one.
 RIGHT = {
     "mirrored": "mesh-mirrored",
-    "wide": "mesh-width",
     "hanging": "rest-shape",
     "filtered": "tracks-filtered",
     "twice": "markers-same",

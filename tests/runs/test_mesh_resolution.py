@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
+from collocation_sysid.common.display import plain_text
+from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from collocation_sysid.statistics.budget.discretisation_error import Refinement, RefinementLevel
 
@@ -84,4 +86,4 @@ def test_the_answer_and_its_file_carry_the_concern(tmp_path):
     run.save(tmp_path / "run", pictures=False)
     text = (tmp_path / "run" / "result.json").read_text(encoding="utf8")
     assert '"mesh/few"' in text
-    assert concern.message in str(run).replace("\n", " ").replace("  ", " ")
+    assert concern.message in plain_text(run_summary(run.result, details=True), width=10_000)

@@ -127,7 +127,6 @@ def test_no_other_material_is_suggested_for_small_strains():
     ("error", "cause"),
     [
         ("mirrored", "mesh-mirrored"),
-        ("wide", "mesh-width"),
         ("hanging", "rest-shape"),
         ("filtered", "tracks-filtered"),
         ("twice", "markers-same"),
