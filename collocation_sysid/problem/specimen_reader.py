@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -136,7 +137,11 @@ class SpecimenReader:
             "shift": section.shift,
             "temperature_difference_k": section.temperature_difference_k,
         }
-        area_error = deviation(section.area_error)
+        errors: dict[str, Any] = {
+            "area_error": deviation(section.area_error),
+            "specimen": section.specimen,
+            "specimen_stiffness": section.specimen_stiffness,
+        }
         if section.modulus == "harmonic":
             assert section.relative_sigma is not None
             specimen = Specimen.harmonic(
@@ -147,7 +152,7 @@ class SpecimenReader:
                 section.deformation,
                 **temperature,
             )
-            return replace(specimen, area_error=area_error)
+            return replace(specimen, **errors)
         del arguments["frequency_hz"], arguments["loss_pa"]
         if section.modulus == "relaxation":
             sigma = arguments["sigma_pa"]
@@ -158,7 +163,7 @@ class SpecimenReader:
                 section.deformation,
                 **temperature,
             )
-            return replace(specimen, area_error=area_error)
+            return replace(specimen, **errors)
         arguments |= dict.fromkeys(self._placeholders(arguments))
         if arguments["sigma_pa"] is None:
             arguments["sigma_pa"] = self._sigma_pa()
@@ -173,7 +178,7 @@ class SpecimenReader:
             transverse_stretch=section.transverse_stretch,
             cut_angle_deg=section.cut_angle_deg,
             strain_zero=deviation(section.strain_zero),
-            area_error=area_error,
+            **errors,
             stress_zero_pa=deviation(section.stress_zero_pa),
             **temperature,
         )

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from ..common.schema_tables import Among, ByForm, Noise, require_one
 from ..common.validated_types import AtLeastOne, Boundless, Count, Finite, Flag, Positive, Text
 from ..recording.homogeneous_deformation import TESTS
-from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, STRAIN_ZERO
+from ..recording.specimen import AREA_ERROR, LATERAL_SIGMA, SPECIMEN_SPREAD, STRAIN_ZERO
 from ..recording.specimen_files import ModulusTable
 from .measurement_section import NamedSection
 
@@ -90,6 +90,11 @@ class SpecimenSection(NamedSection):
         Standard deviation of the noise of the lateral stretch, or its column.
     strain_zero : float or "none"
         Standard deviation of a constant offset of the strains, which is estimated.
+    specimen : str
+        Name of the specimen, if several tests of it are fitted: they share specimen_stiffness.
+    specimen_stiffness : float
+        Standard deviation of the relative difference between the stiffness of the specimen and that
+        of its material, which is estimated.
     area_error : float or "none"
         Standard deviation of the relative error of the area, which is estimated.
     stress_zero_pa : float or "none"
@@ -129,6 +134,8 @@ class SpecimenSection(NamedSection):
     sigma_n: Noise | None = None
     lateral_sigma: Noise = LATERAL_SIGMA
     strain_zero: Prior = STRAIN_ZERO
+    specimen: Annotated[str, Field(pattern=r"^\S*$")] = ""
+    specimen_stiffness: Positive = SPECIMEN_SPREAD
     area_error: Prior = AREA_ERROR
     stress_zero_pa: Prior = "none"
     skip_cycles: Count = 0

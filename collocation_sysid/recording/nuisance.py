@@ -733,6 +733,8 @@ GRIP = (GRASP_TURN, GRASP_SHIFT)
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, Deviation))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
 GAUGE = Deviation("reading", "", sigma=None, of="gauge", changes=())
+# Unknown of the stress of a specimen that several tests of it share.
+SPECIMEN_STIFFNESS = Deviation("specimen_stiffness", "", sigma=None, of="gauge", changes=())
 # Coordinates of places on the surface that sensors refer to, and other unknowns of single points.
 SURFACE_PLACE = Deviation(
     "surface_place", "", sigma=None, of="gauge", changes=(), reach=3.0, step=_largest_place_step_m
@@ -810,7 +812,7 @@ class Nuisance:
                     f"the standard deviation of the nuisance parameter {row.name!r} is {value:g}; "
                     "expected a value above 0"
                 )
-        names = [row.name for row in self.kinds]
+        names = [*(row.name for row in self.kinds), SPECIMEN_STIFFNESS.name]
         for name, word in self.scope.items():
             if name not in names:
                 raise InputError(

@@ -36,7 +36,7 @@ from .homogeneous_deformation import (
     cell_mesh,
     shape_factor,
 )
-from .nuisance import Nuisance
+from .nuisance import SPECIMEN_STIFFNESS, Nuisance
 from .poses import PoseSequence
 from .specimen_stretches import require_evaluable_law
 
@@ -46,6 +46,9 @@ CELL_DENSITY_KG_M3 = 1000.0
 STRAIN_ZERO = 2e-3
 # Standard deviation of the relative error of the area: 0.02 mm on a thickness of 2 mm.
 AREA_ERROR = 0.01
+# Standard deviation of the relative difference between the stiffness of a specimen and that of its
+# material: cast silicones differ by 1 to 8 %.
+SPECIMEN_SPREAD = 0.05
 # Standard deviation of a measured lateral stretch: 0.1 mm on a width of 20 mm.
 LATERAL_SIGMA = 5e-3
 # Strain of a table of a relaxation modulus, at which every law is linear.
@@ -101,6 +104,11 @@ class Specimen:
         Standard deviation of the relative error of the area, which is estimated; 0 if exact.
     stress_zero_pa : float
         Standard deviation of a constant offset of the stresses, which is estimated; 0 if exact.
+    specimen : str
+        Name of the specimen, without blanks, if several tests of it are fitted: they share the
+        relative difference between its stiffness and that of its material, which is estimated.
+    specimen_stiffness : float
+        Standard deviation of this difference.
     axial_stretch : float
         Constant stretch of a "simple-shear" test along the normal of the planes that slide. The
         amount of shear γ is the displacement of these planes over their distance after this
@@ -151,6 +159,8 @@ class Specimen:
     strain_zero: float = key(NotNegative, default=STRAIN_ZERO)
     area_error: float = key(NotNegative, default=AREA_ERROR)
     stress_zero_pa: float = key(NotNegative, default=0.0)
+    specimen: str = key(Text, default="")
+    specimen_stiffness: float = key(Positive, default=SPECIMEN_SPREAD)
     axial_stretch: float = key(Positive, default=1.0)
     transverse_stretch: float | None = key(Positive, default=None)
     cut_angle_deg: float = key(Finite, default=0.0)
@@ -422,7 +432,8 @@ class Specimen:
         require_evaluable_law(
             cell, self.find_deformation(), strain=self.strain, second_strain=self.second_strain
         )
-        nuisance = Nuisance.none(strain_zero=self.strain_zero or None)
+        scope = {SPECIMEN_STIFFNESS.name: f"shared {self.specimen}"} if self.specimen else {}
+        nuisance = Nuisance.none(scope=scope, strain_zero=self.strain_zero or None)
         return Experiment(
             cell,
             self.t_s,
@@ -484,6 +495,8 @@ class Specimen:
 
     def _stress_sensor(self, name: str, component: str, values: Array) -> Gauge:
         deviations = {"area_error": self.area_error, "stress_zero_pa": self.stress_zero_pa}
+        if self.specimen:
+            deviations[SPECIMEN_STIFFNESS.name] = self.specimen_stiffness
         direction, normal = (AXES.index(axis) for axis in component)
         quantity = NominalStress(direction)
         if self.test == "biaxial-difference":
@@ -503,7 +516,9 @@ class Specimen:
 
 
 class _MeasuredStress:
-    """Expression of a stress, measured with a wrong area and zero; subclasses define the stress."""
+    """Expression of a stress, measured with a wrong area and zero on a specimen that is not as stiff
+    as its material; subclasses define the stress.
+    """
 
     def stress_pa(self, at: GraspQuantities) -> ca.SX:
         """Return the stress [Pa] from force and torque on a node of the cell."""
@@ -514,9 +529,13 @@ class _MeasuredStress:
         at: GraspQuantities,
         area_error: ca.SX | float = 0.0,
         stress_zero_pa: ca.SX | float = 0.0,
+        specimen_stiffness: ca.SX | float = 0.0,
     ) -> ca.SX:
-        """Return the measured stress P (1 + `area_error`) + `stress_zero_pa` [Pa]."""
-        return self.stress_pa(at) * (1 + area_error) + stress_zero_pa
+        """Return the measured stress P (1 + `specimen_stiffness`) (1 + `area_error`)
+        + `stress_zero_pa` [Pa].
+        """
+        stress_pa = self.stress_pa(at) * (1 + specimen_stiffness)
+        return stress_pa * (1 + area_error) + stress_zero_pa
 
 
 class NominalStress(_MeasuredStress):

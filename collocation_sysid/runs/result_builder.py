@@ -30,7 +30,7 @@ from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..recording.deviation import in_readable_unit
-from ..recording.nuisance import GAUGE, JOINING, PLACE, TARE
+from ..recording.nuisance import GAUGE, JOINING, PLACE, SPECIMEN_STIFFNESS, TARE
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import ScaleReference, scale_reference
@@ -340,7 +340,7 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
     nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
-    for row in (*part.transcription.experiment.nuisance.kinds, GAUGE):
+    for row in (*part.transcription.experiment.nuisance.kinds, GAUGE, SPECIMEN_STIFFNESS):
         here = nuisance.indices_of_rows(row).tolist()
         if row == PLACE or not here:
             continue
