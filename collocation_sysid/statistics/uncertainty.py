@@ -149,7 +149,7 @@ class Uncertainty(ErrorBasis):
         Standard deviation of each nuisance parameter, in standard deviations of its prior; NaN at a
         bound.
     nuisance_covariance : (k, k) array
-        Covariance of these, in their order.
+        Covariance of these, then of the effects, in their order.
     chi_squared : float
         Σ ((ŷ − h(x)) / σ)² of the measurements, with the stated σ.
     degrees_of_freedom : float
@@ -258,7 +258,9 @@ def uncertainty_from_fit(
         quantiles=quantiles,
         estimates=estimates,
         derived=without_long_term_moduli(parameters, derived),
-        nuisance=dict(zip(fit.names[shared:], deviations, strict=True)),
+        nuisance=dict(
+            zip(fit.with_known_effects.names[shared:], deviations, strict=False)  # of effects too
+        ),
         nuisance_covariance=of_all[shared:, shared:],
         chi_squared=fit.chi_squared,
         degrees_of_freedom=freedom,

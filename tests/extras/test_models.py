@@ -620,7 +620,7 @@ def test_a_comparison_in_python_has_the_estimates_of_a_solve():
     assert "Use neo-hookean" in str(compared)
     for row in compared.rows:
         solved = cs.run(problems[row["model"]], seek_causes=False)
-        assert row["parameters"]["young_pa"] == solved.derived["young_pa"]
+        assert row["parameters"]["young_pa"] == solved.estimates["young_pa"].value
         assert row["budget"]["young_pa"]["combined95"] == solved.interval("young_pa")
     assert [table.title for table in compared.tables] == ["Models", "Parameters"]
     (prediction, young, *_) = compared.plot().axes

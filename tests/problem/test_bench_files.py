@@ -603,7 +603,7 @@ def test_a_simulated_bench_is_solved_by_its_own_problem(tmp_path, kind):
                 grasp.poses.positions_m, recorded.poses.positions_m, atol=1e-12
             )
     found = run(again, seek_causes=False)
-    assert found.estimates["young_pa"].value == pytest.approx(4e4, rel=0.01)
+    assert found.optimum["young_pa"].value == pytest.approx(4e4, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -164,7 +164,7 @@ def test_tracks_are_simulated_and_identified_from(filmed: Path) -> None:
     done = run_command("solve", *options, *fixed, "--out", "found", "--method", "reduced-space")
     assert done.code == 0, done.err
     result = json.loads((filmed / "found" / "result.json").read_text())
-    assert result["parameters"]["mu_pa"]["value"] == pytest.approx(TRUTH["mu_pa"], rel=0.1)
+    assert result["parameters"]["mu_pa"]["optimum"] == pytest.approx(TRUTH["mu_pa"], rel=0.1)
     fitted = result["fit"]["experiments"]["swing"]
     assert fitted["reading_rms"]["front"] < 0.3
     assert fitted["reading_unit"] == {"front": "px"}

@@ -169,8 +169,8 @@ def test_a_force_in_a_file_is_simulated_and_identified(tiny):
     recorded = settings("experiment.0.markers.file=data/swing_markers.csv")
     assert run_command("solve", *code, *recorded, "--out", "found").code == 0
     result = json.loads((tiny / "found" / "result.json").read_text())
-    value = result["parameters"]["drag_coefficient"]["value"]
-    assert value == pytest.approx(40.0, rel=0.02)
+    found = result["parameters"]["drag_coefficient"]["optimum"]
+    assert found == pytest.approx(40.0, rel=0.02)
 
 
 def lift(x, v, at, spin_n_s_m4):

@@ -124,7 +124,7 @@ def test_measurements_of_another_package_are_simulated_and_identified_from(strun
     )
     assert done.code == 0, done.err
     result = json.loads((strung / "found" / "result.json").read_text())
-    assert result["parameters"]["mu_pa"]["value"] == pytest.approx(TRUTH["mu_pa"], rel=0.1)
+    assert result["parameters"]["mu_pa"]["optimum"] == pytest.approx(TRUTH["mu_pa"], rel=0.1)
     fitted = result["fit"]["experiments"]["swing"]
     assert fitted["reading_rms"].keys() == {"string", "cord"}
     assert fitted["reading_unit"] == {"string": "m", "cord": "m"}

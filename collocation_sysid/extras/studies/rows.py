@@ -105,12 +105,11 @@ def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[st
         row[f"guess_{name}"] = known if guess is None else guess
     for name in run.guess:
         estimate = estimates.get(name)
-        value = None if estimate is None else estimate.value
+        # Methods are compared by the optimum that they find, not by its correction.
+        value = estimate and (estimate.value if estimate.optimum is None else estimate.optimum)
         row[f"value_{name}"] = value
         if name in truth:
-            # Methods are compared by the optimum that they find, not by its correction.
-            optimum = value if estimate is None or estimate.optimum is None else estimate.optimum
-            row[f"error_{name}"] = None if optimum is None else abs(optimum / truth[name] - 1)
+            row[f"error_{name}"] = None if value is None else abs(value / truth[name] - 1)
     return row
 
 
