@@ -220,7 +220,10 @@ def run(
                 if not answer.is_consistent:
                     say("testing possible causes of the misfit")
                 causes = find_misspecifications(answer.solution, answer.is_consistent)
-                tested = () if answer.is_consistent else cause_notes(answer.solution, causes)
+                is_explained = answer.is_consistent or any(
+                    each.suffices for each in answer.suspects
+                )
+                tested = () if is_explained else cause_notes(answer.solution, causes)
                 answer = replace(answer, causes=causes, notes=(*answer.notes, *tested))
             if problem.uncertainty.numerical and answer.uncertainty is not None:
                 answer = refine(answer, report_progress=say, watch=watch)
@@ -270,7 +273,6 @@ def _with_posterior(
 ) -> Run:
     """Replace the statistical uncertainty of the solution by the posterior with all effects."""
     from .judge.augmented_fit import augmented_fit, suspects
-    from .statistics.budget.effect_estimates import effect_concerns
 
     problem, solution = answer.problem, answer.solution
     discretisation: dict[str, Sequence[Array]] = {}
@@ -294,11 +296,10 @@ def _with_posterior(
     judged = replace(
         answer, notes=notes, uncertainty=posterior.uncertainty, posterior=posterior, by_mesh=by_mesh
     )
-    if not effect_concerns(judged.effects):
+    if judged.is_consistent:
         return judged
-    with counted_phase(StepUnit.TIME_STEP, rows):
-        others = suspects(solution, posterior, problem.assumed_deviations)
-    return replace(judged, suspects=others)
+    with counted_phase(StepUnit.TIME_STEP, 2 * rows):
+        return replace(judged, suspects=suspects(problem, solution, posterior))
 
 
 def _with_added_measurements(answer: Run, say: Log) -> Run:

@@ -8,7 +8,9 @@ from ..common.array_types import Array
 from ..methods.solution import Solution
 from ..problem import Problem
 from ..program.collocation import Collocation
-from ..statistics.budget.consider_analysis import changed_residuals, changes_of_assumptions
+from ..recording.nuisance import KINDS
+from ..statistics.budget.consider_analysis import changes_of_assumptions
+from ..statistics.budget.effect_estimates import EffectEstimate
 from ..statistics.budget.systematic_effects import ASSUMPTIONS
 from ..statistics.linearised import DerivedModuli, LinearisedFit
 from .posterior import Effects, Posterior
@@ -57,12 +59,18 @@ def augmented_fit(
 
 
 def suspects(
-    solution: Solution, posterior: Posterior, deviations: Mapping[str, float | None]
-) -> dict[str, float]:
-    """Return the decreases of the loss by effects that the budget does not contain, by name, each with
-    its wide prior (`Deviation.wide`) at the answer.
+    problem: Problem, solution: Solution, posterior: Posterior
+) -> tuple[EffectEstimate, ...]:
+    """Return the effects beyond the budget of a motion that explain the residuals best, see
+    `Posterior.suspected`: those of bodies with their wide priors (`Deviation.wide`), and those of
+    instruments that the problem states to be exact with their usual ones.
     """
-    rows = [(row, row.wide) for row in ASSUMPTIONS if row.wide and deviations.get(row.name) is None]
-    changes = changed_residuals(solution.collocation, solution.z, rows)
-    sizes: dict[str, float | None] = {row.name: wide for row, wide in rows}
-    return posterior.decreases(Effects.from_changes(changes, sizes, {}, {}))
+    if not is_learnt(solution.collocation):
+        return ()
+    stated = problem.assumed_deviations
+    sizes = {row.name: row.wide for row in ASSUMPTIONS}
+    sizes |= {row.name: row.considered for row in KINDS}
+    sizes |= {name: None for name, deviation in stated.items() if deviation is not None}
+    changes = changes_of_assumptions(solution.collocation, solution.z, sizes)
+    others = Effects.from_changes(changes, sizes, {}, {})
+    return posterior.suspected(others, problem.uncertainty)

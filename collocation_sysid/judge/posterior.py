@@ -40,10 +40,17 @@ from ..fem.laws.constants import without_region
 from ..model.parameters import Parameters
 from ..program.transcription import Transcription
 from ..recording.nuisance import GRIP, PLACE
+from ..statistics.assessment import fit_concerns
 from ..statistics.budget.combined_intervals import NORMAL_95, ReportedEstimate, combine
 from ..statistics.budget.consider_analysis import ResidualChanges
 from ..statistics.budget.discretisation_error import estimate_changes
-from ..statistics.budget.effect_estimates import EFFECT, EffectEstimate, JointPosterior, effect_row
+from ..statistics.budget.effect_estimates import (
+    AS_WELL,
+    EFFECT,
+    EffectEstimate,
+    JointPosterior,
+    effect_row,
+)
 from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
 from ..statistics.distributions import student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
@@ -554,20 +561,30 @@ class Posterior:
             )
         return tuple(sorted(found, key=lambda each: -abs(each.surprise)))
 
-    def decreases(self, others: Effects) -> dict[str, float]:
-        """Return by how much the least loss decreases with each of other effects, whose priors have the
-        mean zero and the deviations of the columns, by name; those that cannot be negative and would be
-        are left out.
+    def suspected(self, others: Effects, errors: ErrorModel) -> tuple[EffectEstimate, ...]:
+        """Return those of other effects with which the least loss decreases most (`AS_WELL`), with the
+        root of the decrease as surprise. Their priors have the mean zero and the deviations of the
+        columns; columns of one name count together. Those that cannot be negative and would be are left
+        out.
         """
         fit = self.fit
-        found = {}
         before = least_squares_of_fit(fit).loss(self.step)
-        for k, name in enumerate(others.names):
-            wide, _ = replace(others.only([k]), means=np.zeros(1)).added_to(fit, self.parameters)
+        found = []
+        for name in dict.fromkeys(others.names):
+            own = others.only(k for k, each in enumerate(others.names) if each == name)
+            wide, _ = replace(own, means=np.zeros(len(own.names))).added_to(fit, self.parameters)
             step = gauss_newton_step(wide)
-            if step[-1] > 0 or not effect_row(name).is_one_sided:
-                found[name] = before - least_squares_of_fit(wide).loss(step)
-        return found
+            if step[len(fit.names) :].min() > 0 or not effect_row(name).is_one_sided:
+                gain = max(0.0, before - least_squares_of_fit(wide).loss(step))
+                count = fit.effect_count + len(own.names)
+                found.append((gain, name, replace(wide.after_step(step), effect_count=count)))
+        most = max((gain for gain, *_ in found), default=0.0)
+        suspects = []
+        for gain, name, after in found:
+            if gain > AS_WELL * most:
+                bars = uncertainty_from_fit(after, self.parameters, self.reported_q, errors)
+                suspects.append(EffectEstimate.beyond(name, gain, not fit_concerns(bars)))
+        return tuple(suspects)
 
     @cached_property
     def _cosines(self) -> Array:

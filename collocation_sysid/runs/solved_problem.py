@@ -78,9 +78,8 @@ class SolvedProblem:
     refinement: Refinement | None = None
     omitted_checks: str = ""  # checks that were left out after Ctrl-C; empty if all were done
     posterior: Posterior | None = None  # with all effects of the budget; None without error bars
-    # Effects beyond the budget that would explain the residuals as well, by name, with the decrease of
-    # the loss; empty for a consistent fit.
-    suspects: Mapping[str, float] = field(default_factory=dict)
+    # Effects beyond the budget, the best first; empty for a consistent fit.
+    suspects: Sequence[EffectEstimate] = ()
     # Changes of the estimates over their values by elements of half the size; None if unknown.
     by_mesh: Mapping[str, float] | None = None
     # mapping of frozenset of str to Fix: the sensor or test that would determine the constants of a
@@ -202,8 +201,7 @@ class SolvedProblem:
         """Whether residuals and effects are as expected of a true description."""
         if self.uncertainty is None:
             return False
-        concerns = [*fit_concerns(self.uncertainty), *effect_concerns(self.effects)]
-        return not concerns
+        return not (fit_concerns(self.uncertainty) or effect_concerns(self.effects))
 
     @cached_property
     def places(self) -> dict[str, dict[str, MarkerPlace]]:
@@ -235,6 +233,8 @@ class SolvedProblem:
         of_fields = [concern for field in self.fields.values() for concern in field.list_concerns()]
         if not self.omitted_checks:
             causes = cause_concerns(self.causes)
+            if any(each.suffices for each in self.suspects):
+                causes = [each for each in causes if each.code != "description/insufficient"]
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
             effects = effect_concerns(self.effects, self.suspects)
             # Effects are judged with this mesh, so that a coarse one is as grave.

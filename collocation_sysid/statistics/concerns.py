@@ -145,7 +145,7 @@ TOPICS: dict[str, Topic] = {
         "effect, which is right only if it is the cause. The table of effects (solve --budget) has "
         "all of them.",
         messages={
-            "surprising": "the residuals need a {effect}: {surprise:.1f} standard deviations"
+            "surprising": "the residuals need {effect}: {surprise:.1f} standard deviations"
             "{alike}; {remedy}, and check what else the description lacks"
         },
     ),

@@ -66,21 +66,9 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "compare the laws first",
     ),
 }
-# Problems whose reasons are still wrong.
-OPEN: dict[str, str] = {
-    "rolling shutter": "a clock, whose effect is alike, is named before the rows of the image"
-}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(strict=True, reason=OPEN[name]))
-        if name in OPEN
-        else name
-        for name in REASONS
-    ],
-)
+@pytest.mark.parametrize("name", REASONS)
 def test_the_first_reason_is_right(name: str):
     made, expected, forbidden = REASONS[name]
     run = cs.run(made())

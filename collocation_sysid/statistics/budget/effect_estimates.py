@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from ...common.array_types import Array
 from ...errors import listed
@@ -28,15 +30,29 @@ class EffectEstimate:
 
     name: str  # name with its component, and with a number if several recordings have it
     mean: float
-    deviation: float  # standard deviation of the prior
+    deviation: float  # standard deviation of the prior; 0 if the budget does not contain the effect
     value: float
     std_error: float
     # Value less mean over the standard deviation that this difference has for a true description.
     surprise: float
     alike: tuple[str, ...] = ()  # other effects that look alike in these data
+    suffices: bool = (
+        False  # whether the residuals are noise with this effect, of one beyond the budget
+    )
+
+    @classmethod
+    def beyond(cls, name: str, gain: float, suffices: bool) -> EffectEstimate:
+        """Return an effect beyond the budget that decreases χ² by `gain`; its size is not known, because
+        the answer without it may be far away.
+        """
+        return cls(name, 0.0, 0.0, np.nan, np.nan, float(np.sqrt(gain)), suffices=suffices)
 
     def describe(self) -> str:
-        """Return name, estimate and prior as text."""
+        """Return name, estimate and prior as text; of an effect beyond the budget the name alone."""
+        label = source_label(self.name)
+        article = "an" if label[0] in "aeiou" else "a"
+        if not self.deviation:
+            return f"{article} {label}, of which the description has none"
         unit = effect_row(self.name).unit
         value, error, mean, sigma = (
             in_readable_unit(each, unit)[0]
@@ -44,7 +60,7 @@ class EffectEstimate:
         )
         shown = in_readable_unit(1.0, unit)[1]
         return (
-            f"{source_label(self.name)} of {value:+.2g} ± {error:.1g}{shown}, where {mean:.2g} ± "
+            f"{article} {label} of {value:+.2g} ± {error:.1g}{shown}, where {mean:.2g} ± "
             f"{sigma:.2g}{shown} is expected"
         )
 
@@ -73,24 +89,25 @@ def effect_row(name: str) -> Deviation:
 
 
 def effect_concerns(
-    effects: Sequence[EffectEstimate], suspects: Mapping[str, float] | None = None
+    effects: Sequence[EffectEstimate], suspects: Sequence[EffectEstimate] = ()
 ) -> list[Concern]:
     """Return one concern, as a list, if the data need an effect that is not expected of a true
     description; else empty.
 
-    It names the most surprising effect, others whose columns look alike, and `suspects` beyond the
-    budget, by their decrease of the loss, that explain the residuals as well (`AS_WELL`). The
+    It names the most surprising effect, or that of `suspects` beyond the budget which suffices and is
+    more surprising, and others that look alike or explain the residuals as well (`AS_WELL`). The
     probability that any of the effects is so surprising by chance (Bonferroni) is below `CHANCE`, or
     below `RARE`, which is doubtful.
     """
-    if not effects:
+    named = [*effects, *(each for each in suspects if each.suffices)]
+    if not named:
         return []
-    worst = max(effects, key=lambda each: abs(each.surprise))
-    limit, gross = (float(normal_isf(p / 2 / len(effects))) for p in (CHANCE, RARE))
+    worst = max(named, key=lambda each: abs(each.surprise))
+    limit, gross = (float(normal_isf(p / 2 / len(named))) for p in (CHANCE, RARE))
     if abs(worst.surprise) <= limit:
         return []
-    found = sorted((suspects or {}).items(), key=lambda each: -each[1])
-    instead = [name for name, gain in found if gain > AS_WELL * worst.surprise**2]
+    known = sorted((*suspects, *effects), key=lambda each: -abs(each.surprise))
+    instead = [each.name for each in known if each.surprise**2 > AS_WELL * worst.surprise**2]
     alike = dict.fromkeys(source_label(name) for name in (*instead, *worst.alike))
     others = [label for label in alike if label != source_label(worst.name)][:MOST_NAMED]
     data = {

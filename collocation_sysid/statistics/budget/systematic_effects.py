@@ -569,7 +569,8 @@ def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
         return None
     association = transcription.association.markers
     if association.sigma_m.any():
-        placement = place_markers(association.centre_places_m, at.body.nodes_m, at.body)
+        places_m, nodes_m = association.centre_places_m, at.body.nodes_m
+        placement = place_markers(places_m, nodes_m, at.body, max_distance_m=np.inf)
     node_mass_kg = np.bincount(
         placement.nodes.ravel(), weights=placement.weights.ravel(), minlength=len(at.body.nodes_m)
     )
