@@ -13,12 +13,12 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
-from ..fem.laws.constants import is_damping
 from ..methods.reduced_search import UNLIMITED
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..methods.starts.continuation import first_samples
 from ..methods.starts.initial_trajectories import associated_at_guess
+from ..methods.starts.stiffness_scan import start_problem, without_guesses
 from ..recording.experiment import Experiment
 from ..recording.measurement_selection import measured_count
 from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
@@ -291,11 +291,12 @@ class _Refits:
         )
         try:
             changed = replace(collocation, experiments=experiments)
-            start = self.answer if is_near else {}
-            if not is_near and experiments[0].specimen is None:
-                # A large mistake makes the damping of a motion wrong, and all constants of a specimen.
-                start = {n: value for n, value in self.answer.items() if not is_damping(n)}
-            changed = changed.with_parameters(changed.parameters.with_estimates(start))
+            first = experiments[0]
+            if is_near or first.specimen is not None or first.is_static:
+                start = self.answer if is_near or first.specimen is None else {}
+                changed = changed.with_parameters(changed.parameters.with_estimates(start))
+            else:  # a large mistake makes all constants wrong: begin as a solve without guesses does
+                changed = start_problem(without_guesses(changed)).collocation
             solution = method(associated_at_guess(changed))
         except (InputError, SimulationError):
             return None
