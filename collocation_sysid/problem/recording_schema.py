@@ -183,7 +183,7 @@ class ForceSensorSection(TableSection, of=Wrench):
 
     @model_validator(mode="after")
     def _require_noise(self) -> ForceSensorSection:
-        if self.sigma_n is None and self.sigma_nm is None:
+        if all(getattr(self, key) is None for key in ("sigma_n", "sigma_nm")):
             raise ValueError(
                 "found no sigma_n; expected sigma_n, the standard deviation of the noise of the "
                 "forces [N], or sigma_nm, that of the torques [N m]"

@@ -353,7 +353,7 @@ def _opencv_camera(content: Mapping[str, Any]) -> Calibration:
             raise InputError(f"found {content[given]!r}; expected only {known}", where=given)
     size = _size(content)
     if key == radial_key and size is not None and _value(content, SIZE_KEYS)[0]:
-        size = size[::-1]  # rows come first in MATLAB
+        size = size[1], size[0]  # rows come first in MATLAB
     return Calibration(
         str(_value(content, ("cameraname", "name"))[1] or ""),
         nine,
