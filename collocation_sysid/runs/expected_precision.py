@@ -300,10 +300,12 @@ def added_measurements(
             if not experiment.wrenches and experiment.grasps:
                 which = "" if len(experiments) == 1 else f" of '{experiment.name}'"
                 sensed = _with_force_sensor(collocation, z, k, noise)
-                yield (
-                    f"a force sensor at the grasp{which} (noise {NOISE:.0%} of the largest force)",
-                    [*experiments[:k], sensed, *experiments[k + 1 :]],
-                )
+                if sensed is not None:
+                    yield (
+                        f"a force sensor at the grasp{which} "
+                        f"(noise {NOISE:.0%} of the largest force)",
+                        [*experiments[:k], sensed, *experiments[k + 1 :]],
+                    )
             if (longer := _held_longer(collocation.transcriptions[k])) is not None:
                 yield (
                     f"another recording of '{experiment.name}', held as long again at its end",
@@ -375,7 +377,10 @@ def _held_longer(transcription: Transcription) -> Experiment | None:
     )
 
 
-def _with_force_sensor(collocation: Collocation, z: Array, number: int, noise: float) -> Experiment:
+def _with_force_sensor(
+    collocation: Collocation, z: Array, number: int, noise: float
+) -> Experiment | None:
+    """None if no force is predicted, as in a recording of few samples."""
     experiments = [each.experiment for each in collocation.transcriptions]
     experiment = experiments[number]
     blank = Wrench(experiment.t_s, np.zeros((len(experiment.t_s), 3)), 1.0)
@@ -391,8 +396,8 @@ def _with_force_sensor(collocation: Collocation, z: Array, number: int, noise: f
     (forces_n,) = (
         each for of, each in zip(measurements, predicted, strict=True) if isinstance(of, Wrench)
     )
-    largest_n = float(np.nanmax(np.abs(np.asarray(forces_n)[:, :3])))
-    return sensed(replace(blank, sigma_n=noise * largest_n))
+    largest_n = float(np.nanmax(np.abs(np.asarray(forces_n)[:, :3]), initial=0.0))
+    return None if not largest_n else sensed(replace(blank, sigma_n=noise * largest_n))
 
 
 def _extended(

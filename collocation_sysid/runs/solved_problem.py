@@ -52,7 +52,7 @@ from .ensemble import draw_samples
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed
-from .verdict import expected_rms_m, modes_by_experiment, solution_concerns
+from .verdict import expected_rms_m, modes_by_experiment, solution_concerns, unknown_concerns
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,10 +198,14 @@ class SolvedProblem:
 
     @cached_property
     def is_consistent(self) -> bool:
-        """Whether residuals and effects are as expected of a true description."""
-        if self.uncertainty is None:
+        """Whether residuals, effects and nuisance parameters are as expected of a true description."""
+        if self.uncertainty is None or self.posterior is None:
             return False
-        return not (fit_concerns(self.uncertainty) or effect_concerns(self.effects))
+        return not (
+            fit_concerns(self.uncertainty)
+            or effect_concerns(self.effects)
+            or unknown_concerns(self.solution, self.posterior.phi)
+        )
 
     @cached_property
     def places(self) -> dict[str, dict[str, MarkerPlace]]:
@@ -226,7 +230,7 @@ class SolvedProblem:
             self.rollouts,
             motions=self.modes_by_experiment.values(),
             uncertainty=self.uncertainty,
-            phi=None if self.posterior is None else self.posterior.phi,
+            phi=self.posterior and self.posterior.phi,
         )
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)

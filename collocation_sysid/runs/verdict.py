@@ -93,12 +93,7 @@ def solution_concerns(
         yield Concern("solve/jump")
     transcriptions = solution.collocation.transcriptions
     collocation = solution.collocation
-    at = collocation.parameters_from(solution.z)[collocation.nq :] if phi is None else phi
-    unknowns = [
-        concern
-        for each in transcriptions
-        for concern in _nuisance_concerns(each, at[each.nuisance_indices.indices - collocation.nq])
-    ]
+    unknowns = unknown_concerns(solution, phi)
     if uncertainty is not None:
         misfits = fit_concerns(uncertainty)
         of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
@@ -142,6 +137,17 @@ def solution_concerns(
                 added_ratio=motion.first_mode.numerical_damping_ratio,
                 period_error=motion.first_mode.period_error,
             )
+
+
+def unknown_concerns(solution: Solution, phi: Array | None) -> list[Concern]:
+    """Return the concerns about nuisance parameters (nphi,), by default those of the solution."""
+    collocation = solution.collocation
+    at = collocation.parameters_from(solution.z)[collocation.nq :] if phi is None else phi
+    return [
+        concern
+        for each in collocation.transcriptions
+        for concern in _nuisance_concerns(each, at[each.nuisance_indices.indices - collocation.nq])
+    ]
 
 
 def _nuisance_concerns(transcription: Transcription, phi: Array) -> Iterator[Concern]:
