@@ -211,8 +211,11 @@ def test_with_the_scan_described_the_interval_contains_the_truth(described):
 def test_the_budget_contains_the_error_of_a_scan_in_an_unknown_orientation():
     run = cs.run(problem_of(measured(None, mesh_from="scan"), **ONE_STEP), seek_causes=False)
     estimate = run.estimates["young_pa"]
-    assert abs(estimate.optimum / TRUTH["young_pa"] - 1) > 0.3
-    assert abs(estimate.value / TRUTH["young_pa"] - 1) < 0.1
+    without, error = (
+        abs(value / TRUTH["young_pa"] - 1) for value in (estimate.optimum, estimate.value)
+    )
+    assert without > 0.3
+    assert error < without / 2
     low, high = combined(estimate)
     assert low < TRUTH["young_pa"] < high
     assert run.budget["young_pa"].shares["rest_shape"] > 0

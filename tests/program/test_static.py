@@ -326,7 +326,7 @@ def test_grasps_may_share_nodes_along_different_axes_only():
         ("t_s,z_m,z_mm\n0,0,0\n", "the columns z_m, z_mm could all be z"),
         ("z_m\n0\n", "expected t_s and any of"),
         ("t_s,z_m\n0,0\n0,1\n", "line 3: t_s = 0 follows 0; time must increase"),
-        ("t_s,z_m\n0,\n", "line 2"),
+        ("t_s,z_m\n0,\n", "line 1: column z_m has no values"),
         ("t_s\n0\n", "expected t_s and any of"),
     ],
 )

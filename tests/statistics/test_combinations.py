@@ -166,7 +166,7 @@ def test_the_picture_has_a_bar_for_each_constant_and_combination():
     ]
     (axes,) = combinations_picture({"lambda_pa": 3.0, "mu_pa": 4.0}, directions).axes
     assert [each.get_text() for each in axes.get_yticklabels()] == [
-        "λ", "μ", "λ + 0.9 μ", "μ / λ^0.9",
+        "λ", "μ", "λ +\u00a00.9\u00a0μ", "μ /\u00a0λ^0.9",
     ]  # fmt: skip
     lengths = [bar.get_x() + bar.get_width() for bar in axes.patches]
     assert lengths[:3] == pytest.approx(np.log([3.0, 4.0, 1.01]))
