@@ -183,9 +183,11 @@ def _limit(result: Result) -> Iterator[str]:
     limits = result.limits
     if not limits:
         return
-    vague = [name for name in limits if name not in stated and not limits[name].determined]
     shown = [
-        name for name in vague if name in result.parameters or without_region(name) in SHOWN_MODULI
+        name
+        for name, limit in limits.items()
+        if not (limit.determined or name in stated or name in combined)
+        and (name in result.parameters or without_region(name) in SHOWN_MODULI)
     ]
     stiffness = next((name for name in STIFFNESS_NAMES if name in limits), next(iter(limits)))
     name = next(iter(shown), stiffness)
@@ -196,9 +198,8 @@ def _limit(result: Result) -> Iterator[str]:
         if share > SMALLEST_SHOWN_SHARE
     ]
     subject = f"variance of {symbol_of(name)}: {', '.join(sources)}"
-    if alone := [name for name in shown if name not in combined]:
-        symbols = listed(map(symbol_of, alone))
-        subject = f"not determined: {symbols}; {subject}"
+    if shown:
+        subject = f"not determined: {listed(map(symbol_of, shown))}; {subject}"
     remedy = f"to reduce {source_label(limit.source)}, {limit.remedy}"
     yield f"{subject}; {remedy}{effect_of_remedy(result, name)}"
 

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kit.problem_files import AT_TRUTH, TRUTH, replace_text, run_command, settings
+from kit.problem_files import (
+    AT_TRUTH,
+    TRUTH,
+    pictures_drawn,
+    replace_text,
+    run_command,
+    settings,
+)
 
 import collocation_sysid as cs
 from collocation_sysid.problem.key_descriptions import find_keys
@@ -168,5 +175,6 @@ def test_tracks_are_simulated_and_identified_from(filmed: Path) -> None:
     fitted = result["fit"]["experiments"]["swing"]
     assert fitted["reading_rms"]["front"] < 0.3
     assert fitted["reading_unit"] == {"front": "px"}
-    assert run_command("plot", "found").code == 0
-    assert [*(filmed / "found").rglob("reading_swing_front.png")]
+    with pictures_drawn():
+        assert run_command("plot", "found").code == 0
+    assert [*(filmed / "found").rglob("image_swing_front.png")]

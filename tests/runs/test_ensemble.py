@@ -20,7 +20,7 @@ def run():
     strain = np.linspace(0.005, 0.1, 20)
     blank = cs.Specimen("uniaxial", strain, 0 * strain, 1.0)
     (stress_pa,) = cs.simulate(blank.experiment("mooney-rivlin"), TRUTH).custom_sensor_values
-    sigma_pa = 1e-3 * np.abs(stress_pa).max()
+    sigma_pa = 2e-3 * np.abs(stress_pa).max()
     noise_pa = np.random.default_rng(0).normal(0, sigma_pa, 20)
     measured = replace(blank, stress_pa=stress_pa[:, 0] + noise_pa, sigma_pa=sigma_pa)
     unknown = {name: cs.Unknown(5e4) for name in ("c10_pa", "c01_pa")}
