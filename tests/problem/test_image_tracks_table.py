@@ -7,14 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kit.problem_files import (
-    AT_TRUTH,
-    TRUTH,
-    pictures_drawn,
-    replace_text,
-    run_command,
-    settings,
-)
+from kit.problem_files import AT_TRUTH, TRUTH, pictures_drawn, replace_text, run_command, settings
 
 import collocation_sysid as cs
 from collocation_sysid.problem.key_descriptions import find_keys
