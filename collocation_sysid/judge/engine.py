@@ -230,7 +230,7 @@ class _Refits:
 
     def accepted(self, tested: Hypothesis) -> Hypothesis | None:
         """Return the hypothesis with its strength and what remains, if it decreases the discrepancy
-        by `BETTER`, or to the noise; None else. A size is estimated again at the refit.
+        by `BETTER`; None else. A size is estimated again at the refit.
         """
         stated = self.fit(None)
         remaining = self._remaining(tested)
@@ -253,7 +253,7 @@ class _Refits:
                 if other and left is not None and left < remaining:
                     tested, remaining = other, left
         strength = misfit / max(remaining, LEAST_MISFIT)
-        if strength > BETTER or remaining <= 1.0 < misfit:
+        if strength > BETTER:
             return replace(tested, strength=strength, remaining=remaining)
         return None
 
