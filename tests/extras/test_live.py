@@ -294,7 +294,7 @@ def live_command(monkeypatch, *lines: bytes) -> Outcome:
 @pytest.mark.long
 def test_malformed_lines_are_reported_one_by_one_with_exit_code_2(tiny, monkeypatch):
     with (tiny / "problem.toml").open("a") as file:
-        file.write('\n[uncertainty]\nassumptions = "none"\n')  # as of the last solve
+        file.write('\n[uncertainty]\nassumptions = "none"\n')  # which no solve of a part has
     lines = lines_of(cs.Problem.read("problem.toml"))
     ended = live_command(monkeypatch, *lines)
     assert ended.code == 0

@@ -44,7 +44,7 @@ def problem() -> cs.Problem:
     seen = images_m + noise
     depth = cs.Depth.of_images("front", seen, camera, NOISE_M, at_s, spacing_m=0.008)
     unknown = {**MADE, "young_pa": cs.Unknown(2.9e5)}
-    simulated = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())  # with its own mesh
+    simulated = cs.UncertaintyOptions(assumptions=cs.Assumptions.exact())
     return cs.Problem([swung(depth)], unknown, substeps=1, uncertainty=simulated)
 
 
