@@ -70,7 +70,8 @@ plt.rcParams.update(
 #
 # The next cell repeats the run of part 2. The data are synthetic, so that the true values can be
 # listed for comparison. The printed standard errors are statistical: they describe the effect of
-# the noise only.
+# the noise only. Systematic effects are excluded until section 3.6, because the data are simulated
+# without them.
 
 # %%
 TRUE_VALUES = {
@@ -97,7 +98,9 @@ def print_estimates(run):
         print(f"{name:12}{estimate.value:10.4g} {text:15} true value {TRUE_VALUES[name]:.4g}")
 
 
-problem = cs.Problem.read(cs.datasets.fetch("foam_cylinder") / "problem.toml")
+described = cs.Problem.read(cs.datasets.fetch("foam_cylinder") / "problem.toml")
+exact = replace(described.uncertainty, assumptions=cs.Assumptions.exact())
+problem = replace(described, uncertainty=exact)
 cylinder = problem.experiments[0]
 markers = cylinder.markers
 measured_m = markers.positions_m
@@ -414,12 +417,15 @@ assert young_errors["auto"] > 1.5 * young_errors["independent"]
 # interval** is the one to publish.
 
 # %%
+run = cs.run(described, "reduced-space")
 print(run.table())
 
 # %% [markdown]
 # The columns `± stat` and `± syst` are the statistical and the systematic part. Although the data
 # are synthetic, the toolbox includes the effects that a real recording would have; the problem
-# file excludes only one of them (`damping_law = "none"`). For purely synthetic data,
+# file excludes only some of them, such as `damping_law = "none"`. The estimates are corrected for what the
+# fit finds of the effects, and are less accurate than in section 3.1, because the data have none.
+# The combined intervals contain the true values. For purely synthetic data,
 # `cs.Assumptions.exact()` excludes all of these effects.
 
 # %%
@@ -427,9 +433,9 @@ names = ["young_pa", "mu_pa", "lambda_pa", "poisson", "gamma_r_s", "gamma_m_1_s"
 labels = ["$E$", r"$\mu$", r"$\lambda$", r"$\nu$", r"$\gamma_r$", r"$\gamma_m$"]
 MAIN_EFFECTS = {  # label and colour by name in the budget
     "noise": ("noise", VERMILION),
-    "body_scale": ("size of the body", BLUE),
-    "anisotropy": ("anisotropy", SKY),
-    "density_gradient": ("density gradient", GREEN),
+    "mass": ("mass", BLUE),
+    "surface": ("surface", SKY),
+    "anisotropy": ("anisotropy", GREEN),
 }
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.8))
@@ -461,27 +467,28 @@ for name in names:
     low, high = run.interval(name)
     assert low < TRUE_VALUES[name] < high
     assert np.isclose(sum(run.budget[name].shares.values()), 1)
-    assert run.budget[name].shares["noise"] < 0.1
+    assert run.budget[name].shares["noise"] > 0.5
 
 # %% [markdown]
-# The noise contributes less than 10 % of the variance of every estimate, and less than 1 % for the
-# moduli. More recordings of this kind would not reduce the combined intervals. The largest
-# contribution to the variance of $E$ and μ is the size of the body: a standard deviation of 1 % is
-# assumed unless the problem file states a smaller one. The budget therefore shows which measurement
-# to improve.
+# The effects are estimated together with the parameters, as far as the recording determines them.
+# The noise therefore contributes more to the standard errors than in section 3.1, for $E$ more than
+# four times as much, and more than half of the variance of every estimate: more recordings of this
+# kind would reduce the combined intervals. The largest other contribution to the variance of $E$ and
+# μ is the mass of the body, for which the problem file states a standard deviation of 1 %. The
+# budget therefore shows which measurement to improve.
 #
 # The **verdict** summarises the checks of a run: `good` (no reason for doubt was found), `check`
 # (usable after checking the listed reasons) or `doubtful` (something is wrong with the data, the
 # model or the solution). The verdict considers convergence, the size and the pattern of the
 # residuals, parameters at a bound, the forward simulation, and the discretisation error
 # ([verdict](../../docs/howto/trust.md)). It does not consider the width of the intervals: the
-# table marks an estimate whose interval is wider than its value as "not determined", here λ and ν.
+# table marks an estimate whose interval is wider than its value as "not determined", here none.
 
 # %%
 print("verdict:", run.trust.verdict)
 print("not determined:", [name for name in names if not run.estimates[name].is_determined])
 assert run.trust.verdict == "good"
-assert not run.estimates["lambda_pa"].is_determined
+assert all(run.estimates[name].is_determined for name in names)
 
 # %% [markdown]
 # `collocation-sysid explain budget` describes the systematic effects, their standard deviations and
@@ -493,9 +500,9 @@ assert not run.estimates["lambda_pa"].is_determined
 #
 # 1. **One marker.** Only one marker can be recorded. Which markers give the smallest standard
 #    errors of $E$ and $\gamma_r$?
-# 2. **Size of the body.** Two lengths of the body were measured to 0.1 %. State this in
-#    `[uncertainty.assumptions]` (`body_scale = 0.001`). How do the combined standard uncertainties
-#    of $E$ and λ change?
+# 2. **Mass of the body.** The body was weighed to 0.1 %. State this in
+#    `[uncertainty.assumptions]` (`mass = 0.001`). How do the combined standard uncertainties of $E$
+#    and μ change?
 #
 # This is the last part. The [how-to pages](../../docs/howto) describe further kinds of
 # measurements, and `docs/theory.md` the complete model.
@@ -529,20 +536,22 @@ middles = [single[f"middle_{i}"] for i in (1, 2, 3)]
 assert np.all(np.max(tips, axis=0) < np.min(middles, axis=0))
 
 # %% [markdown]
-# **2.** The combined uncertainties decrease, most for λ. Anisotropy is then the largest
-# contribution to the variance of $E$.
+# **2.** The combined uncertainties decrease by more than a tenth. The surface of the mesh is then
+# the largest contribution to the variance of $E$ beside the noise.
 
 # %% jupyter={"source_hidden": true}
-assumptions = replace(problem.uncertainty.assumptions, body_scale=0.001)
-options = replace(problem.uncertainty, assumptions=assumptions)
-measured_run = cs.run(replace(problem, uncertainty=options), "reduced-space")
-for name in ("young_pa", "lambda_pa"):
+assumptions = replace(described.uncertainty.assumptions, mass=0.001)
+options = replace(described.uncertainty, assumptions=assumptions)
+measured_run = cs.run(replace(described, uncertainty=options), "reduced-space")
+for name in ("young_pa", "mu_pa"):
     before = run.std_error(name)
     after = measured_run.std_error(name)
     shares = measured_run.budget[name].shares
-    largest = max(shares, key=lambda effect: shares[effect])
-    print(f"{name}: ± {before:.0f} → ± {after:.0f} Pa, largest contribution {largest}")
+    _, largest, *_ = sorted(shares, key=lambda effect: -shares[effect])
+    print(
+        f"{name}: ± {before:.1f} → ± {after:.1f} Pa, largest contribution beside noise: {largest}"
+    )
     assert after < 0.9 * before
 assert measured_run.trust.verdict == "good"
 young_shares = measured_run.budget["young_pa"].shares
-assert young_shares["anisotropy"] == max(young_shares.values())
+assert sorted(young_shares, key=lambda effect: -young_shares[effect])[:2] == ["noise", "surface"]
