@@ -104,8 +104,8 @@ def remedied(folder: Path, message: str) -> Iterator[tuple[str, str, str]]:
         yield "problem.toml", r"window_s = \[.*?\]", f"window_s = [{found[1]}, {found[2]}]"
     elif found := re.search(r"write (\w+ = \{\}) to estimate it", message):
         yield "problem.toml", r"\[parameters\]", f"[parameters]\n{found[1]}"
-    elif found := re.search(r"(?:wrench\.(\w+): missing|but (\w+) is missing)", message):
-        key = found[1] or found[2]
+    elif found := re.search(r"(?:wrench: found no|but) (\w+)(?:;| is missing)", message):
+        key = found[1]
         yield "problem.toml", r"(?=file = \"swing_wrench)", f"{key} = {KNOWN[key]}, "
     elif csv and (found := re.search(r"column (.+?) names no unit;.*for example (.+)$", message)):
         yield csv[1], rf"\b{re.escape(found[1])}\b", found[2]

@@ -366,7 +366,7 @@ def test_the_picture_of_a_harmonic_test_has_its_moduli_over_frequency():
     assert not is_harmonic(np.linspace(0.0, 0.1, 5))
     stress = specimen.stress_pa
     samples = np.column_stack([specimen.t_s, stress, stress, np.full_like(stress, np.nan)])
-    (axes,) = harmonic_picture(specimen.strain, specimen.t_s, samples).axes
+    axes, _ = harmonic_picture(specimen.strain, specimen.t_s, samples).axes
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_allclose(lines["storage, measured"].get_ydata(), storage / 1e3)
     np.testing.assert_allclose(lines["loss, measured"].get_ydata(), loss / 1e3)

@@ -63,7 +63,7 @@ def test_differences_and_picture_are_those_of_the_modulus():
     assert stated["reading_unit"] == {"relaxation modulus": "Pa"}
     strain, _ = specimen_strains(experiment)
     samples = np.column_stack([experiment.t_s, measured, measured, measured])
-    (axes,) = relaxation_picture(strain, experiment.t_s, samples).axes
+    axes, _ = relaxation_picture(strain, experiment.t_s, samples).axes
     assert axes.get_ylabel() == "relaxation modulus [kPa]"
     np.testing.assert_allclose(np.asarray(axes.lines[0].get_xydata()), np.c_[T_S, MODULUS_PA / 1e3])
 
