@@ -58,6 +58,28 @@ def float_array(
     return array
 
 
+def require_numbers(values: Any) -> Any:
+    """Return values unchanged if `float_array` accepts their type."""
+    try:
+        is_numeric = values is not None and _as_array(values, "it").dtype.kind in "iufb"
+    except InputError:
+        is_numeric = False
+    if not is_numeric:
+        raise ValueError("expected an array of numbers")
+    return values
+
+
+def require_indices(values: Any) -> Any:
+    """Return values unchanged if they are an array of whole numbers, or an empty one."""
+    try:
+        array = _as_array(values, "it")
+    except InputError:
+        array = np.array(np.nan)
+    if not array.ndim or (array.size and array.dtype.kind not in "iu"):
+        raise ValueError("expected an array of whole numbers")
+    return values
+
+
 def require_shape(shape: tuple[int, ...], shapes: Shape | Sequence[Shape], name: str) -> None:
     """Raise an `InputError` about `name` unless a shape is one of `shapes`, see `float_array`."""
     possible: Any = [shapes] if not shapes or not isinstance(shapes[0], tuple) else shapes

@@ -10,10 +10,11 @@ from __future__ import annotations
 import inspect
 import re
 import sys
+import types
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import wraps
-from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_origin
+from typing import Annotated, Any, TypeVar, cast, dataclass_transform, get_args, get_origin
 
 import numpy as np
 from pydantic import PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
@@ -43,17 +44,20 @@ class Key:
 
 
 def identity(value: T) -> T:
-    """Return the value unchanged; converter of fields that are converted later, with more
-    information.
+    """Return the value unchanged; converter, for type checkers alone, of fields that are converted
+    later, with more information. Their values are validated against their annotation.
     """
     return value
 
 
 def identity_or_none(value: Any) -> Any:
-    """Return the value unchanged; converter of fields that may be None until they are set with more
-    information.
+    """Return the value unchanged, like `identity`; of fields that may be None until they are set
+    with more information.
     """
     return value
+
+
+UNCHANGED = (identity, identity_or_none)
 
 
 def key(
@@ -126,8 +130,8 @@ def _forms(kind: type) -> dict[str, Any]:
 
 def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
     """Return the form of a field, see `key`, else of its annotation; the default is accepted."""
-    # The converter ``tuple[X, ...]`` stands for that form of its annotation; type checkers then
-    # accept all iterables.
+    # The converters ``tuple[X, ...]`` and ``dict[K, V]`` stand for that form of their annotation;
+    # type checkers then accept all iterables or mappings.
     is_optional = field.default is None or str(field.type).endswith("| None")
     if (converter := _converter(field)) is not None:
         return Annotated[
@@ -137,7 +141,7 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
             ),
         ]
     form = field.metadata.get("accepted") or field.metadata.get("form")
-    if form is None or isinstance(form, Key):
+    if form is None or isinstance(form, Key) or field.metadata.get("converter") in UNCHANGED:
         form = form_of(field.type, names)
         is_number = field.type in ("float", "float | None") and field.default is not MISSING
         if is_number and np.isfinite(cast(Any, field.default) or 0.0):
@@ -146,6 +150,8 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
         return None
 
     def unless_default(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
+        if value is None and not is_optional and types.NoneType in get_args(form):
+            return field.default  # as for a key that is not stated
         is_default = type(value) is type(field.default)
         if (value is None and is_optional) or (is_default and value == field.default):
             return value
@@ -156,7 +162,8 @@ def _form(field: Field[Any], names: Mapping[str, Any]) -> Any:
 
 def _converter(field: Field[Any]) -> Callable[[Any], Any] | None:
     converter, accepted = (field.metadata.get(name) for name in ("converter", "accepted"))
-    return None if accepted or get_origin(converter) is tuple else converter
+    is_form = accepted or get_origin(converter) in (tuple, dict) or converter in UNCHANGED
+    return None if is_form else converter
 
 
 def _refusal(

@@ -30,9 +30,20 @@ from typing import (
 )
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, InstanceOf, Strict, TypeAdapter, ValidationError
+from numpy.typing import ArrayLike
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    InstanceOf,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+)
 
 from ..errors import InputError
+from .array_types import Index
+from .checked_arrays import require_indices, require_numbers
 from .field_descriptions import attributes
 from .validated_types import Flag, Number, StrictInteger, expectation
 
@@ -43,6 +54,8 @@ C = TypeVar("C", bound=Callable[..., Any])
 Refusal = Callable[[Mapping[str, Any], str, str, Any, Sequence[Mapping[str, Any]]], Exception]
 _CONFIGURATION = ConfigDict(extra="forbid", arbitrary_types_allowed=True, validate_default=True)
 _PLAIN = {float: Number, int: StrictInteger, bool: Flag, str: Annotated[str, Strict()]}
+_ARRAY = Annotated[Any, AfterValidator(require_numbers)]
+_INDICES = Annotated[Any, AfterValidator(require_indices)]
 
 
 @overload
@@ -58,7 +71,7 @@ def validated(called: Any = None, /, *, kw_only: bool = False) -> Any:
     replaced by the validated ones, the section "Attributes" of the docstring describes the fields in
     the JSON schema, tables of a file can be validated as the class, and errors are located at the
     name of the field. A function, or a class that has a constructor, accepts its defaults as they
-    are, and values whose annotation has no form (see `form_of`), such as arrays.
+    are, and values whose annotation has no form (see `form_of`), such as protocols.
 
     Parameters
     ----------
@@ -85,7 +98,7 @@ def validated(called: Any = None, /, *, kw_only: bool = False) -> Any:
 
     def refusal(arguments: Any, name: str, part: str, found: Any, faults: Any) -> InputError:
         own = arguments.get("name")
-        who = f"{title} {own!r}" if own and isinstance(own, str) else title
+        who = f"{title} {own!r}" if isinstance(own, str) and own else title
         return refused(f"{who}: {name}{part} is", found, faults)
 
     title = _title(called)
@@ -135,7 +148,10 @@ def validate_arguments(
 
     def made_validators() -> list[tuple[str, Any, Any]]:
         stated = {n: f for n, f in forms().items() if n in signature.parameters and f is not None}
-        return [(n, signature.parameters[n].default, _validator(f)) for n, f in stated.items()]
+        return [
+            (n, signature.parameters[n].default, _validator(_of_all(f, signature.parameters[n])))
+            for n, f in stated.items()
+        ]
 
     validators = _Kept(made_validators)
 
@@ -156,12 +172,18 @@ def validate_arguments(
             except ValidationError as error:
                 faults = error.errors(include_url=False)
             # Outside of the handler, so that the error is shown alone.
-            raise refusal(stated, name, *_part_at_fault(value, faults[0]), faults)
+            raise refusal(stated, name, *_deepest(value, faults))
         return function(*bound.args, **bound.kwargs)
 
     if is_class:
         called.__init__ = call
     return called if is_class else call
+
+
+def _of_all(form: Any, parameter: inspect.Parameter) -> Any:
+    """Return the form of all arguments of a parameter, of ``*name`` and ``**name`` several."""
+    several = {parameter.VAR_POSITIONAL: tuple[form, ...], parameter.VAR_KEYWORD: dict[str, form]}
+    return several.get(parameter.kind, form)
 
 
 class _Kept:
@@ -197,9 +219,9 @@ def _other_constructors(called: Any) -> str:
 def form_of(annotation: Any, names: Mapping[str, Any]) -> Any:
     """Return the form, for pydantic, of values with an annotation; None if all values are accepted.
 
-    Numbers are finite or infinite, classes accept their instances, and sequences a single object
-    in place of a list of one. Protocols, arrays and names that are known only to type checkers have
-    no form, nor has a union that contains one of these.
+    Numbers are finite or infinite, classes accept their instances, arrays all numbers, and
+    sequences a single object in place of a list of one. Protocols and names that are known only to
+    type checkers have no form, nor has a union that contains one of these.
 
     Parameters
     ----------
@@ -218,11 +240,26 @@ def form_of(annotation: Any, names: Mapping[str, Any]) -> Any:
     origin, parts = get_origin(annotation), get_args(annotation)
     if annotation is None or annotation is types.NoneType or origin in (Annotated, Literal):
         return annotation
+    if annotation is ArrayLike:
+        return _ARRAY
+    if origin is np.ndarray:
+        return _INDICES if annotation == Index else _ARRAY
     if origin in (Union, types.UnionType):
-        forms = [form_of(part, names) for part in parts if part is not types.NoneType]
+        stated = [part for part in parts if part is not types.NoneType]
+        of_arrays = {*get_args(ArrayLike)} if {*get_args(ArrayLike)} <= {*stated} else set()
+        others = [e for e in stated if e not in of_arrays and get_origin(e) is not np.ndarray]
+        arrays = [e for e in stated if e not in others]
+        array = _INDICES if arrays == [Index] else _ARRAY
+        has_array = bool(arrays)
+        # A sequence of numbers is an array, too.
+        stated = [e for e in others if not (has_array and e == Sequence[float])]
+        forms = [form_of(part, names) for part in stated] + [array] * has_array
         if any(form is None for form in forms):
             return None
-        return reduce(or_, forms + [None] * (len(forms) < len(parts)))
+        return reduce(or_, forms + [None] * (types.NoneType in parts))
+    if origin is Mapping:
+        key, value = (form_of(part, names) or Any for part in parts)
+        return dict[key, value]
     if origin is Callable:
         return annotation
     if origin in (tuple, Sequence):
@@ -231,6 +268,8 @@ def form_of(annotation: Any, names: Mapping[str, Any]) -> Any:
             return None
         entries += [...] * (origin is Sequence)
         return Annotated[tuple[*entries], BeforeValidator(_listed)]
+    if getattr(annotation, "_is_protocol", False) and "__call__" in vars(annotation):
+        return Callable[..., Any]
     if not isinstance(annotation, type) or origin or getattr(annotation, "_is_protocol", False):
         return None
     return _PLAIN.get(annotation, InstanceOf[annotation])
@@ -240,6 +279,8 @@ def _listed(value: Any) -> Any:
     """Return a single object as a list of one, and other containers than tables as a tuple."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         return (value,)
+    if isinstance(value, list | tuple):
+        return tuple(value)
     is_list = not isinstance(value, Mapping | bytes) and np.ndim(cast(Any, value)) == 1
     return tuple(value) if is_list else value
 
@@ -252,7 +293,7 @@ def validate_as(annotation: Any, value: Any, name: str) -> Any:
         return _validator_of(annotation).validate_python(value)
     except ValidationError as error:
         faults = error.errors(include_url=False)
-    part, found = _part_at_fault(value, faults[0])
+    part, found, faults = _deepest(value, faults)
     raise refused(f"{name}{part} is", found, faults)
 
 
@@ -264,6 +305,13 @@ def _validator(form: Any) -> TypeAdapter[Any]:
 @cache  # forms that are made of the same annotation differ
 def _validator_of(annotation: Any) -> TypeAdapter[Any]:
     return _validator(form_of(annotation, {}))
+
+
+def _deepest(value: Any, faults: Sequence[Any]) -> tuple[str, Any, Sequence[Any]]:
+    """Return the deepest place at fault in a value, what was found there, and its faults."""
+    parts = [_part_at_fault(value, fault) for fault in faults]
+    part, found = max(parts, key=lambda each: len(each[0]))
+    return part, found, [f for f, each in zip(faults, parts, strict=True) if each[0] == part]
 
 
 def _part_at_fault(value: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:

@@ -15,9 +15,10 @@ are downloaded at their first use.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 from ..common.time_dependence import at_times, values_over_time
+from ..common.validated_classes import validated
 from ..errors import InputError
 from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
@@ -46,15 +47,17 @@ __all__ = [
 KAWABATA_SIGMA_PA = 1e4
 TRELOAR_SIGMA_PA = 2e4
 DIANI_SIGMA_PA = 2e4
-KAWABATA_TESTS = ("uniaxial", "equibiaxial", "planar", "biaxial")
+KawabataTest = Literal["uniaxial", "equibiaxial", "planar", "biaxial"]
+KAWABATA_TESTS = get_args(KawabataTest)
 
 MaterialLaw = str | Energy | Material
 
 
+@validated
 def kawabata_1981(
     material: MaterialLaw = "ogden-3",
     *,
-    tests: tuple[str, ...] = KAWABATA_TESTS[:3],
+    tests: tuple[KawabataTest, ...] = KAWABATA_TESTS[:3],
     largest_stretch: float | None = None,
 ) -> list[Experiment]:
     """Return biaxial tension of an isoprene rubber vulcanisate at stretches up to 3.7.
@@ -97,6 +100,7 @@ def kawabata_1981(
     ]
 
 
+@validated
 def treloar_1944(
     material: MaterialLaw = "gent", *, largest_stretch: float | None = None
 ) -> list[Experiment]:
@@ -134,6 +138,7 @@ def treloar_1944(
     ]
 
 
+@validated
 def diani(
     material: MaterialLaw = "yeoh", *, largest_stretch: float | None = None
 ) -> list[Experiment]:

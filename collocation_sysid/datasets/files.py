@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 
 from ..common.files import replaced_file, require_possible, write_text_file
+from ..common.validated_classes import validated
 from ..errors import InputError, hint_at
 from ..problem import Problem
 from ..problem.editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
@@ -71,6 +72,7 @@ def dataset_file(name: str, file: str) -> Path:
     return dataset_folder(name) / file
 
 
+@validated
 def read_problem(name: str) -> Problem:
     """Return the problem of a dataset, one of `DATASETS`, with experiments and parameters.
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.files import damage_refused, reason
+from ..common.validated_classes import validated
 from ..errors import InputError, require_among
 from ..fem.laws.materials import Energy, Material
 from ..recording import Experiment, Specimen
@@ -40,6 +41,7 @@ LEFT_OUT = {"Katashima_2012": ("BT", "PS")}
 RELATIVE_SIGMA = 0.01
 
 
+@validated
 def hyperelastic_curves(
     author: str,
     material: str | Energy | Material,

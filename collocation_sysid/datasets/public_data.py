@@ -10,6 +10,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from ..common.validated_classes import validated
 from ..errors import InputError, require_among
 from ..fem.kernels.jit import cache_folder
 from .files import DATASETS, dataset_folder
@@ -113,6 +114,7 @@ def data_folder() -> Path:
     return Path(override) if override else cache_folder() / "datasets"
 
 
+@validated
 def fetch(name: str) -> Path:
     """Return the folder with the files of a data set, which are downloaded at the first use.
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Any, Literal, NamedTuple, cast, get_args
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 import casadi as ca
 import numpy as np
@@ -96,6 +96,7 @@ class NodeForce:
     is_compiled: bool = False
 
     @classmethod
+    @validated
     def from_law(
         cls,
         law: Law,
@@ -147,10 +148,6 @@ class NodeForce:
             )
         known = tuple(definitions.get(a) or constant_named(a) for a in arguments)
         chosen = nodes if nodes is None or isinstance(nodes, Selection) else np.asarray(nodes)
-        if on not in get_args(On):
-            raise InputError(
-                f"force {name!r}: found on = {on!r}; expected one of {', '.join(get_args(On))}"
-            )
         force = cls(
             name, law, constants=known, nodes=chosen, on=on, internal_variable_count=carries
         )

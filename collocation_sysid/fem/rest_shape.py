@@ -31,6 +31,7 @@ from scipy.sparse.linalg import splu
 
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import float_array
+from ..common.validated_classes import validated
 from ..errors import InputError, SimulationError
 from .laws.materials import Material
 from .meshes.mesh import ElementNodes
@@ -83,6 +84,7 @@ class RestShapeError(SimulationError):
         return type(self), (self.message,)
 
 
+@validated
 @dataclass(frozen=True, eq=False)
 class UnderGravity:
     """Conditions of a scan under gravity: the mesh is the equilibrium shape.

@@ -405,6 +405,7 @@ def _require_admissible(constant: Constant, value: float, what: str) -> None:
         )
 
 
+@validated
 @dataclass(frozen=True)
 class FieldCoefficients:
     """Vector parameter: the coefficients of the shapes of a spatially varying constant.
@@ -471,6 +472,7 @@ class Parameters:
         return f"Parameters({', '.join(map(_describe, self.scalars))})"
 
     @classmethod
+    @validated
     def from_mapping(
         cls,
         statements: Mapping[str, Unknown | Tied | float],

@@ -17,12 +17,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from ..common.validated_classes import validated
+from ..common.validated_types import AtLeastOne, Finite
 from ..errors import InputError
 
 # Largest accepted number of steps from sample to sample; a larger one is a typing error.
 MOST_STEPS = 10_000
 
 
+@validated
 @dataclass(frozen=True)
 class Stencil:
     """Coefficients of one row of the equations of motion.
@@ -41,13 +44,14 @@ class Stencil:
         Weight of the start velocity v_0 / Δt in the acceleration.
     """
 
-    p: tuple[float, ...]
-    q: tuple[float, ...]
-    w: tuple[float, ...]
-    s: tuple[float, ...]
-    r: float = 0.0
+    p: tuple[Finite, ...]
+    q: tuple[Finite, ...]
+    w: tuple[Finite, ...]
+    s: tuple[Finite, ...]
+    r: Finite = 0.0
 
 
+@validated
 @dataclass(frozen=True)
 class Scheme:
     """Time-stepping scheme: a regular stencil and separate stencils for the first rows.
@@ -64,7 +68,7 @@ class Scheme:
     """
 
     name: str
-    order: int
+    order: AtLeastOne
     regular: Stencil
     start: tuple[Stencil, ...]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.declarations import declaration, key
+from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, located
 from ..fem.body import Body
@@ -142,6 +143,7 @@ class Problem:
         return f"Problem({title}experiments {names}; {self.parameters!r})"
 
     @classmethod
+    @validated
     def read(
         cls,
         path: str | Path,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_origin
+from typing import TYPE_CHECKING, Any, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from ..common.schema_tables import Section
 from ..common.validated_types import expectation
 from ..errors import InputError, excerpt, hint_at
 from .recording_schema import ExperimentSection, registered_tables
@@ -21,7 +22,10 @@ Fault = Mapping[str, Any]
 
 
 def explain_validation_error(
-    error: ValidationError, content: dict[str, Any], path: Path, root: type[BaseModel] = ProblemFile
+    error: ValidationError,
+    content: dict[str, Any],
+    path: Path | None,
+    root: type[BaseModel] = ProblemFile,
 ) -> InputError:
     """Return (not raise) an `InputError` for one fault, with the number of other places with
     faults.
@@ -32,7 +36,7 @@ def explain_validation_error(
     ----------
     content : dict
         Content that was validated, without [experiment_defaults] inserted.
-    path : Path
+    path : Path or None
         File, for the message.
     root : type
         Model that the content was validated as.
@@ -46,6 +50,18 @@ def explain_validation_error(
     if others:
         message += f" (and {len(others)} more mistake{'s' if len(others) > 1 else ''})"
     return InputError(message, path, where=where or None)
+
+
+class StatedSection(Section):
+    """Section that is also stated in Python, by keyword arguments."""
+
+    if not TYPE_CHECKING:  # which then know the keys
+
+        def __init__(self, **stated: Any) -> None:
+            try:
+                super().__init__(**stated)
+            except ValidationError as error:
+                raise explain_validation_error(error, stated, None, root=type(self)) from error
 
 
 # Tags of the alternatives of a union in the location of a fault.

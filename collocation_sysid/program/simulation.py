@@ -397,6 +397,7 @@ def _with_values(
     )
 
 
+@validated
 def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experiment:
     """Return the experiment with other samples (S, 6) [N, N m] of its force–torque sensors, one
     array for each grasp that has one, in the order of the grasps.
@@ -409,7 +410,8 @@ def with_wrenches(experiment: Experiment, wrenches: Sequence[Array]) -> Experime
     return _with_values(experiment, Wrench, wrenches)
 
 
-def with_readings(experiment: Experiment, values: Sequence[ArrayLike]) -> Experiment:
+@validated
+def with_readings(experiment: Experiment, values: Sequence[ArrayLike | None]) -> Experiment:
     """Return the experiment with other samples (S, m) of its custom sensors, one array for each, in
     their order.
 

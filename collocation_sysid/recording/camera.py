@@ -43,8 +43,9 @@ COEFFICIENTS: dict[Lens, str] = {
     "pinhole": "k1, k2, p1, p2, k3, k4, k5, k6",
     "fisheye": "k1, k2, k3, k4",
 }
-# Numbers of coefficients that each lens may have; rational lenses have all eight.
-COUNTS: dict[Lens, tuple[int, ...]] = {"pinhole": (0, 1, 2, 3, 4, 5, 8), "fisheye": (0, 4)}
+# Numbers of coefficients that each lens may have: p1 and p2 belong together, and rational lenses
+# have all eight.
+COUNTS: dict[Lens, tuple[int, ...]] = {"pinhole": (0, 1, 2, 4, 5, 8), "fisheye": (0, 4)}
 # Fixed-point iterations that invert the distortion; each gains two digits for usual lenses.
 UNDISTORTION_ITERATIONS = 12
 # Newton iterations for lenses for which the fixed-point iteration does not converge.
@@ -76,8 +77,8 @@ class Camera:
         none. If a cloud of a depth camera has one, an offset and a scale error of the depth are
         estimated, and surfaces that face away from the camera are not used.
     distortion : sequence of numbers
-        Coefficients in the order of OpenCV. "pinhole": up to five, k1, k2, p1, p2, k3, or eight,
-        with k4, k5, k6. "fisheye": four, k1 to k4.
+        Coefficients in the order of OpenCV. "pinhole": one, two, four, five or eight of k1,
+        k2, p1, p2, k3, k4, k5, k6. "fisheye": four, k1 to k4.
     model : {"pinhole", "fisheye"}
         Model of the lens: Brown and Conrady, or the equidistant fisheye.
     size_px : (int, int), optional
@@ -117,7 +118,7 @@ class Camera:
             )
         distortion = read_only_floats(self.distortion, (None,), name="distortion of a camera")
         if len(distortion) not in COUNTS[self.model]:
-            counts = "up to five, or eight" if self.model == "pinhole" else "four"
+            counts = "none, one, two, four, five or eight" if self.model == "pinhole" else "four"
             raise InputError(
                 f"distortion has {len(distortion)} numbers; expected {counts} for the model "
                 f'"{self.model}": {COEFFICIENTS[self.model]}'

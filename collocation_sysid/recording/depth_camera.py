@@ -64,6 +64,10 @@ def _unconverted_clouds(clouds: Sequence[ArrayLike]) -> Any:
 
 def _unconverted_images(images_m: Sequence[ArrayLike | None]) -> Any:
     """Return the images unchanged, which `Depth` checks and converts."""
+    if not isinstance(images_m, list | tuple | np.ndarray):
+        raise InputError(
+            f"images_m of a depth camera is a {type(images_m).__name__}; expected a list of images"
+        )
     return images_m
 
 
@@ -174,6 +178,7 @@ class Depth(Measurement):
         return tuple(images)
 
     @classmethod
+    @validated
     def of_images(
         cls,
         name: str,

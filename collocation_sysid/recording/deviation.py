@@ -15,6 +15,8 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
+from ..common.validated_types import Finite, Positive
 
 Component = Literal[
     "recording",
@@ -56,6 +58,7 @@ class RecordingQuantities:
     pivot_m: Array  # (3,): pivot c of the rigid motion in the frame of the markers
 
 
+@validated
 @dataclass(frozen=True)
 class Deviation:
     """One way in which reality may deviate from the description; zero is as described.
@@ -149,13 +152,13 @@ class Deviation:
     # this one, so that their argument has no type here.
     name: str
     unit: str
-    sigma: float | None = None
+    sigma: Positive | None = None
     description: str = ""
     label: str = ""
     _: KW_ONLY
-    considered: float | None = None
-    by_origin: Mapping[str, float] = field(default_factory=dict, hash=False)
-    wide: float | None = None
+    considered: Positive | None = None
+    by_origin: Mapping[str, Positive] = field(default_factory=dict, hash=False)
+    wide: Positive | None = None
     remedy: str = ""
     of: Component = "recording"
     axes: str = ""
@@ -164,13 +167,13 @@ class Deviation:
     is_one_sided: bool = False
     redefines: tuple[str, ...] = ()
     key: str = ""
-    reference: float | None = None
+    reference: Finite | None = None
     changes: tuple[ModelPart, ...] = ("reading",)
     applies: Callable[..., bool] = lambda experiment: True
     applies_to: Callable[..., bool] = lambda experiment, index: True
     low: float = -np.inf
     high: float = np.inf
-    reach: float = 1.0
+    reach: Positive = 1.0
     step: Callable[..., float] | None = None
     sentence: str = ""
     by: Literal["length", "worst", "each"] = "each"

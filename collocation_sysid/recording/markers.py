@@ -22,6 +22,7 @@ from ..common.checked_arrays import (
 )
 from ..common.declarations import Key, declaration, identity_or_none, key
 from ..common.time_dependence import over_time
+from ..common.validated_classes import validated
 from ..common.validated_types import Positive
 from ..errors import InputError
 from .measurement import Measurement, checked_ratios, split_sigma
@@ -178,11 +179,16 @@ class Markers(Measurement):
             places_m = np.full((m, 3), np.nan) if places_m is None else places_m
             places_m = read_only_floats(places_m, (m, 3), name="places_m", finite=False)
             known = np.isfinite(places_m).all(axis=1)
-        vars(self).update(places_m=places_m, located=np.ones(m, bool) if known is None else known)
+        known = np.ones(m, bool) if known is None else known
+        if known.shape != (m,) or known.dtype != bool:
+            raise InputError(f"located has the shape {known.shape}; expected ({m}) truth values")
+        vars(self).update(places_m=places_m, located=known)
         if self.places_sigma_m is not None:
             each = self.places_sigma_m
             each = np.broadcast_to(each, m) if each.ndim == 0 else each
             sigma_m = read_only_floats(each, (m,), name="places_sigma_m", finite=False)
+            if (sigma_m < 0).any() or np.isinf(sigma_m).any():
+                raise InputError("places_sigma_m has negative or infinite values; expected none")
             vars(self)["places_sigma_m"] = sigma_m
 
     def __repr__(self) -> str:
@@ -255,6 +261,7 @@ class Markers(Measurement):
         return replace(self, positions_m=np.where(is_later, np.nan, self.positions_m))
 
     @classmethod
+    @validated
     def none(cls, t_s: ArrayLike) -> Markers:
         """Return an empty set of markers at the times `t_s` (T,), for an experiment without
         markers.

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.field_descriptions import FieldOfRow, sentence, with_fields
-from ..common.validated_classes import validate_as
+from ..common.validated_classes import validate_as, validated
 from ..common.validated_types import Finite
 from ..errors import InputError, listed
 from .deviation import Deviation, RecordingQuantities
@@ -764,6 +764,7 @@ def _field_of(row: Deviation) -> FieldOfRow:
     return FieldOfRow("float | None", row.sigma, "float or None", sentence(row.description))
 
 
+@validated
 @dataclass(frozen=True, kw_only=True)
 @with_fields({row.name: _field_of(row) for row in KINDS})
 class Nuisance:
@@ -836,6 +837,7 @@ class Nuisance:
         return row.sigma if row in self.own else getattr(self, row.name)
 
     @classmethod
+    @validated
     def none(
         cls,
         *,

@@ -31,6 +31,7 @@ _INSIDE_TOLERANCE = 1e-9
 _EMBEDDING_ITERATIONS = 30
 
 
+@validated
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Attachment of markers as fixed linear combinations of node positions.

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import as_array, float_converter, read_only_floats
 from ..common.declarations import declaration, key
+from ..common.validated_classes import validated
 from ..errors import InputError
 from .sample_times import TIME_TOLERANCE_S, first_unordered_time
 
@@ -100,6 +101,7 @@ class PoseSequence:
         vars(self).update(positions_m=positions_m, quaternions_xyzw=continuous)
 
     @classmethod
+    @validated
     def fixed(cls, t0_s: float = 0.0) -> PoseSequence:
         """Return the identity pose for all time, as a single sample at `t0_s`: grasped nodes stay
         where they are undeformed.
@@ -109,6 +111,7 @@ class PoseSequence:
         )
 
     @classmethod
+    @validated
     def from_matrices(
         cls, t_s: ArrayLike, matrices: ArrayLike, interpolation: Interpolation = "smooth"
     ) -> PoseSequence:

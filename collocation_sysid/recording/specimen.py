@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array, float_converter
 from ..common.declarations import declaration, key
+from ..common.validated_classes import validated
 from ..common.validated_types import Finite, Flag, NotNegative, Positive, PositivePerSample, Text
 from ..errors import InputError
 from ..fem.body import Body, Made
@@ -265,6 +266,7 @@ class Specimen:
         )
 
     @classmethod
+    @validated
     def relaxation(
         cls,
         t_s: ArrayLike,
@@ -301,9 +303,16 @@ class Specimen:
             raise InputError("expected positive times that increase", None, where="t_s")
         _require_small_strain_test(test)
         modulus = float_array(modulus_pa, "modulus_pa", ((len(times),),), False)
+        if (wrong := (modulus < 0) | np.isinf(modulus)).any():
+            raise InputError(
+                f"found {modulus[wrong][0]:g} in row {np.flatnonzero(wrong)[0] + 1}; expected "
+                "moduli above 0, or nan where one is missing",
+                None,
+                where="modulus_pa",
+            )
         # A ramp that is short compared with the first time; before it the specimen is at rest.
         ramp_s = 1e-6 * times[0]
-        sigma = np.asarray(sigma_pa)
+        sigma = float_array(sigma_pa, "sigma_pa", ((), (len(times),)))
         return cls(
             test,
             RELAXED_STRAIN * np.r_[0.0, 1.0, np.ones(len(times))],
@@ -316,6 +325,7 @@ class Specimen:
         )
 
     @classmethod
+    @validated
     def harmonic(
         cls,
         frequency_hz: ArrayLike,
@@ -365,10 +375,12 @@ class Specimen:
             ("storage_pa", storage, 0.0),
             ("loss_pa", loss, -LOSS_NOISE * np.nan_to_num(storage)),
         ):
-            if (values < lowest).any() or not size.all():
-                row = int(np.flatnonzero((values < lowest) | (size == 0))[0]) + 1
+            wrong = (values < lowest) | (size == 0) | np.isinf(values)
+            if wrong.any():
+                row = int(np.flatnonzero(wrong)[0]) + 1
                 fault = (
-                    f"found no modulus, or a negative one, in row {row}; expected moduli above 0"
+                    f"found no modulus, or a negative or infinite one, in row {row}; expected "
+                    "moduli above 0"
                 )
                 raise InputError(fault, None, where=name)
         # Beginning with the shortest period, all times have the precision of their period.

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
 from ..judge.posterior import BudgetLine, Posterior
@@ -368,6 +369,7 @@ class SolvedProblem:
             matrix = self._complete_covariance * np.outer(factors, factors)
         return matrix if units == "relative" else matrix / np.outer(by_value, by_value)
 
+    @validated
     def samples(self, count: int, seed: int = 0) -> Any:
         """Return draws from the combined distribution of the parameters as a pandas DataFrame, one
         row each, for simulations with random constants.

@@ -10,6 +10,8 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
+from ..common.validated_types import Positive
 from ..errors import InputError
 from ..fem.laws.damping_admissibility import viscous_stress
 from ..fem.laws.materials import DampingLaw, Energy, Material, as_damping, as_material, damped_psi
@@ -25,6 +27,7 @@ LARGEST_STRAIN = 0.5
 ROUNDING = 1e-10
 
 
+@validated
 def check_damping(
     law: str | DampingLaw,
     *,
@@ -32,7 +35,7 @@ def check_damping(
     constants: Mapping[str, float] | None = None,
     is_objective: bool = True,
     is_dissipative: bool = True,
-    largest_strain: float = LARGEST_STRAIN,
+    largest_strain: Positive = LARGEST_STRAIN,
 ) -> None:
     """Check a damping law: derivatives, dissipation and objectivity.
 

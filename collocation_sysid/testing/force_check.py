@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..errors import InputError
 from ..fem.node_force import CONTEXT_OFFSETS, CONTEXT_SIZE, ForceContext, Law, NodeForce
 from ..model.generated_functions import GeneratedFunction
@@ -32,6 +33,7 @@ FACE_EDGE_M = 0.03
 ROUNDING = 1e-9
 
 
+@validated
 def check_force(
     force: Law | NodeForce,
     *,

@@ -11,6 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
+from ..common.validated_types import Positive
 from ..fem.laws.materials import Energy, Material, as_material
 from .property_check import PropertyCheck
 from .small_problems import usual_constants
@@ -27,12 +29,13 @@ CHAIN_RULE = 1e-8
 DIAGONAL = [np.diag(each) for each in np.eye(3)]
 
 
+@validated
 def check_material(
     material: str | Energy | Material,
     *,
     constants: Mapping[str, float] | None = None,
     is_objective: bool = True,
-    largest_strain: float = LARGEST_STRAIN,
+    largest_strain: Positive = LARGEST_STRAIN,
 ) -> None:
     """Check a material: energy, stress, stiffness and objectivity.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..fem.body import Body
 from ..fem.meshes.structured import box_mesh
 from ..methods.solution import Iteration, Method, Solution
@@ -28,6 +29,7 @@ LARGEST_ERROR = 1e-3
 LARGEST_VIOLATION = 1e-5
 
 
+@validated
 def check_method(
     method: Method, *, is_exact: bool = True, largest_error: float = LARGEST_ERROR
 ) -> None:

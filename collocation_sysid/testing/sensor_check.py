@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..fem.body import Body
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import box_mesh
@@ -36,6 +37,7 @@ MARGIN_M = 0.02
 SAMPLES = 7
 
 
+@validated
 def check_sensor(sensor: CustomSensor) -> None:
     """Check a custom sensor: values, derivatives and predictions.
 

@@ -1514,7 +1514,7 @@ MISTAKES = {
         ('free = ["x"]\nend_m = [0.0, 0.1, 0.0]', "end_m moves y, which is not free"),
         ("free = []", "hand.free: found \\[\\]; expected coordinates that may move"),
         ('joint_limits = "reach.py"', "joint_limits"),
-        ("end_m = [inf, nan, 0.0]", "end_m has an infinite component; expected a number or nan"),
+        ("end_m = [inf, nan, 0.0]", "end_m: found inf; expected a finite number, or nan"),
     ],
 }
 

@@ -306,7 +306,7 @@ def test_a_force_on_faces_that_are_not_there_is_refused():
     force = NodeForce.from_law(breath, nodes=inside, on="faces")
     with pytest.raises(InputError, match="'breath' acts on faces of the surface, but no face"):
         forces_alone(Body(hung_cube(2).body.mesh, density_kg_m3=30.0, forces=[force]), np.zeros(1))
-    with pytest.raises(InputError, match="found on = 'edges'; expected one of nodes, faces"):
+    with pytest.raises(InputError, match="on is 'edges'; expected 'nodes' or 'faces'"):
         NodeForce.from_law(breath, on="edges")  # pyright: ignore[reportArgumentType]
 
 

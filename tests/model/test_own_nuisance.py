@@ -99,7 +99,7 @@ def test_an_omitted_nuisance_parameter_spoils_the_answer():
     [
         ({"reading": None}, "'extra' has no effect; expected exactly one"),
         ({"sigma": None}, "'extra' has no sigma; expected the standard deviation of its prior"),
-        ({"sigma": 0.0}, "'extra' is 0; expected a value above 0"),
+        ({"sigma": 0.0}, "'extra': sigma is 0; expected a number above 0"),
         ({"name": "tare"}, "two nuisance parameters are named 'tare'"),
         ({"of": "load"}, "'extra' has of = 'load'; expected 'recording' or 'marker'"),
         ({"reading": lambda y, v, t_s, data: y[:2]}, r"has the shape \(2, 1\); expected \(3, 1\)"),

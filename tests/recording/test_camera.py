@@ -78,7 +78,14 @@ def test_a_depth_camera_is_a_camera() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"distortion": [0.1] * 6}, "6 numbers; expected up to five, or eight .* k1, k2, p1, p2"),
+        (
+            {"distortion": [0.1] * 6},
+            "6 numbers; expected none, one, two, four, five or eight .* k1",
+        ),
+        (
+            {"distortion": [0.1] * 3},
+            "3 numbers; expected none, one, two, four, five or eight .* k1",
+        ),
         ({"distortion": [0.1] * 5, "model": "fisheye"}, "5 numbers; expected four .* k1, k2, k3"),
         ({"model": "omni"}, "'omni'"),
         ({"size_px": (0, 480)}, "size_px"),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.array_types import Array
+from ...common.validated_classes import validated
 from ...errors import InputError, SimulationError
 from ...features.image_tracks.tracks import ImageTracks
 from ...fem.laws.constants import unit_of
@@ -71,6 +72,7 @@ class LiveEstimator:
         If the problem has a feature that frames cannot describe.
     """
 
+    @validated
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.experiment = _only_experiment(problem)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...common.text_files import parse_json
+from ...common.validated_classes import validated
 from ...errors import InputError
 from ...features.image_tracks.tracks import ImageTracks
 from ...problem import Problem
@@ -44,6 +45,7 @@ class Frame:
 class FrameReader:
     """Reader of the frames of an experiment of a problem; lines come from `source`."""
 
+    @validated
     def __init__(self, experiment: Experiment, problem: Problem, source: str = "input") -> None:
         self._experiment = experiment
         self._source = source

@@ -16,6 +16,7 @@ from ...common.display import Line, Picture, Shown, Table, TitledParts
 from ...common.files import write_text_file
 from ...common.serialisation import as_json
 from ...common.signal_handling import INTERRUPTS
+from ...common.validated_classes import validated
 from ...errors import listed
 from ...fem.laws.constants import symbol_of
 from ...recording import write_markers_csv, write_poses_csv
@@ -62,6 +63,7 @@ SCHEMA = 2
 FRAMES_PER_SECOND = 25.0
 
 
+@validated
 def write_plan(
     plan: MotionPlan,
     folder: str | Path,

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from ...common.array_types import Array
-from ...common.schema_tables import Section, Vector
+from ...common.schema_tables import Vector
 from ...common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
+from ...common.validated_classes import validated
 from ...common.validated_types import Positive
-from ...errors import InputError
-from ...problem.validation_messages import explain_validation_error
+from ...errors import InputError, located
+from ...problem.validation_messages import StatedSection
 from .hand_motion import TimeDerivatives, angular_motion
 
 # Largest share of a limit on the grid of a motion: between grid points peaks may be larger.
@@ -22,7 +23,7 @@ WITHIN = 1 - 6e-3
 REACHED = 0.98
 
 
-class Limits(Section):
+class Limits(StatedSection):
     """limits.toml: what the hand may do.
 
     The hand is the middle of the grasped nodes.
@@ -51,6 +52,7 @@ class Limits(Section):
         return self
 
     @classmethod
+    @validated
     def read(cls, path: str | Path) -> Limits:
         """Read limits.toml from a file.
 
@@ -63,10 +65,8 @@ class Limits(Section):
         file = Path(path)
         text = read_text(file, "a file of limits (TOML)", HAND_WRITTEN_BYTES)
         content = parse_toml(text, file)
-        try:
-            return cls.model_validate(content)
-        except ValidationError as error:
-            raise explain_validation_error(error, content, path=file, root=cls) from error
+        with located(file):
+            return cls(**content)
 
     def bounds_from(self, hand_m: Array) -> HandBounds:
         """Return the limits of a hand that starts at the position `hand_m` (3,) in the world frame

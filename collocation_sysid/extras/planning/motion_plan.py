@@ -17,6 +17,7 @@ import numpy as np
 from scipy.stats import norm
 
 from ...common.array_types import Array
+from ...common.validated_classes import validated
 from ...errors import InputError, SimulationError
 from ...problem import Problem
 from ...problem.code_loader import CodeLoader
@@ -49,8 +50,8 @@ BAND = 0.95
 # Source of the band beside those of a budget and the grip.
 DESCRIPTION = "description"
 # Limits of a hand that does not move.
-STANDING = Limits.model_validate(
-    {
+STANDING = Limits(
+    **{
         "workspace_m": ((-1e3,) * 3, (1e3,) * 3),
         "speed_m_s": 1.0,
         "acceleration_m_s2": 1.0,
@@ -403,6 +404,7 @@ class MotionPlan:
         return tuple(sorted(found, key=lambda each: -each.gain_per_percent))
 
 
+@validated
 def plan_motion(
     source: str | Path | Problem | SolvedProblem,
     task: Task | str | Path,

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from ...common.array_types import Array
 from ...common.schema_tables import Section, Vector, require_one
 from ...common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
+from ...common.validated_classes import validated
 from ...common.validated_types import (
     AboveOne,
     AtLeastOne,
@@ -29,7 +30,7 @@ from ...common.validated_types import (
 )
 from ...errors import InputError, hint_at, listed, located
 from ...problem.schema import CodeSection
-from ...problem.validation_messages import explain_validation_error
+from ...problem.validation_messages import StatedSection
 from ...recording.sources.columns import find_time
 from ...recording.sources.source import read_table
 from ...recording.sources.text import numeric_cells, times_in_column
@@ -38,7 +39,18 @@ HandAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")
 POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 VELOCITY_COLUMNS = ("vx_m_s", "vy_m_s", "vz_m_s")
-Row = tuple[Boundless, Boundless, Boundless]
+
+
+def _not_infinite(value: float) -> float:
+    if np.isinf(value):
+        raise ValueError(
+            f"found {value:g}; expected a finite number, or nan where nothing is required"
+        )
+    return value
+
+
+Coordinate = Annotated[Boundless, AfterValidator(_not_infinite)]
+Row = tuple[Coordinate, Coordinate, Coordinate]
 # Keys of a task that a motion for information does not have.
 OF_REFERENCES = ("reference", "end", "largest_error_m")
 # Distance of a reference from the body in sizes of the body beyond which it has another unit.
@@ -186,8 +198,6 @@ class HandSection(Section):
         for key, axes in (("end_m", AXES[:3]), ("end_rotation_deg", AXES[3:])):
             values = getattr(self, key)
             for axis, value in zip(axes, values or (), strict=False):
-                if np.isinf(value):
-                    raise ValueError(f"{key} has an infinite component; expected a number or nan")
                 if value and not np.isnan(value) and axis not in self.free:
                     raise ValueError(
                         f"{key} moves {axis}, which is not free; expected {axis} in free, or 0"
@@ -312,7 +322,7 @@ class InformationSection(Section):
     half_width: Positive
 
 
-class Task(Section):
+class Task(StatedSection):
     """task.toml: a motion to be planned.
 
     Attributes
@@ -441,6 +451,7 @@ class Task(Section):
         return self.model_copy(update={"duration_s": duration_s, "reference": references})
 
     @classmethod
+    @validated
     def read(cls, path: str | Path) -> Task:
         """Read task.toml and the files of its references; the file of `joint_limits` is not run.
 
@@ -453,10 +464,8 @@ class Task(Section):
         file = Path(path)
         text = read_text(file, "a task of a planned motion (TOML)", HAND_WRITTEN_BYTES)
         content = parse_toml(text, file)
-        try:
-            task = cls.model_validate(content)
-        except ValidationError as error:
-            raise explain_validation_error(error, content, path=file, root=cls) from error
+        with located(file):
+            task = cls(**content)
         update: dict[str, Any] = {
             "reference": [_with_values_of_file(each, file) for each in task.reference]
         }

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from ...common.display import Table, plain_text
+from ...common.validated_classes import validated
 from ...errors import InputError
 from ...problem import Problem
 from ...recording.measurement_selection import measured_count
@@ -66,6 +67,7 @@ class ModelComparison:
         return figure
 
 
+@validated
 def compare_models(
     models: Mapping[str, Problem],
     method: str | None = None,

@@ -64,6 +64,7 @@ class Material:
     constants: tuple[Constant, ...]
 
     @classmethod
+    @validated
     def from_energy(cls, energy: Energy, name: str = "", *constants: Constant) -> Material:
         """Return a material from an energy function; its arguments after F are the constants.
 

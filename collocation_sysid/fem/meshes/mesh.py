@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...common.array_types import Array, Index
+from ...common.validated_classes import validated
 from ...errors import InputError
 from ..elements import Element
 from .checks import (
@@ -43,6 +44,7 @@ class NodeSelection(Protocol):
         ...
 
 
+@validated
 @dataclass(frozen=True, eq=False)
 class TetMesh:
     """Mesh of linear tetrahedra in metres; its arrays are read-only.
@@ -140,6 +142,7 @@ class TetMesh:
         return f"TetMesh({len(self.points_m)} nodes, {len(self.tetrahedra)} tetrahedra)"
 
     @classmethod
+    @validated
     def read(cls, path: str | Path, length_unit: str = "m") -> TetMesh:
         """Read the tetrahedra of any file that meshio can read.
 
@@ -179,6 +182,7 @@ class TetMesh:
         return mesh
 
     @classmethod
+    @validated
     def from_surface(
         cls,
         surface: str | Path | tuple[ArrayLike, ArrayLike],
