@@ -54,6 +54,7 @@ class CustomSensorResidual(MeasurementResidual):
     is_static: bool
 
     sigma_key = "sigma"
+    has_offsets = True
 
     @classmethod
     def from_sensor(

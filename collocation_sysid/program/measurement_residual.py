@@ -236,6 +236,9 @@ class MeasurementResidual(ABC):
         Indices in φ of the nuisance parameters of each entity.
     sigma_key : str
         Key of σ in a problem file.
+    has_offsets : bool
+        Whether measurements have an unknown offset, such as a tare, which must be allowed for
+        before anything is fitted.
     group_size : int
         How many numbers the loss takes as one vector, g; three for a position.
     has_fixed_stencils : bool
@@ -263,6 +266,7 @@ class MeasurementResidual(ABC):
 
     group_size: ClassVar[int] = GROUP
     sigma_key: ClassVar[str] = "sigma_m"
+    has_offsets: ClassVar[bool] = False
     has_fixed_stencils: ClassVar[bool] = True
     has_noise_floor: ClassVar[bool] = False
     errs_slowly: ClassVar[bool] = False

@@ -43,6 +43,7 @@ class WrenchResidual(MeasurementResidual):
     wrench: Wrench  # measured samples
 
     sigma_key = "sigma_n"
+    has_offsets = True
     has_fixed_stencils = False
 
     @classmethod

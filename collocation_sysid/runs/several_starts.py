@@ -54,7 +54,7 @@ def robust_loss(solution: Solution) -> float:
     return sum(part.loss for part in solution.parts) + float(prior @ prior) + excluded_loss
 
 
-class KnownMinimum(Exception):
+class _KnownMinimum(Exception):
     """A search has arrived at a minimum that is known."""
 
     def __init__(self, solution: Solution) -> None:
@@ -62,8 +62,8 @@ class KnownMinimum(Exception):
         self.solution = solution
 
 
-def until_known(method: Method, known: Sequence[Solution]) -> Method:
-    """Return a method that raises `KnownMinimum` where a known solution is reached."""
+def _until_known(method: Method, known: Sequence[Solution]) -> Method:
+    """Return a method that raises `_KnownMinimum` where a known solution is reached."""
 
     def solve(
         collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -74,7 +74,7 @@ def until_known(method: Method, known: Sequence[Solution]) -> Method:
                 watch(line)
             for solution in known:
                 if _is_at(line, solution):
-                    raise KnownMinimum(solution)
+                    raise _KnownMinimum(solution)
 
         return method(collocation, watch_for_known, start)
 
@@ -128,8 +128,8 @@ def follow_starts(
         # The search associates cameras with its first shape itself.
         started = collocation.with_parameters(scan.starts[number])
         try:
-            solution = solve(until_known(method, [each for *_, each in candidates]), started)
-        except KnownMinimum as known:
+            solution = solve(_until_known(method, [each for *_, each in candidates]), started)
+        except _KnownMinimum as known:
             candidates.append((robust_loss(known.solution), number, known.solution))
             continue
         if solution.status.converged:
@@ -148,5 +148,4 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = collocation.with_parameters(scan.starts[best])
-    chosen_start = replace(start, collocation=started, note=note, scan=chosen)
-    return chosen_start, solution if is_own else None
+    return Start(started, note=note, scan=chosen), solution if is_own else None

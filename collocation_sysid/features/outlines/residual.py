@@ -197,6 +197,7 @@ class OutlinesResidual(CameraImagesResidual):
     correspondences: OutlinePairs
 
     sigma_key = "sigma_px of outlines"
+    has_offsets = False
     has_noise_floor = True
 
     @cached_property

@@ -84,6 +84,7 @@ class DepthResidual(CorrespondenceResidual):
     observable_s: Array  # (n,): times of the observable [s]
 
     group_size = 1
+    has_offsets = True
     sigma_key = "sigma_m of depth"
     is_compiled = True
 
