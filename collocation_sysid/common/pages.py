@@ -81,9 +81,9 @@ def page_text(topic: str) -> str:
     return _LINK_TO_PAGE.sub(named, page_files()[topic].read_text(encoding="utf-8"))
 
 
-def search_pages(text: str, count: int = 5) -> list[tuple[str, str, str]]:
-    """Return topic, heading and first line with a word of `text` of the pages, at most `count`, that
-    have all its words in one section; a word in a heading counts as ten in the text.
+def search_pages(text: str) -> list[tuple[str, str, str]]:
+    """Return topic, heading and first line with a word of `text` of the five best pages that have all
+    its words in one section; a word in a heading counts as ten in the text.
     """
     words = text.lower().split()
     found = {}
@@ -97,7 +97,7 @@ def search_pages(text: str, count: int = 5) -> list[tuple[str, str, str]]:
                 ]
                 line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", lines[0].strip()) if lines else ""
                 found[topic] = sum(counts), heading, line
-    best = sorted(found, key=lambda topic: -found[topic][0])[:count]
+    best = sorted(found, key=lambda topic: -found[topic][0])[:5]
     return [(topic, *found[topic][1:]) for topic in best]
 
 

@@ -65,11 +65,6 @@ class Table:
     lines: Sequence[int]  # line of each row, counted from 1
     names_line: int = 1  # line of the names
 
-    def without_column(self, place: int) -> Table:
-        """Return the table without the column of an index."""
-        names = [name for k, name in enumerate(self.columns) if k != place]
-        return replace(self, columns=names, cells=np.delete(self.cells, place, axis=1))
-
     def with_rows(self, rows: Index) -> Table:
         """Return the table of rows, by their indices."""
         return replace(self, cells=self.cells[rows], lines=[self.lines[k] for k in rows.tolist()])
