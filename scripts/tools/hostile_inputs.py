@@ -255,7 +255,7 @@ def make_folders(folder: Path) -> list[tuple[str, str, str, tuple[str, ...]]]:
     for words in (
         ("plot", "run"),
         ("report", "run", "-q"),
-        ("export", "run", "--to", "mujoco", "-q"),
+        ("export", "run", "--to", "calculix", "-q"),
     ):
         for file in sorted(each.name for each in (run / "run").iterdir() if each.is_file()):
             if file.endswith((".json", ".npz", ".toml")):

@@ -730,7 +730,7 @@ def test_the_result_in_place_of_its_run_folder_leads_to_the_folder(tiny, command
     (tiny / "run").mkdir()
     (tiny / "run" / "result.json").write_text("{}")
     words = ("run/result.json: this is a file; expected a run folder, likely run",)
-    options = ("--to", "newton") if command == "export" else ()
+    options = ("--to", "json") if command == "export" else ()
     assert_refused(tiny, words, command, "run/result.json", *options)
 
 

@@ -80,7 +80,7 @@ def test_pictures_and_films_are_there_whole_or_not_at_all(run: Path, tmp_path: P
 
 
 def test_an_export_is_there_whole_or_not_at_all(run: Path, tmp_path: Path):
-    refused(tmp_path, "out", "export", run, "--to", "newton", "--out", tmp_path / "out")
+    refused(tmp_path, "out", "export", run, "--to", "febio", "--out", tmp_path / "out")
 
 
 def test_a_problem_is_begun_whole_or_not_at_all(tmp_path: Path):

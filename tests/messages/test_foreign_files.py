@@ -127,7 +127,9 @@ def test_a_command_of_a_run_executes_nothing_of_the_working_folder(
     tmp_path: Path, words: tuple[str, ...]
 ):
     pytest.importorskip("mujoco")
-    write_problem(tmp_path, {"swing": 8})
+    problem = write_problem(tmp_path, {"swing": 8})
+    law = '[object]\nmaterial = "st-venant-kirchhoff"\n'  # that of MuJoCo
+    problem.write_text(problem.read_text().replace("[object]\n", law))
     solved = run_command(
         *("solve", tmp_path / "problem.toml", *REDUCED, "--no-pictures", "-q"),
         *("--out", tmp_path / "run"),

@@ -1,8 +1,7 @@
 """CalculiX: an input deck of the body at rest under gravity, in its grasp and in contact with
 obstacles.
 
-For a static recording the deck has one step for each sample, else one for the first sample. A body
-with fibres gets a second deck with the cards that Abaqus has for them.
+For a static recording the deck has one step for each sample, else one for the first sample.
 """
 
 from __future__ import annotations
@@ -29,37 +28,24 @@ from .target import (
     comment_lines,
     equilibria,
     longest_displacement_m,
+    require_known_laws,
 )
 
 DECK = "body.inp"
-ABAQUS_DECK = "abaqus.inp"
 # Time after which a run of CalculiX is stopped.
 TIME_LIMIT_S = 600.0
 # Corners of the sides of a tetrahedron in the order of CalculiX.
 TETRAHEDRON_SIDES = (0, 1, 2), (0, 1, 3), (1, 2, 3), (0, 2, 3)
 # Constant D_i that removes a term of U = Σ (J − 1)^2i / D_i: zero would mean a very stiff term.
 ABSENT_TERM = 1e20
-CAPABILITIES = TargetCapabilities(
-    {},
-    other_materials="",
-    mass_damping="",
-    node_forces="",
-    has_quadratic_elements=True,
-    has_fibres=True,
-)
+CAPABILITIES = TargetCapabilities(mass_damping="", node_forces="", has_quadratic_elements=True)
 # Coefficients C_i of the series of Arruda and Boyce.
 _ARRUDA_BOYCE_COEFFICIENTS = (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750)
-# Largest number of terms of Ogden's law and of the foam, and of values on a line.
-MOST_TERMS = 3
 # Largest number of values on a line of a card, by the manual of CalculiX.
 VALUES_PER_LINE = 8
 # Abaqus divides by the exponent k₂ of fibres: that of the quadratic law, which changes the energy by
 # k₂ e² / 2.
 ABAQUS_QUADRATIC = 1e-6
-DISPERSED = (
-    "fibres that scatter are not exported: the exported part is softer along them than the "
-    "identified one"
-)
 FOAM_LIMITATION = (
     "CalculiX 2.20 finds no equilibrium of a HYPERFOAM of one term, or of two with a negative "
     "exponent; the card is that of Abaqus, too"
@@ -70,18 +56,20 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     """Return the input deck, one text file, and what CalculiX cannot express; nothing is written.
 
     The deck has one step for each sample of a static recording, else one for the first sample
-    alone. Damping is not exported. A material that CalculiX does not have becomes a neo-Hookean
-    one, with a sentence on that. A body with fibres has the deck for Abaqus, too, whose comments
-    say what it cannot express.
+    alone. Damping is not exported.
+
+    Raises
+    ------
+    InputError
+        For a law that CalculiX does not have.
     """
-    deck, limits = _deck(body, for_abaqus=False)
-    files = {DECK: deck}
-    if any(isinstance(part.material, ReinforcedMaterial) for part in body.body.parts):
-        files[ABAQUS_DECK], _ = _deck(body, for_abaqus=True)
-    return ExportedFiles(files, limits)
+    require_known_laws(body, "calculix")
+    deck, limits = input_deck(body, for_abaqus=False)
+    return ExportedFiles({DECK: deck}, limits)
 
 
-def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ...]]:
+def input_deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ...]]:
+    """Return the input deck, with the fibres of CalculiX or of Abaqus, and what it cannot express."""
     static = body.experiment.is_static
     limits = replace(
         CAPABILITIES, has_moving_grasps=static, has_moving_obstacles=static
@@ -89,7 +77,7 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
     linear = all(region.material == "linear" for region in body.regions)
     materials = ""
     for k, (region, part) in enumerate(zip(body.regions, body.body.parts, strict=True)):
-        card, limitation = material_card(region, linear, "CalculiX", MOST_TERMS)
+        card, limitation = material_card(region)
         card += "".join(f"** Abaqus: {line}\n" for line in memory_card(region).splitlines())
         name = f"M{k}"
         sections = f"*SOLID SECTION,ELSET=E{k},MATERIAL={name}\n"
@@ -99,8 +87,6 @@ def _deck(body: IdentifiedBody, *, for_abaqus: bool) -> tuple[str, tuple[str, ..
                 card, limitation = abaqus_fibre_card(region, fibres)
                 directions = region.fibre_directions(fibres.families).tolist()
                 sections = _fibre_sections(body, part, k, name, directions)
-            elif fibres.is_dispersed:
-                limitation = f"{limitation}; {DISPERSED}".removeprefix("; ")
             else:
                 name = f"ELASTIC_FIBER{k}"
                 card, limitation = _fibre_card(region, fibres)
@@ -250,46 +236,21 @@ def memory_card(region: IdentifiedRegion) -> str:
     return f"*VISCOELASTIC,TIME=PRONY\n{card}" if card else ""
 
 
-def material_card(
-    region: IdentifiedRegion, is_linear: bool, program: str, most_terms: int
-) -> tuple[str, str]:
-    """Return the card of a law of a program, with at most so many terms in powers of the stretches,
-    and a sentence on what it does not express; that of the matrix of fibres is not used.
-
-    Raises
-    ------
-    InputError
-        If the program has no law with the energy of the material.
+def material_card(region: IdentifiedRegion) -> tuple[str, str]:
+    """Return the card of a law, and a sentence on what it does not express; that of the matrix of
+    fibres is not used.
     """
     c: Mapping[str, float] = region.constants
     volume = 2 / region.kappa_pa
     if region.material in ("st-venant-kirchhoff", "linear"):
-        limitation = ""
-        if region.material == "linear" and not is_linear:
-            limitation = (
-                "in an analysis with large displacements the linear material becomes that of St. "
-                "Venant and Kirchhoff"
-            )
-        return (f"*ELASTIC\n{format_values(region.young_pa, region.poisson)}\n", limitation)
+        return f"*ELASTIC\n{format_values(region.young_pa, region.poisson)}\n", ""
     if region.material == "mooney-rivlin":
         constants = format_values(c["c10_pa"], c["c01_pa"], volume)
         return f"*HYPERELASTIC,MOONEY-RIVLIN\n{constants}\n", ""
-    if region.material in ("yeoh", "gent"):
-        if region.material == "yeoh":
-            factors = (c["c10_pa"], c["c20_pa"], c["c30_pa"])
-            limitation = ""
-        else:
-            mu = c["mu_pa"]
-            limit = c["gent_limit"]
-            factors = mu / 2, mu / (4 * limit), mu / (6 * limit**2)
-            limitation = (
-                "Gent's energy is exported as a series of three terms, accurate for Ī₁ − 3 well "
-                f"below {limit:.4g}"
-            )
-        constants = format_values(
-            factors[0], factors[1], factors[2], volume, ABSENT_TERM, ABSENT_TERM
-        )
-        return f"*HYPERELASTIC,YEOH\n{constants}\n", limitation
+    if region.material == "yeoh":
+        factors = (c["c10_pa"], c["c20_pa"], c["c30_pa"])
+        constants = format_values(*factors, volume, ABSENT_TERM, ABSENT_TERM)
+        return f"*HYPERELASTIC,YEOH\n{constants}\n", ""
     if region.material == "arruda-boyce":
         stretch = c["chain_stretch"]
         slope = sum(
@@ -301,20 +262,13 @@ def material_card(
             "its volumetric energy is ½ κ ((J² − 1)/2 − ln J) instead of ½ κ (J − 1)²: both "
             "agree for small changes of volume"
         )
-    if 0 < len(region.power_terms) <= most_terms:
+    if region.power_terms:
         is_foam = region.material.startswith("hyperfoam")
         return _power_law_card(region, volume), FOAM_LIMITATION if is_foam else ""
-    if not region.material.endswith("neo-hookean"):
-        few = f" of {len(region.power_terms)} terms" if region.power_terms else ""
-        raise InputError(
-            f"{program} has no law with the energy of {region.material}{few}; fit a law that it has, such "
-            "as mooney-rivlin, yeoh, ogden-3 or hyperfoam-3, or export to another format",
-            where=f"region '{region.name}'",
-        )
     constants = format_values(region.mu_pa / 2, volume)
     return f"*HYPERELASTIC,NEO HOOKE\n{constants}\n", (
-        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)²: the same λ and μ "
-        "at small strain, but stresses differ in second order of the strain"
+        "its neo-Hookean energy is that of Ī₁ with ½ κ (J − 1)²: both agree for small changes of "
+        "volume"
     )
 
 
@@ -334,10 +288,10 @@ def _fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
     lines = (values[k : k + VALUES_PER_LINE] for k in range(0, len(values), VALUES_PER_LINE))
     card = "".join(f"{format_values(*line)}\n" for line in lines)
     limitation = (
-        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ (J − 1)², and fibres resist "
-        "their stretch without the change of volume"
+        "its neo-Hookean energy is that of Ī₁ with ½ κ (J − 1)², and fibres resist their stretch "
+        "without the change of volume"
     )
-    return f"*USER MATERIAL,CONSTANTS={len(values)}\n{card}", limitation + _compression(fibres)
+    return f"*USER MATERIAL,CONSTANTS={len(values)}\n{card}", limitation
 
 
 def abaqus_fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, str]:
@@ -356,17 +310,11 @@ def abaqus_fibre_card(region: IdentifiedRegion, fibres: FibreLaw) -> tuple[str, 
         c.get(FIBRE_DISPERSION.name, 0.0),
     )
     limitation = (
-        f"{region.material} becomes the neo-Hookean law of Ī₁ with ½ κ ((J² − 1)/2 − ln J), and "
-        "fibres resist their stretch without the change of volume"
+        "its neo-Hookean energy is that of Ī₁ with ½ κ ((J² − 1)/2 − ln J), and fibres resist their "
+        "stretch without the change of volume"
     )
     keyword = f"*ANISOTROPIC HYPERELASTIC,HOLZAPFEL,LOCAL DIRECTIONS={fibres.families}"
-    return f"{keyword}\n{format_values(*values)}\n", limitation + _compression(fibres)
-
-
-def _compression(fibres: FibreLaw) -> str:
-    if fibres.tension_only:
-        return ""
-    return "; they carry no compression, while the identified ones do"
+    return f"{keyword}\n{format_values(*values)}\n", limitation
 
 
 def _fibre_sections(

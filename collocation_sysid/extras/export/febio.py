@@ -17,30 +17,27 @@ from ...errors import InputError
 from ...fem.laws.constants import FIBRE_DISPERSION, FIBRE_EXPONENT, FIBRE_STIFFNESS
 from ...fem.laws.fibres import FibreLaw, ReinforcedMaterial
 from .identified import IdentifiedBody, IdentifiedRegion
-from .target import ExportedFiles, TargetCapabilities, comment_lines, values_as_text
+from .target import (
+    ExportedFiles,
+    TargetCapabilities,
+    comment_lines,
+    require_known_laws,
+    values_as_text,
+)
 
 MODEL = "body.feb"
-# Law of FEBio with the energy of a material; "linear" has it at small strain.
+# Law of FEBio with the energy of a material.
 LAWS = {
     "neo-hookean": "neo-Hookean",
     "st-venant-kirchhoff": "isotropic elastic",
-    "linear": "isotropic elastic",
     "mooney-rivlin": "Mooney-Rivlin",
     "yeoh": "Yeoh",
     **{f"ogden-{terms}": "Ogden" for terms in range(1, 5)},
 }
-# Laws of which a solid mixture consists, of E and ν.
-COUPLED = ("neo-hookean", "st-venant-kirchhoff", "linear")
 # Most branches of a memory.
 MOST_BRANCHES = 6
 CAPABILITIES = TargetCapabilities(
-    LAWS,
-    "",
-    mass_damping="",
-    node_forces="",
-    has_quadratic_elements=True,
-    has_fibres=True,
-    has_memory=True,
+    mass_damping="", node_forces="", has_quadratic_elements=True, has_memory=True
 )
 # Energy ½ κ (J − 1)² of the change of volume.
 ABAQUS_VOLUME = 2
@@ -82,26 +79,25 @@ OUTPUT = """\
 
 
 def export(body: IdentifiedBody) -> ExportedFiles:
-    """Return the model, one text file, and what FEBio cannot express; nothing is written."""
+    """Return the model, one text file, and what FEBio cannot express; nothing is written.
+
+    Raises
+    ------
+    InputError
+        For a law or a memory that FEBio does not have.
+    """
+    require_known_laws(body, "febio")
     limits = CAPABILITIES.limitations(body)
     limits += [f"{each.name} is not exported" for each in body.obstacles]
     limits.append("damping is not exported: an equilibrium has none")
     materials, domains = "", []
     for region, part in zip(body.regions, body.body.parts, strict=True):
-        if region.material == "linear":
-            limits.append(
-                f"{region.name}: the linear material becomes that of St. Venant and Kirchhoff"
-            )
-        limits += _require_known(region)
+        limits += _memory_limitations(region)
         fibres = None
         groups: list[tuple[Index, Array]] = [(part.cells, np.eye(3))]
         if isinstance(part.material, ReinforcedMaterial):
             fibres = part.material.energy.fibres
             groups = body.fibre_axes(part)
-            if not fibres.tension_only:
-                limits.append(
-                    f"{region.name}: fibres carry no compression, while the identified ones do"
-                )
         for cells, axes in groups:
             number = len(domains) + 1
             materials += _material(number, region, fibres, axes)
@@ -130,27 +126,15 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     return ExportedFiles({MODEL: text}, tuple(limits))
 
 
-def _require_known(region: IdentifiedRegion) -> Iterable[str]:
-    """Refuse what FEBio does not have, and yield what it changes."""
-    where = f"region '{region.name}'"
+def _memory_limitations(region: IdentifiedRegion) -> Iterable[str]:
+    """Refuse a memory that FEBio does not have, and yield what it changes."""
     has_fibres = FIBRE_STIFFNESS.name in region.constants
     is_isochoric = "pressure_model" in _constants(region)
-    if has_fibres and (is_isochoric or region.material not in LAWS):
-        yield (
-            f"{region.name}: beside fibres {region.material} becomes the neo-Hookean energy of the same "
-            "λ and μ at small strain"
-        )
-    elif region.material not in LAWS:
-        raise InputError(
-            f"FEBio has no law with the energy of {region.material}; expected one of "
-            f"{', '.join(LAWS)}: fit one of these, or export to another format",
-            where=where,
-        )
     if len(region.branches) > MOST_BRANCHES or (region.branches and has_fibres):
         raise InputError(
             f"FEBio has no memory of {len(region.branches)} branches with these constants; expected "
             f"at most {MOST_BRANCHES}, without fibres",
-            where=where,
+            where=f"region '{region.name}'",
         )
     if region.branches:
         yield f"{region.name}: the load is applied within 1 s, after which its stress relaxes"
@@ -182,8 +166,7 @@ def _material(number: int, region: IdentifiedRegion, fibres: FibreLaw | None, ax
     names = f'id="{number}" name="M{number}" '
     if fibres is not None:
         constants = {"density": region.density_kg_m3, "E": region.young_pa, "v": region.poisson}
-        matrix = LAWS[region.material] if region.material in COUPLED else "neo-Hookean"
-        solids = _law("solid", matrix, constants)
+        solids = _law("solid", LAWS[region.material], constants)
         solids += "".join(_fibre_solids(region, fibres, axes))
         return f'    <material {names}type="solid mixture">\n{solids}    </material>\n'
     law, constants = LAWS[region.material], _constants(region)

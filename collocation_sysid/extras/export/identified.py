@@ -19,6 +19,7 @@ from ...common.array_types import Array, Index
 from ...errors import InputError, listed, located
 from ...fem.body import Body
 from ...fem.laws.constants import FIBRE_ANGLE
+from ...fem.laws.fibres import ReinforcedMaterial
 from ...fem.laws.moduli import engineering_constants
 from ...fem.laws.ogden import is_power_law, term_numbers
 from ...fem.regions import BodyPart
@@ -377,6 +378,23 @@ class IdentifiedBody:
                 )
             )
         return tuple(regions)
+
+    @cached_property
+    def laws(self) -> tuple[str, ...]:
+        """Name of the law of each of the `regions`: its material and the kind of its fibres."""
+        names = []
+        is_linear = [region.material == "linear" for region in self.regions]
+        for part, region in zip(self.body.parts, self.regions, strict=True):
+            name = region.material
+            if isinstance(part.material, ReinforcedMaterial):
+                fibres = part.material.energy.fibres
+                kind = "dispersed fibres" if fibres.is_dispersed else "fibres"
+                name += f" with {kind}"
+                name += "" if fibres.tension_only else " that carry compression"
+            elif region.material == "linear" and not all(is_linear):
+                name += " beside other laws"  # large displacements are those of the whole body
+            names.append(name)
+        return tuple(names)
 
     def fibre_axes(self, part: BodyPart) -> list[tuple[Index, Array]]:
         """Return the elements of a part with fibres by their axes: for each axes (3, 3) in the

@@ -26,6 +26,7 @@ from .target import (
     TargetCapabilities,
     comment_lines,
     linear_tetrahedra,
+    require_known_laws,
     values_as_text,
     xml_attribute,
 )
@@ -45,9 +46,6 @@ RELATIVE_DIFFERENCE_STEP = 1e-5
 # Steps of a verified motion: some minutes.
 MAX_STEPS = 2_000_000
 CAPABILITIES = TargetCapabilities(
-    {"st-venant-kirchhoff": "flex"},
-    "a flex has the law of St. Venant and Kirchhoff; {material} has the same E and ν at small "
-    "strain, but stresses differ in second order of the strain",
     stiffness_damping='the damping of a flex is the law "material", γ_r (λ tr(Ė) I + 2 μ Ė); '
     "{damping} agrees with it at small strain",
     mass_damping="mass-proportional damping, γ_m = {gamma_m_1_s:.4g} 1/s, is not supported, and MuJoCo "
@@ -66,13 +64,14 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     Raises
     ------
     InputError
-        For grasps that hold single axes, or not during the whole recording.
+        For another law, or for grasps that hold single axes, or not during the whole recording.
     """
     if body.experiment.specimen is not None:
         raise InputError(
             "a test of a specimen has no body that moves; export its constants with --to json or "
             "calculix, also with --samples, or export a recording of a body"
         )
+    require_known_laws(body, "mujoco")
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         if grasp.axes != "xyz" or not grasp.is_active(body.experiment.t_s).all():
             raise InputError(

@@ -24,13 +24,12 @@ from .target import (
     equilibria,
     linear_tetrahedra,
     longest_displacement_m,
+    require_known_laws,
 )
 
 MODULE_FILE = "body.py"
 DATA_FILE = "body.json"
 CAPABILITIES = TargetCapabilities(
-    {"stable-neo-hookean": "soft mesh"},
-    "{material} becomes the stable neo-Hookean energy of the same λ and μ at small strain",
     stiffness_damping="damping γ_r becomes a viscosity k = γ_r μ / 2 [Pa s] with the stress 4 k Ė, the law "
     '"material" without its part λ tr(Ė): changes of volume are damped less; the identified law '
     "is {damping}",
@@ -143,7 +142,13 @@ def export(body: IdentifiedBody) -> ExportedFiles:
 
     The elastic constants are those of Newton's `SolverVBD`, whose energy is the stable neo-Hookean
     one of λ and μ (Smith, de Goes & Kim 2018).
+
+    Raises
+    ------
+    InputError
+        For another law.
     """
+    require_known_laws(body, "newton")
     cells = []
     constants = []
     for region, own in zip(body.regions, linear_tetrahedra(body), strict=True):

@@ -13,13 +13,33 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ...common.array_types import Array, Index
-from ...errors import printable
+from ...errors import InputError, printable
 from ...fem.meshes.refinement import split_in_eight
 from ...model.forces import Forces
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.simulation import simulate
 from .identified import IdentifiedBody
 
+_CALCULIX = (
+    *("neo-hookean", "st-venant-kirchhoff", "linear", "mooney-rivlin", "yeoh", "arruda-boyce"),
+    *(f"{law}-{terms}" for law in ("ogden", "hyperfoam") for terms in (1, 2, 3)),
+    "neo-hookean with fibres",
+)
+# Laws that each target has, by the names of `IdentifiedBody.laws`; the json file has all. Newton has
+# that of its `SolverVBD`, with which it also reads a stage.
+LAWS: Mapping[str, tuple[str, ...]] = {
+    "mujoco": ("st-venant-kirchhoff",),
+    "newton": ("stable-neo-hookean",),
+    "usd": ("stable-neo-hookean",),
+    "calculix": _CALCULIX,
+    "abaqus": (*_CALCULIX, "ogden-4", "hyperfoam-4", "neo-hookean with dispersed fibres"),
+    "febio": (
+        *("neo-hookean", "st-venant-kirchhoff", "mooney-rivlin", "yeoh"),
+        *(f"ogden-{terms}" for terms in range(1, 5)),
+        *("neo-hookean with fibres", "neo-hookean with dispersed fibres"),
+        *("st-venant-kirchhoff with fibres", "st-venant-kirchhoff with dispersed fibres"),
+    ),
+}
 LINEAR_ONLY = (
     "each quadratic tetrahedron is split into eight linear ones with the same nodes, which are "
     "too stiff in bending and near ν = ½"
@@ -32,11 +52,29 @@ VISCOELASTICITY = (
     "viscoelastic memory is not supported; the exported stiffness is the long-term one, and the "
     "instantaneous one is {at_once:.4g} times that"
 )
-FIBRES = "fibres are not exported: the exported part is softer along them than the identified one"
 MOTION = (
     "grasped nodes are fixed at their positions of the first sample; the motion is in the CSV "
     "files of poses beside this file, and your simulation has to apply it"
 )
+
+
+def require_known_laws(body: IdentifiedBody, target_name: str) -> None:
+    """Refuse a body with a law that a target in `LAWS` does not have.
+
+    Raises
+    ------
+    InputError
+        With the law, those of the target, and the targets that have it.
+    """
+    for region, law in zip(body.regions, body.laws, strict=True):
+        if law not in LAWS[target_name]:
+            others = [f"--to {name}" for name, laws in LAWS.items() if {*body.laws} <= {*laws}]
+            raise InputError(
+                f"{target_name} has no law {law}; expected one of {', '.join(LAWS[target_name])}: solve "
+                "again with such a material, or export with one of "
+                f"{', '.join([*others, '--to json'])}",
+                where=f"region '{region.name}'",
+            )
 
 
 @dataclass(frozen=True)
@@ -80,16 +118,14 @@ class ExportTarget:
 
 @dataclass(frozen=True)
 class TargetCapabilities:
-    """Features of a body that a simulator can express; all others become limitations of an export.
+    """Features of a body beside its law that a simulator can express; all others become limitations
+    of an export.
 
     Attributes
     ----------
-    materials : mapping of str to str
-        Names in the simulator of the materials that it has; all others become what
-        `other_materials` states.
-    other_materials, stiffness_damping, mass_damping : str
-        Sentences on other materials, and on the two kinds of damping; they may contain `{material}`
-        and the names of constants of a region. Empty if the simulator expresses the damping.
+    stiffness_damping, mass_damping : str
+        Sentences on the two kinds of damping, which may contain the names of constants of a region.
+        Empty if the simulator expresses the damping.
     damping_law : str
         Name of the damping law that the simulator has, for which no sentence is needed.
     has_moving_grasps, has_moving_obstacles, has_quadratic_elements : bool
@@ -97,14 +133,12 @@ class TargetCapabilities:
         (which are split otherwise).
     node_forces, point_masses : str
         Sentences for forces and for point masses on nodes; empty if the simulator has them.
-    has_fibres, has_memory : bool
-        Whether it has fibres beside a material, and branches of a memory.
+    has_memory : bool
+        Whether it has branches of a memory.
     has_rounded_edges, has_face_selection : bool
         Whether obstacles may have rounded edges, and be limited to some faces of the body.
     """
 
-    materials: Mapping[str, str]
-    other_materials: str
     stiffness_damping: str = ""
     mass_damping: str = "γ_m = {gamma_m_1_s:.4g} 1/s is not supported"
     damping_law: str = ""
@@ -113,7 +147,6 @@ class TargetCapabilities:
     node_forces: str = "forces on nodes are not exported"
     point_masses: str = ""
     has_quadratic_elements: bool = False
-    has_fibres: bool = False
     has_memory: bool = False
     has_rounded_edges: bool = True
     has_face_selection: bool = True
@@ -131,8 +164,6 @@ class TargetCapabilities:
             damped = bool(region.gamma_r_s)
             templates = [
                 *[VISCOELASTICITY] * (bool(region.branches) and not self.has_memory),
-                *[FIBRES] * ("fibre_pa" in region.constants and not self.has_fibres),
-                *[self.other_materials] * (region.material not in self.materials),
                 *[self.stiffness_damping] * (damped and region.damping != self.damping_law),
                 *[self.mass_damping] * bool(region.gamma_m_1_s),
             ]

@@ -27,14 +27,12 @@ from .target import (
     TargetCapabilities,
     comment_lines,
     linear_tetrahedra,
+    require_known_laws,
 )
 
 STAGE_FILE = "body.usda"
 ATTRIBUTE_NAMESPACE = "collocationSysid"
 CAPABILITIES = TargetCapabilities(
-    {},
-    "the simulator chooses the energy for E and ν instead of {material}: in Newton it is the "
-    "stable neo-Hookean law",
     stiffness_damping="damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
     mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
     "attribute",
@@ -45,6 +43,10 @@ CAPABILITIES = TargetCapabilities(
     has_face_selection=False,
 )
 SINGLE_PRECISION = "numbers are single precision"
+READERS_LAW = (
+    "the stage states E and ν, and its reader chooses the law: Newton has stable-neo-hookean, the "
+    "identified one"
+)
 REGIONS = (
     "regions are subsets of tetrahedra, each with its material; a simulator with one material "
     "per body, such as Newton 1.8, uses that of the largest"
@@ -70,10 +72,11 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     Raises
     ------
     InputError
-        If usd-core is not installed.
+        For another law than that of Newton, or if usd-core is not installed.
     """
+    require_known_laws(body, "usd")
     pxr = _import_usd()
-    limits = [*CAPABILITIES.limitations(body), SINGLE_PRECISION]
+    limits = [*CAPABILITIES.limitations(body), READERS_LAW, SINGLE_PRECISION]
     limits += [REGIONS] * (len(body.regions) > 1)
     limits += [SINGLE_AXES] * bool(
         (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any()
