@@ -1,7 +1,7 @@
 """Run a script of one of the folders; scripts import those of the other folders by name.
 
 python scripts                                # list of all scripts
-python scripts study_table1 --time-s 600
+python scripts study_starts --starts 20
 """
 
 from __future__ import annotations

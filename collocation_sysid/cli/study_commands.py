@@ -19,7 +19,7 @@ from ..errors import InputError
 from ..extras.studies import PlannedRun, RunOptions, Starts, plan_comparison, plan_models, run_all
 from ..extras.studies.arguments import parse_methods, read_truth
 from ..extras.studies.model_variants import models, parse_branches, parse_dampings, parse_materials
-from ..extras.studies.planning import METHOD_STUDY, MODEL_STUDY, STUDY_TITLES
+from ..extras.studies.planning import COMPARED_METHODS, METHOD_STUDY, MODEL_STUDY, STUDY_TITLES
 from ..extras.studies.rows import SuccessCriterion
 from ..extras.studies.run_execution import Record
 from ..problem import Problem
@@ -28,6 +28,8 @@ from .common import error_console, interruption_exit, print_result, shown_progre
 
 commands = typer.Typer()
 
+# Time limit of each run of a comparison of methods [s].
+METHOD_TIME_LIMIT_S = 60.0
 # Largest number of failures on the terminal; summary.md lists all.
 SHOWN_FAILURES = 8
 
@@ -49,14 +51,20 @@ class StudyOptions:
 
 @command(
     commands,
+    "compare-methods problem.toml --truth truth.toml",
     "compare-methods problem.toml --methods reduced-space,shooting --starts 40",
-    "compare-methods problem.toml --methods penalty,interior-point --truth truth.toml",
+    "compare-methods problem.toml --methods 'penalty rho=1e4,penalty rho=1e6'",
 )
 def compare_methods(
     *,
     methods: Annotated[
-        str, option("Methods to compare, each with its options in the problem file.", "A,B,…")
-    ],
+        str,
+        option(
+            "Methods to compare, with their options in the problem file, or KEY=VALUE after the "
+            "name; by default the penalty method of the paper and six others.",
+            "A,B,…",
+        ),
+    ] = COMPARED_METHODS,
     starts: Starts,
     truth: Annotated[
         list[str] | None, option("True parameters: a TOML file, or values.", "FILE|NAME=VALUE")
@@ -69,10 +77,11 @@ def compare_methods(
     source: ProblemOptions,
     output: OutputOptions,
 ) -> None:
-    """Compare methods from several initial guesses by success, accuracy and time.
+    """Compare methods by success, violation of the equations of motion, and time.
 
-    All methods solve the same problem from the same guesses. To compare the materials, damping laws
-    or branches of a body, use the command compare-models.
+    All methods solve the same problem from the same guesses. The picture shows the violations over
+    time, and the error of a forward simulation with the estimates of each method. To compare the
+    materials, damping laws or branches of a body, use the command compare-models.
     """
     named = parse_methods(methods)
     problem = source.read_problem(output.quiet)
@@ -86,6 +95,8 @@ def compare_methods(
         truth=known,
         allow_code=source.allow_code,
     )
+    limit_s = study.limits.time_limit_s or METHOD_TIME_LIMIT_S
+    study = replace(study, limits=replace(study.limits, time_limit_s=limit_s))
     _run_study(
         METHOD_STUDY, planned, study, source, output, yardstick=SuccessCriterion(known, within)
     )
@@ -199,7 +210,7 @@ def _run_study(
                 report.records[run.label] = record
                 progress.count_run(run, record)
 
-            run_all(planned, study.limits, count)
+            run_all(planned, study.limits, count, progress.show_iteration)
     except KeyboardInterrupt:
         is_complete = False
     if report.records:

@@ -228,7 +228,7 @@ class SolveProgress(Watched):
 
     def _redraw(self) -> None:
         table = on_terminal(_iteration_table(self._lines))
-        self.update(Group(table, _RefreshedText(self._activity_with_time)))
+        self.update(Group(table, RefreshedText(self._activity_with_time)))
 
     def _activity_with_time(self) -> str:
         """Return the current activity with its share and remaining time, or its elapsed time."""
@@ -252,7 +252,7 @@ class SolveProgress(Watched):
 
 
 @dataclass(frozen=True)
-class _RefreshedText:
+class RefreshedText:
     """Text of a live display that is computed whenever the display is refreshed."""
 
     text: Callable[[], str]  # returns the text

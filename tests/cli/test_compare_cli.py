@@ -11,37 +11,40 @@ from types import SimpleNamespace
 
 import pytest
 from kit.problem_files import TRUTH, Outcome, run_command, state_vacuum, write_problem
-from kit.results import a_result
 from matplotlib.image import imread
 from rich.console import Console
 
 from collocation_sysid.cli import study_commands
-from collocation_sysid.common.serialisation import as_json
 from collocation_sysid.extras.studies import progress as display
 from collocation_sysid.extras.studies import run_execution
-from collocation_sysid.methods.solution import Iteration
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
 METHODS = ("interior-point", "reduced-space")
 # Answers with the guess, as a run that did not move; the second start never ends.
 STAND_IN = """
-import json, sys
+import json, os, sys
 planned, out = json.loads(sys.stdin.readline()), sys.argv[-1]
 if planned["start"] == 1:
+    with open(os.path.join(os.path.dirname(out), "iteration.json"), "w") as file:
+        json.dump({"number": 12, "loss": 345.0, "violation_n": 0.067}, file)
     sys.stdin.read()
 record = {
     "outcome": "finished",
     "message": "Converged.",
-    "result": json.loads(sys.argv[1]),
-}
-record["result"]["parameters"] = {
-    name: like | {"value": guess}
-    for like in record["result"]["parameters"].values() for name, guess in planned["guess"].items()
+    "fit": json.loads(sys.argv[1]) | {"parameters": planned["guess"]},
 }
 with open(out, "w") as file:
     json.dump(record, file)
 """
-HISTORY = tuple(Iteration(k, 10.0 / k, 1e-3, 10.0**-k, {}, 0.1 * k, 1.0) for k in (1, 2))
+FIT = {
+    "status": "converged",
+    "converged": True,
+    "loss": 2.0,
+    "violation_n": 1e-3,
+    "iterations": 7,
+    "total_s": 1.5,
+    "violation": ([0.0, 0.1], [0.0, 1e-3]),
+}
 
 
 @pytest.fixture
@@ -49,8 +52,7 @@ def stand_in(tmp_path, monkeypatch):
     """Replaces the runs' processes."""
     script = tmp_path / "stand_in.py"
     script.write_text(STAND_IN)
-    found = as_json(a_result(history=HISTORY))
-    monkeypatch.setattr(run_execution, "COMMAND", (sys.executable, str(script), found))
+    monkeypatch.setattr(run_execution, "COMMAND", (sys.executable, str(script), json.dumps(FIT)))
 
 
 def drawn(folder: Path) -> set[str]:
@@ -105,7 +107,7 @@ def test_the_summary_has_a_row_for_each_method(compared):
     assert [row["method"] for row in rows] == list(METHODS)
     for row in rows:
         assert (row["runs"], row["successes"]) == (2, 2)
-        numbers = ("violation_n", "violation_relative", "rms_m", "iterations", "total_s")
+        numbers = ("loss", "violation_n", "forward", "iterations", "total_s")
         assert all(row[name] >= 0 for name in numbers)
         assert all(row[f"error_{name}"] < 1e-4 for name in TRUTH)
 
@@ -115,7 +117,7 @@ def test_the_table_fits_a_terminal_and_the_picture_is_drawn(compared):
     lines = compared.first.out.splitlines()
     assert lines[0] == "Methods"
     assert max(len(line) for line in lines if "written to" not in line) <= 90
-    assert drawn(compared.out) == {"convergence"}
+    assert drawn(compared.out) == {"methods"}
     text = (compared.out / "summary.md").read_text()
     assert "| interior-point | 2/2 |" in text
     assert "within 1 % of the truth" in text
@@ -141,7 +143,16 @@ def test_a_late_run_is_a_row(tiny, stand_in):
     content = json.loads(compare(*words, "--json").out)
     assert [row["status"] for row in content["runs"]] == ["converged", "timeout", "converged"]
     (summary,) = content["methods"]
-    assert (summary["runs"], summary["converged"], summary["rms_m"]) == (3, 2, 0.001)
+    assert (summary["runs"], summary["converged"], summary["loss"]) == (3, 2, 2.0)
+    late_row = content["runs"][1]
+    assert (late_row["loss"], late_row["violation_n"]) == (345.0, 0.067)
+
+
+def test_progress_has_the_last_iteration_of_a_running_run(tiny, stand_in):
+    outcome = compare("--starts", 2, "--time-limit", 1, "--workers", 1)
+    assert "start 0 converged" in outcome.err
+    assert "start 1 timeout in" in outcome.err
+    assert ": loss 345, violation 0.067 N\n" in outcome.err
 
 
 def test_an_interrupted_study_keeps_the_finished_rows(tiny, stand_in, monkeypatch):
@@ -200,6 +211,11 @@ def test_a_dry_run_only_lists_the_runs(tiny):
             ["compare-methods", "problem.toml", "--methods", "interior"],
             "did you mean 'interior-point'?",
         ),
+        (
+            ["compare-methods", "problem.toml", "--methods", "reduced-space penalty"],
+            "found 'penalty' after reduced-space; expected options KEY=VALUE, and a comma before",
+        ),
+        (["compare-methods", "problem.toml", "--methods", "penalty ro=1"], "did you mean 'rho'?"),
         (
             ["compare-methods", "nowhere.toml", "--methods", "reduced-space"],
             "there is no such file",

@@ -5,53 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import study_faults
-import study_table1
 from assumed_twins import _body
-from studies import PARAMETER_SYMBOLS, TRUTH, markdown, run_variants
+from studies import markdown
 
 from collocation_sysid.statistics.budget.shape_error import thickness_m
 
 pytestmark = pytest.mark.long
 
 
-def cells(table: str) -> list[list[str]]:
-    """Rows of a Markdown table, without its head and rule."""
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.split("\n")][2:]
-
-
-def row(**changes) -> dict:
-    """What a study knows of a run that found the truth."""
-    found = {f"value_{name}": value for name, value in TRUTH.items()}
-    errors = {f"error_{name}": 0.0 for name in TRUTH}
-    numbers = dict.fromkeys(("rms_m", "violation_n", "violation_relative"), 0.0)
-    rest = {"iterations": 8, "total_s": 1.0, "wall_s": 3.0, "converged": True}
-    return {**found, **errors, **numbers, **rest, "status": "converged", **changes}
-
-
-# Table I ------------------------------------------------------------------------------------------
-
-
-def test_table_1_sets_every_method_beside_truth_and_paper():
-    stopped = row(rms_m=None, total_s=None, status="timeout")
-    lines = cells(study_table1.table({"one": row(), "other": stopped}))
-    truth, paper, one, other = lines
-    assert {len(line) for line in lines} == {11}
-    assert one[1:5] == truth[1:5] == ["200", "300", "0.009", "1"]
-    assert paper[1] == "734.3"
-    assert (other[5], other[-1]) == ("–", "timeout")
-
-
-def test_table_1_names_options_that_the_methods_have(monkeypatch):
-    monkeypatch.setattr("studies.run_all", lambda *_, **__: None)
-    rows = run_variants(study_table1.PROBLEM, study_table1.VARIANTS)
-    assert list(rows) == [each.name for each in study_table1.VARIANTS]
-
-
 def test_tables_are_markdown():
-    assert (
-        markdown(("a", *PARAMETER_SYMBOLS[:1]), [("x", "1")])
-        == "| a | λ |\n| --- | ---: |\n| x | 1 |"
-    )
+    assert markdown(("a", "λ"), [("x", "1")]) == "| a | λ |\n| --- | ---: |\n| x | 1 |"
 
 
 # Faults -------------------------------------------------------------------------------------------

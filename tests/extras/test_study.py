@@ -9,9 +9,7 @@ import sys
 import numpy as np
 import pytest
 from kit.problem_files import TRUTH
-from kit.results import a_result, value
 
-from collocation_sysid.common.serialisation import as_json, content
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.studies import (
     PlannedRun,
@@ -25,7 +23,6 @@ from collocation_sysid.extras.studies import (
 from collocation_sysid.extras.studies.arguments import parse_methods, read_truth
 from collocation_sysid.extras.studies.rows import SuccessCriterion, method_rows, run_row
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.problem import Problem
 
 NAMES = tuple(TRUTH)
@@ -120,6 +117,17 @@ def test_every_method_has_the_same_starts(tiny):
     assert planned[0].guess == {item.name: item.guess for item in problem.parameters.free}
 
 
+def test_options_of_a_method_are_overrides(tiny):
+    problem = Problem.read("problem.toml")
+    methods = parse_methods("penalty rho=1e4 inner=levenberg-marquardt,penalty")
+    several, alone = plan_comparison(problem, methods)
+    options = ["solver.penalty.rho=1e4", "solver.penalty.inner=levenberg-marquardt"]
+    assert list(several.overrides) == [*alone.overrides, *options]
+    assert several.label == "penalty rho=1e4 inner=levenberg-marquardt, start 0"
+    solver = Problem.read("problem.toml", several.overrides).solver("penalty")
+    assert (solver.rho, solver.inner) == (1e4, "levenberg-marquardt")
+
+
 def test_more_starts_are_further_ones(tiny):
     problem = Problem.read("problem.toml")
     few, many = (plan_comparison(problem, ["reduced-space"], (), Starts(n)) for n in (2, 5))
@@ -192,7 +200,7 @@ OBEDIENT = """
 import json, pathlib, signal, sys
 file, ready = map(pathlib.Path, (sys.argv[-1], sys.argv[-2]))
 def end(*_, **__):
-    file.write_text(json.dumps({"outcome": "finished", "result": json.loads(sys.argv[1])}))
+    file.write_text(json.dumps({"outcome": "finished", "fit": json.loads(sys.argv[1])}))
     sys.exit()
 signal.signal(signal.SIGTERM, end)
 ready.touch()
@@ -203,7 +211,7 @@ signal.pause()
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     ready = tmp_path / "ready"
-    found = as_json(a_result(status="interrupted", converged=False))
+    found = json.dumps({"status": "interrupted", "converged": False, "parameters": {}})
     monkeypatch.setattr(
         run_execution, "COMMAND", (sys.executable, "-c", OBEDIENT, found, str(ready))
     )
@@ -211,7 +219,7 @@ def test_a_late_run_keeps_the_answer_that_it_had(tmp_path, monkeypatch):
     planned = planned_runs(1)[0]
     record = run_execution.execute(planned, time_limit_s=10.0)
     assert record["outcome"] == "timeout"
-    assert record["result"] == json.loads(found)
+    assert record["fit"] == json.loads(found)
     assert run_row(planned, record, SuccessCriterion())["status"] == "timeout"
 
 
@@ -275,15 +283,13 @@ def test_limits_that_cannot_be_are_refused(options, where):
 
 def answer(run: PlannedRun, factor: float = 1.0, status: str = "converged") -> dict:
     """A record as a run's process writes it, off by a factor."""
-    values = {name: value(factor * true) for name, true in TRUTH.items()}
-    found = a_result(
-        values,
-        status=status,
-        converged=status == "converged",
-        iterations=7,
-        history=(Iteration(1, factor, 1e-3, 1e-9, {}, 0.1, 1.0),),
-    )
-    return {**run.as_dict(), "outcome": "finished", "result": content(found)}
+    fit = {
+        "status": status,
+        "converged": status == "converged",
+        "parameters": {name: factor * true for name, true in TRUTH.items()},
+        "iterations": 7,
+    }
+    return {**run.as_dict(), "outcome": "finished", "fit": fit}
 
 
 def test_success_needs_convergence_and_the_truth():

@@ -22,22 +22,31 @@ def unique_items(text: str) -> tuple[str, ...]:
 
 
 def parse_methods(text: str, option: str = "--methods") -> tuple[str, ...]:
-    """Return names of methods from text separated by commas, each once.
+    """Return methods from text separated by commas, each once: a name, which options KEY=VALUE of
+    the method may follow, such as "penalty inner=levenberg-marquardt".
 
     Raises
     ------
     InputError
-        If there is no name, or for an unknown one, with the most similar known one; it refers to
-        the command-line `option`.
+        If there is no name, or for an unknown one, with the most similar known one, or a word that
+        is no option; it refers to the command-line `option`.
     """
-    names = unique_items(text)
-    if not names:
+    methods = unique_items(text)
+    if not methods:
         raise InputError(
             f"found no name; expected some of {', '.join(METHODS)}", None, where=option
         )
-    for name in names:
+    for name, *options in map(str.split, methods):
         require_method(name, option)
-    return names
+        for word in options:
+            if not all(word.partition("=")):
+                raise InputError(
+                    f"found {word!r} after {name}; expected options KEY=VALUE, and a comma before "
+                    "another method",
+                    None,
+                    where=option,
+                )
+    return methods
 
 
 def read_truth(

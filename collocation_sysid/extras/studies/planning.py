@@ -25,6 +25,12 @@ from .model_variants import ModelVariant
 METHOD_STUDY = "compare-methods"
 MODEL_STUDY = "compare-models"
 STUDY_TITLES = {METHOD_STUDY: "Comparison of methods", MODEL_STUDY: "Comparison of models"}
+# Methods that are compared by default: that of the paper, those of the literature, and those that the
+# package recommends; interior point without a solution by reduced space as its start.
+COMPARED_METHODS = (
+    "penalty schedule=constant,penalty,penalty inner=levenberg-marquardt,augmented-lagrangian,shooting,"
+    "casadi:sqpmethod,interior-point initial=simulation,reduced-space"
+)
 # Largest number of starts: more would be a mistake.
 MOST_STARTS = 10_000
 
@@ -34,7 +40,7 @@ class PlannedRun:
     """One run of a study."""
 
     problem: str  # absolute path of the problem file
-    method: str
+    method: str  # name, and in a comparison of methods options KEY=VALUE, separated by spaces
     start: int = 0  # number of the start; 0 is the file's guess
     overrides: tuple[str, ...] = ()  # overrides "key=value"
     # mapping of str to float or None: guesses of the estimated parameters; None where there is
@@ -130,7 +136,7 @@ def plan_comparison(
     allow_code: bool = False,
 ) -> list[PlannedRun]:
     """Return a run of every method from every start; all methods have the same starts and time
-    grid.
+    grid. `methods` are those of `parse_methods`.
 
     An automatic number of substeps is replaced by the problem's first one, so that the methods do
     not choose their own. Runs are ordered by start, then by method.
@@ -165,12 +171,12 @@ def plan_comparison(
     planned = []
     for start in range(starts.starts):
         start_overrides = [*overrides, *starts.overrides(problem, truth or {}, start=start)]
-        file, _ = read_problem_file(problem.path, start_overrides)
-        details = {"start": start, "allow_code": allow_code}
-        planned += [
-            _planned_run(problem.path, file, method=method, overrides=start_overrides, **details)
-            for method in methods
-        ]
+        for method in methods:
+            name, *options = method.split()
+            own = [*start_overrides, *(f"solver.{name}.{option}" for option in options)]
+            file, _ = read_problem_file(problem.path, own)
+            details = {"start": start, "allow_code": allow_code}
+            planned.append(_planned_run(problem.path, file, method, own, **details))
     return planned
 
 

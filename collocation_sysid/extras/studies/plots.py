@@ -1,4 +1,4 @@
-"""Pictures of a study: convergence of methods, and predictions and estimates of models."""
+"""Pictures of a study: violations by methods, and predictions and estimates of models."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from ...common.display import readable_stress
-from ...common.serialisation import read
 from ...fem.laws.constants import is_damping, unit_of, without_region
 from ...result.figure_style import (
     BLUE,
@@ -18,67 +17,67 @@ from ...result.figure_style import (
     LINE_PT,
     PAGE_MM,
     VERMILION,
-    add_legend_above,
-    format_plain_numbers,
+    add_figure_legend,
     make_log_axis,
     new_figure,
     own_settings,
     style_axes,
     symbol_as_mathtext,
 )
-from ...runs.result_content import Result
+from .model_choice import display_unit
 from .rows import Row
 from .run_execution import Record
 
 # Moduli at small strain, which mean the same in every law, as damping coefficients do.
 MODULI = ("young_pa", "poisson")
+# Styles of lines that lie on each other.
+LINE_STYLES = ("-", "--", "-.", ":")
 
 
 @own_settings()
-def convergence_figure(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure | None:
-    """Return a figure of loss and violation of the equations of motion against time [s], a line per
-    run and a colour per method; values that are not positive are left out. None if no run has a
-    result.
+def method_figure(rows: Sequence[Row], records: Mapping[str, Record]) -> Figure | None:
+    """Return a figure of the violation of the equations of motion over the time of the first
+    recording, and of the error of the forward simulation, a line per run and a colour per method.
+    None if no run has an answer.
 
     Parameters
     ----------
     rows : sequence of Row
         Rows of `run_row`, one for each run, also for missing ones.
     records : mapping of label of the run to Record
-        Records, at least of the runs with a result, with its history.
+        Records, at least of the runs with an answer.
     """
-    runs_of_method: dict[str, list[Row]] = {}
+    answers: dict[str, list[Any]] = {}
     for row in rows:
-        if row["rms_m"] is not None:
-            runs_of_method.setdefault(row["method"], []).append(row)
-    if not runs_of_method:
+        if fit := records.get(row["label"], {}).get("fit"):
+            answers.setdefault(row["method"], []).append(fit)
+    if not answers:
         return None
-    figure = new_figure(PAGE_MM, 70)
-    panels = figure.subplots(1, 2)
-    for number, (method, runs) in enumerate(runs_of_method.items()):
-        colour = COLOUR_CYCLE[number % len(COLOUR_CYCLE)]
-        style: dict[str, Any] = {"color": colour, "lw": LINE_PT, "marker": ".", "ms": 3}
-        for k, row in enumerate(runs):
-            history = read(Result, records[row["label"]]["result"]).history
-            times = [line.time_s for line in history]
-            for axes, name in zip(panels, ("loss", "violation_n"), strict=True):
-                values = np.array([getattr(line, name) for line in history], dtype=float)
-                values[~(values > 0)] = np.nan
-                label = None if k else method
-                axes.plot(times, values, label=label, alpha=max(0.2, len(runs) ** -0.5), **style)
-    style_axes(panels[0], "Loss", xlabel="time [s]", ylabel="Σ (residual / σ)²")
-    style_axes(
-        panels[1],
-        "Violation of the equations of motion",
-        xlabel="time [s]",
-        ylabel="largest residual [N]",
-    )
-    for axes in panels:
+    found = [fit for fits in answers.values() for fit in fits]
+    factor, unit = display_unit(next((fit["unit"] for fit in found if "unit" in fit), ""))
+    # Name in the record, factor, title, and label of each panel; a simulation may have failed.
+    panels = [
+        ("violation", 1.0, "Violation of the equations of motion", "largest residual [N]"),
+        ("simulation", factor, "Forward simulation with the estimates", f"RMS error [{unit}]"),
+    ][: 1 + any("simulation" in fit for fit in found)]
+    figure = new_figure(PAGE_MM, 85)
+    subplots = figure.subplots(1, len(panels), sharex=True, squeeze=False)[0]
+    for axes, (name, scale, title, label) in zip(subplots, panels, strict=True):
+        for number, (method, fits) in enumerate(answers.items()):
+            for k, fit in enumerate(fits):
+                t_s, values = np.array(fit.get(name, ([], [])), dtype=float)
+                axes.plot(
+                    t_s,
+                    scale * np.where(values > 0, values, np.nan),
+                    label=None if k else method,
+                    color=COLOUR_CYCLE[number % len(COLOUR_CYCLE)],
+                    ls=LINE_STYLES[number % len(LINE_STYLES)],
+                    lw=LINE_PT,
+                    alpha=max(0.2, len(fits) ** -0.5),
+                )
+        style_axes(axes, title, "time [s]", label)
         make_log_axis(axes)
-        axes.set_xscale("log", nonpositive="mask")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
-        format_plain_numbers(axes.xaxis)
-    add_legend_above(panels[0], 3, height=1.1)
+    add_figure_legend(figure, 3)
     return figure
 
 

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any
 
 import numpy as np
 
-from ...common.serialisation import read
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
-from ...runs.result_content import Result
 from .planning import PlannedRun
 from .run_execution import TIMEOUT, Record
 
 Row = dict[str, Any]
 
-# Quality and cost of a run, from its result.
-NUMBERS: dict[str, Callable[[Result], float | None]] = {
-    "rms_m": lambda r: r.fit.rms_m,
-    "violation_n": lambda r: r.dynamics.max_violation_n,
-    "violation_relative": lambda r: r.dynamics.max_violation_relative,
-    "iterations": lambda r: r.iterations,
-    "total_s": lambda r: r.timing_s.total,
-}
+# Quality and cost of a run: loss Σ (residual / σ)² with priors, largest residual of the equations of
+# motion [N], RMS difference between the forward simulation and the measurements, in their unit.
+NUMBERS = ("loss", "violation_n", "forward", "iterations", "total_s")
 
 
 @validated
@@ -59,8 +52,8 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
     """Return one run as a flat row; values are None if they are not known or NaN.
 
     The columns are "label", "method", "start", "status", "converged", "success", those of the
-    parameters, the names in `NUMBERS` (quality and cost, such as "rms_m"),
-    "wall_s" and "message". The columns of the parameters are ``guess_NAME``,
+    parameters, the names in `NUMBERS` (quality and cost), "unit" (of "forward"), "wall_s" and
+    "message". The columns of the parameters are ``guess_NAME``,
     ``value_NAME``, and ``error_NAME`` (relative to the truth, only for parameters whose truth is
     known).
 
@@ -74,43 +67,35 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         Criterion of success. A run that exceeded its time limit counts as not converged.
     """
     record = record or {"outcome": "missing", "message": "not run yet"}
-    result: Result | None = read(Result | None, record.get("result"))
+    fit: Row = record.get("fit") or {}
     is_timeout = record["outcome"] == TIMEOUT
-    converged = result is not None and result.converged and not is_timeout
-    parameters = _parameter_columns(run, result, truth=yardstick.truth)
-    errors = [parameters[f"error_{name}"] for name in run.guess if name in yardstick.truth]
-    is_accurate = all(error is not None and error <= yardstick.within for error in errors)
-    numbers = {name: None if result is None else number(result) for name, number in NUMBERS.items()}
+    converged = fit.get("converged", False) and not is_timeout
+    estimates: Mapping[str, float] = fit.get("parameters", {})
+    values = {f"value_{name}": estimates.get(name) for name in run.guess}
+    errors = {
+        f"error_{name}": abs(estimates[name] / yardstick.truth[name] - 1) if estimates else None
+        for name in run.guess
+        if name in yardstick.truth
+    }
+    is_accurate = all(error is not None and error <= yardstick.within for error in errors.values())
+    # A run without an answer has the numbers of its last iteration.
+    reached = {**(record.get("iteration") or {}), **fit}
     row = {
         "label": run.label,
         "method": run.method,
         "start": run.start,
-        "status": record["outcome"] if is_timeout or result is None else result.status,
+        "status": record["outcome"] if is_timeout or not fit else fit["status"],
         "converged": converged,
         "success": converged and is_accurate,
-        **parameters,
-        **numbers,
+        **{f"guess_{name}": guess for name, guess in run.guess.items()},
+        **values,
+        **errors,
+        **{name: reached.get(name) for name in NUMBERS},
+        "unit": fit.get("unit"),
         "wall_s": record.get("wall_s"),
         "message": record.get("message", ""),
     }
     return {key: None if each != each else each for key, each in row.items()}  # NaN is no number
-
-
-def _parameter_columns(run: PlannedRun, result: Result | None, truth: Mapping[str, float]) -> Row:
-    """First ``guess_NAME`` of all, then ``value_NAME`` and ``error_NAME`` of each."""
-    row: Row = {}
-    estimates = {} if result is None else result.parameters
-    for name, guess in run.guess.items():
-        known = estimates[name].guess if name in estimates else None
-        row[f"guess_{name}"] = known if guess is None else guess
-    for name in run.guess:
-        estimate = estimates.get(name)
-        # Methods are compared by the optimum that they find, not by its correction.
-        value = estimate and (estimate.value if estimate.optimum is None else estimate.optimum)
-        row[f"value_{name}"] = value
-        if name in truth:
-            row[f"error_{name}"] = None if value is None else abs(value / truth[name] - 1)
-    return row
 
 
 def error_columns(rows: Sequence[Row]) -> list[str]:
@@ -149,5 +134,6 @@ def _method_summary(method: str, rows: Sequence[Row]) -> Row:
         "runs": len(done),
         "converged": sum(row["converged"] for row in done),
         "successes": successes,
+        "unit": next((row["unit"] for row in done if row["unit"]), ""),
         **{name: float(np.median(each)) if each else None for name, each in known.items()},
     }

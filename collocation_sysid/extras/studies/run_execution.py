@@ -40,6 +40,9 @@ ONE_THREAD = {
         "VECLIB_MAXIMUM_THREADS",
     )
 }
+Record = dict[str, Any]
+# Called with a run and its last `Iteration` as a dictionary.
+OnIteration = Callable[[PlannedRun, Record], None]
 # Interval at which a process is checked [s], too short for a person to notice.
 LOOK_EVERY_S = 0.2
 # Time after the time limit in which a run may still write the best iterate [s].
@@ -50,6 +53,7 @@ def execute(
     planned: PlannedRun,
     time_limit_s: float | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
+    on_iteration: OnIteration = lambda *_: None,
 ) -> Record:
     """Execute a run in its own process and return its record, whatever happens to the process.
 
@@ -60,20 +64,39 @@ def execute(
         not. The record then contains the best iterate, if there is one. No limit by default.
     is_stopped : callable
         Function that is called now and then; the process is killed once it returns true.
+    on_iteration : callable
+        Function that is called now and then with the last iteration.
 
     Returns
     -------
     dict
         The record of `run_worker.record_of_run` (of a process that was stopped, crashed or exceeded
-        the limit at least "outcome" and "message"), and its "wall_s" [s].
+        the limit at least "outcome" and "message"), its "wall_s" [s], and its last "iteration".
     """
     began = time.monotonic()
-    record = _record(planned.as_dict(), time_limit_s, stopped=is_stopped)
-    return {**record, "wall_s": time.monotonic() - began}
+    iteration: Record = {}
+
+    def note(file: Path) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            latest = json.loads(iteration_file(file).read_text(encoding="utf-8"))
+            if latest != iteration:
+                iteration.update(latest)
+                on_iteration(planned, latest)
+
+    record = _record(planned.as_dict(), time_limit_s, is_stopped, note)
+    return {**record, "wall_s": time.monotonic() - began, "iteration": iteration}
+
+
+def iteration_file(record: Path) -> Path:
+    """Return the file of the last iteration of the run that writes its record to a file."""
+    return record.with_name("iteration.json")
 
 
 def _record(
-    planned: dict[str, Any], time_limit_s: float | None, stopped: Callable[[], bool]
+    planned: dict[str, Any],
+    time_limit_s: float | None,
+    is_stopped: Callable[[], bool],
+    note_iteration: Callable[[Path], None],
 ) -> Record:
     """Execute a run once, in a process with one thread."""
     with tempfile.TemporaryDirectory(prefix="collocation-sysid-") as place:
@@ -89,11 +112,12 @@ def _record(
             )
             try:
                 interruption = _watch(
-                    process, planned, time_limit_s=time_limit_s, is_stopped=stopped
+                    process, planned, time_limit_s, is_stopped, lambda: note_iteration(file)
                 )
             finally:
                 process.kill()
                 process.wait()
+                note_iteration(file)
             if interruption is not None and interruption["outcome"] != TIMEOUT:
                 return interruption
             try:
@@ -115,6 +139,7 @@ def _watch(
     planned: dict[str, Any],
     time_limit_s: float | None,
     is_stopped: Callable[[], bool],
+    note_iteration: Callable[[], None],
 ) -> Record | None:
     """Send the run to the process and wait for its end, the time limit, or a stop."""
     assert process.stdin is not None
@@ -134,6 +159,7 @@ def _watch(
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(min(remaining_s, LOOK_EVERY_S))
                 return None
+            note_iteration()
             if is_stopped():
                 return {"outcome": STOPPED, "message": "stopped when the study was stopped"}
     finally:
@@ -157,8 +183,6 @@ TIMEOUT = "timeout"
 CRASHED = "crashed"
 STOPPED = "stopped"
 
-Record = dict[str, Any]
-
 
 @validated
 class RunOptions:
@@ -170,7 +194,7 @@ class RunOptions:
         Number of runs computed in parallel; by default the number of cores.
     time_limit_s : --time-limit SECONDS
         Time after which a run is stopped, including the time for loading [s]; a stopped run counts
-        as a failure.
+        as a failure. By default a minute in a comparison of methods, and no limit in one of models.
     """
 
     workers: AtLeastOne | None = None
@@ -181,6 +205,7 @@ def run_all(
     planned: Sequence[PlannedRun],
     options: RunOptions,
     on_record: Callable[[PlannedRun, Record], None],
+    on_iteration: OnIteration = lambda *_: None,
 ) -> None:
     """Execute the runs of a study, and return when all have ended.
 
@@ -193,6 +218,8 @@ def run_all(
     on_record : callable
         Function that is called with every run and its record, in the order in which runs end; also
         for runs that fail, crash or exceed the time limit.
+    on_iteration : callable
+        Function that threads call now and then with a running run and its last iteration.
 
     Raises
     ------
@@ -202,7 +229,8 @@ def run_all(
     stop = threading.Event()
     with ThreadPoolExecutor(options.workers or available_threads()) as executor:
         futures = {
-            executor.submit(execute, run, options.time_limit_s, stop.is_set): run for run in planned
+            executor.submit(execute, run, options.time_limit_s, stop.is_set, on_iteration): run
+            for run in planned
         }
         try:
             for future in as_completed(futures):

@@ -11,17 +11,24 @@ import os
 import sys
 import threading
 import traceback
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ...common.files import write_text_file
 from ...common.serialisation import as_json
 from ...common.signal_handling import heed_interrupts, leave
 from ...errors import InputError, SimulationError
-from ...pipeline import run
+from ...features.measurements import judged_residuals
+from ...methods.solution import Solution
 from ...problem import Problem
+from ...runs.forward_simulation import ForwardSimulation, simulate_experiments
+from ...runs.solving import solve
 from .model_choice import fit_record
-from .run_execution import ERROR, FINISHED
+from .run_execution import ERROR, FINISHED, iteration_file
 
 
 def main() -> None:
@@ -33,24 +40,32 @@ def main() -> None:
     heed_interrupts()
     planned = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_study, daemon=True).start()
-    write_text_file(Path(sys.argv[1]), as_json(record_of_run(planned)))
+    out = Path(sys.argv[1])
+    record = record_of_run(
+        planned, lambda line: write_text_file(iteration_file(out), as_json(asdict(line)))
+    )
+    write_text_file(out, as_json(record))
     leave(0)
 
 
-def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
+def record_of_run(
+    planned: dict[str, Any], watch: Callable[[Any], None] | None = None
+) -> dict[str, Any]:
     """Execute a planned run and return its record; errors become part of the record.
 
     Parameters
     ----------
     planned : dict
         A `PlannedRun` as a dictionary.
+    watch : callable, optional
+        Called with every `Iteration` of a comparison of methods.
 
     Returns
     -------
     dict
         "outcome" (`FINISHED` or `ERROR`) and "message". Of a finished run also "model", see
-        `fit_record`, if `test_name` is not None (a comparison of models), else "result". Of an
-        unexpected error also "traceback".
+        `fit_record`, if `test_name` is not None (a comparison of models), else "fit", see
+        `_answer_of_method`. Of an unexpected error also "traceback".
     """
     try:
         problem = Problem.read(
@@ -60,17 +75,51 @@ def record_of_run(planned: dict[str, Any]) -> dict[str, Any]:
         if test_name is not None:
             fit = fit_record(problem, planned["method"], test_name=test_name)
             return {"outcome": FINISHED, "message": fit["status"], "model": fit}
-        finished = run(problem, planned["method"])
-        return {
-            "outcome": FINISHED,
-            "message": finished.solution.message,
-            "result": finished.result,
-        }
+        solution = solve(problem, planned["method"].split()[0], watch=watch)
+        fit = _answer_of_method(problem, solution)
+        return {"outcome": FINISHED, "message": solution.message, "fit": fit}
     except (InputError, SimulationError) as error:
         return {"outcome": ERROR, "message": str(error)}
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
         return {"outcome": ERROR, "message": message, "traceback": traceback.format_exc()}
+
+
+def _answer_of_method(problem: Problem, solution: Solution) -> dict[str, Any]:
+    """Return numbers of a solution and of the forward simulation with its parameters.
+
+    "violation" has times [s] and the largest residual of the equations of motion then [N], and
+    "simulation" times and RMS differences from the measurements in "unit", of the first experiment;
+    "forward" is the RMS difference of all. "simulation" is missing if a simulation fails.
+    """
+    collocation, (first, *_) = solution.collocation, solution.parts
+    answer = {
+        "status": solution.status.value,
+        "converged": solution.status.converged,
+        "parameters": solution.parameters,
+        "loss": collocation.objective(solution.z) / collocation.loss_scale,
+        "violation_n": solution.max_violation_n,
+        "iterations": solution.iterations,
+        "total_s": solution.timing.total,
+        "violation": (
+            first.transcription.dynamics.t_s,
+            np.abs(first.compute_residual_n()).max(axis=1, initial=0.0),
+        ),
+    }
+    simulations = simulate_experiments(problem, solution)
+    squares: list[np.ndarray] = []
+    for part in solution.parts:
+        experiment = part.transcription.experiment
+        simulated = simulations[experiment.name]
+        if not isinstance(simulated, ForwardSimulation):
+            return answer
+        residuals = judged_residuals(experiment, simulated.trajectory.predicted)
+        lengths = np.linalg.norm(residuals.values, axis=2)
+        squares.append(lengths[residuals.is_counted] ** 2)
+        if part is first:
+            means = np.nanmean(np.where(residuals.is_counted, lengths**2, np.nan), axis=1)
+            answer |= {"unit": residuals.unit, "simulation": (residuals.t_s, np.sqrt(means))}
+    return answer | {"forward": float(np.sqrt(np.concatenate(squares).mean()))}
 
 
 def _end_with_study() -> None:

@@ -10,16 +10,20 @@ from typing import Any
 
 from ...common.display import Shown, Table, TitledParts, as_markdown
 from ...common.files import SCHEMA, replaced_file, write_text_file
-from ...fem.laws.constants import symbol_of, symbol_with_unit
+from ...fem.laws.constants import symbol_with_unit
 from .model_choice import advice, display_unit, model_notes, model_rows
 from .planning import METHOD_STUDY, MODEL_STUDY, PlannedRun
-from .plots import convergence_figure, model_figure
+from .plots import method_figure, model_figure
 from .rows import Row, SuccessCriterion, error_columns, method_rows, run_row
-from .run_execution import Record
+from .run_execution import TIMEOUT, Record
 
 # Resolution of the picture [pixels per inch], for a page.
 RESOLUTION_DPI = 150
-MEDIANS_NOTE = "Errors, misfits and costs are medians over the runs with a result."
+NUMBERS_NOTES = (
+    "Loss: Σ (residual / σ)². Violation: largest residual of the equations of motion.",
+    "Forward: RMS difference between the data and a simulation with the estimates.",
+    "Numbers are medians over the runs, of one without an answer those of its last iteration.",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +64,14 @@ class StudyReport:
 
     @property
     def failures(self) -> list[str]:
-        """One line for each run that has a record without a result: its label, outcome
-        and message. Runs without a record do not count.
+        """One line for each run that has a record without a result, or ended at its time limit: its
+        label, outcome and message. Runs without a record do not count.
         """
         return [
             f"{run.label}: {record['outcome']}: {record.get('message', '')}"
             for run in self.planned
             if (record := self.records.get(run.label)) is not None
-            and not {"result", "model"} & record.keys()
+            and (record["outcome"] == TIMEOUT or not {"fit", "model"} & record.keys())
         ]
 
     def make_notes(self, rows: Sequence[Row]) -> list[str]:
@@ -78,7 +82,7 @@ class StudyReport:
         explained = (
             model_notes(rows)
             if self.kind == MODEL_STUDY
-            else (self.yardstick.describe(), MEDIANS_NOTE)
+            else (self.yardstick.describe(), *NUMBERS_NOTES)
         )
         remaining = [f"{missing} of {len(self.planned)} runs remain to be done."] if missing else []
         return [*explained, *remaining]
@@ -110,7 +114,7 @@ class StudyReport:
 
     def write(self, folder: Path) -> None:
         """Write ``summary.md``, and the picture if a run has a result, into a folder, made if
-        missing: ``convergence.png`` of methods, or ``models.png``. Earlier files are replaced.
+        missing: ``methods.png``, or ``models.png``. Earlier files are replaced.
 
         Raises
         ------
@@ -123,7 +127,7 @@ class StudyReport:
         if self.kind == MODEL_STUDY:
             name, figure = "models.png", model_figure(self.rows)
         else:
-            name, figure = "convergence.png", convergence_figure(self.rows, self.records)
+            name, figure = "methods.png", method_figure(self.rows, self.records)
         if figure is not None:
             with replaced_file(folder / name) as draft:
                 figure.savefig(draft, dpi=RESOLUTION_DPI)
@@ -153,15 +157,21 @@ def method_table(summaries: Sequence[Row]) -> Table:
     Parameters
     ----------
     summaries : sequence of Row
-        Rows of `method_rows`, at least one; None is shown as a dash.
+        Rows of `method_rows`, at least one; None is shown as a dash. The error is the largest of all
+        parameters.
     """
     cells: dict[str, Cell] = {"success": lambda row: f"{row['successes']}/{row['runs']}"}
-    for name in error_columns(summaries):
-        cells[f"Δ{symbol_of(name.removeprefix('error_'))} %"] = _number_cell(name, 100)
+    if errors := error_columns(summaries):
+        cells["error %"] = lambda row: _number_text(
+            max((row[name] for name in errors if row[name] is not None), default=None), 100
+        )
+    factor, unit = display_unit(next((row["unit"] for row in summaries if row["unit"]), ""))
     cells |= {
-        "markers mm": _number_cell("rms_m", 1e3),
+        "loss": _number_cell("loss"),
+        "violation N": _number_cell("violation_n"),
+        f"forward {unit}".strip(): _number_cell("forward", factor),
         "iter.": _number_cell("iterations", form=".4g"),
-        "total s": _number_cell("total_s"),
+        "s": _number_cell("total_s"),
     }
     return _table("Methods", {"method": lambda row: row["method"]}, cells, summaries)
 
