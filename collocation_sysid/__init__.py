@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .fem.node_force import NodeForce
     from .fem.regions import Region
     from .fem.rest_shape import UnderGravity
+    from .fem.schemes import Scheme, Stencil
     from .fem.spatial_field import Field
     from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
     from .methods.comparison.penalty import AugmentedLagrangian, Penalty
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from .methods.solution import Iteration, Solution, Status
     from .methods.starts.continuation import Continuation
     from .model.parameters import FieldCoefficients, Parameter, Parameters, Tied, Unknown
-    from .model.schemes import Scheme, Stencil
     from .pipeline import Run, run
     from .problem import Problem, RolloutOptions, UncertaintyOptions
     from .program.collocation import Collocation

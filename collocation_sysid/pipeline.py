@@ -22,11 +22,11 @@ from .common.validated_classes import validated
 from .errors import InputError, SimulationError
 from .features.specimens.notes import one_kind_notes
 from .features.specimens.offsets import stress_offset_notes
+from .fem.schemes import as_scheme
 from .methods.experiment_executors import connect_executor
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Method, Solution, Status, Watch
 from .methods.starts.initial_trajectories import simulate_trajectories
-from .model.schemes import as_scheme
 from .problem import Problem
 from .program.collocation import Collocation
 from .recording.impact_steps import IMPACT_NOTE

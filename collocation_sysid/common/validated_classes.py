@@ -207,7 +207,8 @@ def _title(called: Any) -> str:
 
 
 def _other_constructors(called: Any) -> str:
-    others = [
+    others = [*getattr(called, "OTHER_CONSTRUCTORS", ())]
+    others += [
         f"{called.__name__}.{name}"
         for name in dir(called)
         if name.startswith("from_")

@@ -27,4 +27,8 @@ Assembly:
   one
   quadrature point; `chain_rule`: derivatives of energies by invariants.
 - `pattern`: sparsity patterns.
+
+Time steps:
+
+- `schemes`: time-stepping schemes as tables; `step_function`: one step as a CasADi expression.
 """

@@ -21,8 +21,9 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import accumulate
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
+import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
@@ -44,7 +45,9 @@ from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
+from .schemes import Scheme, as_scheme
 from .spatial_field import Field
+from .step_function import element_forces, step_function
 
 
 @dataclass(frozen=True, eq=False)
@@ -669,6 +672,68 @@ class Body(Discretisation):
         x = self._state(positions)
         theta = self.elastic_theta(constants)
         return self.pattern.matrix(-self.linearise(x, np.zeros_like(x), theta=theta).by_position[0])
+
+    # One time step --------------------------------------------------------------------------
+
+    @validated
+    def step_function(
+        self, scheme: str | Scheme = "midpoint", row: AtLeastOne | None = None
+    ) -> ca.Function:
+        """Return the discrete equation of motion of one time step as a CasADi function (SX), for
+        programs of one's own and C code.
+
+        Its inputs are positions x_t, x_{t−1}, … (3n,) [m], from "x", "x_1", … back to the largest
+        lag of the scheme, external forces "u" (3n,) [N], constants "theta" (k,) in the order of
+        `constants`, and the time step "step_s" [s]. Its output "c" (3n,) [N] is zero for a motion of
+        dofs that are not held, and minus the force of the hand for others:
+
+            c_t = Σ_j w_j f(ξ_{t−j}, ν_{t−j}; θ) + u_t − M a_t,
+
+        see `schemes`. External forces include the weight, m g; with forces that change, u_t is
+        Σ_j w_j times that of evaluation t − j. The expression sums all elements: use it for bodies
+        of up to some hundred.
+
+        Parameters
+        ----------
+        scheme : str or Scheme
+            Time discretisation.
+        row : int, optional
+            Index of one of the first rows, from 1, whose equation reaches back to x_0 only; those
+            that need the velocity at the start have the input "v_0" (3n,) [m/s] before "u". The
+            regular equation by default.
+
+        Raises
+        ------
+        InputError
+            For an unknown scheme, or a body with memory, a field, forces of its own or a mesh that
+            was scanned under gravity.
+        """
+        has = {
+            "memory (prony)": self.has_memory,
+            "a field": any(part.field is not None for part in self.parts),
+            "forces of its own": bool(self.forces),
+            "a mesh scanned under gravity": self.scan_conditions is not None,
+        }
+        if unsupported := [name for name, is_there in has.items() if is_there]:
+            raise InputError(
+                f"the body has {' and '.join(unsupported)}, whose equations of motion are no function "
+                "of positions alone; expected a body without"
+            )
+        theta = ca.SX.sym("theta", len(self.constants))
+        masses = [ca.SX(mass) for mass in self._part_masses(cast(Any, theta))]
+        damping = sum(
+            (
+                theta[gamma] * mass
+                for gamma, mass in zip(self._gamma_m_indices, masses, strict=True)
+            ),
+            ca.SX.zeros(self.pattern.size),
+        )
+
+        def force(xi: ca.SX, nu: ca.SX) -> ca.SX:
+            return element_forces(self, xi, nu, theta) - damping * nu
+
+        total = sum(masses[1:], masses[0])
+        return step_function(force, total, theta, as_scheme(scheme), row)
 
     # Many states ----------------------------------------------------------------------------
 

@@ -18,11 +18,11 @@ from ..common.array_types import Array
 from ..common.validated_classes import validated
 from ..common.validated_types import Count, Finite, NotNegative, Positive, StrictInteger, Text
 from ..errors import located
+from ..program.casadi_functions import NlpFunctions
 from ..program.collocation import Collocation
 from ..program.lifted.collocation import lifted_count, with_lifted_variables
 from ..recording.experiment import Experiment
 from . import nlpsol
-from .callbacks import NlpFunctions
 from .certificate import certify
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
@@ -218,7 +218,7 @@ class InteriorPoint(MethodOptions):
             hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
 
         def settings(functions: NlpFunctions) -> dict[str, Any]:
-            options = self._settings(functions, is_warm=is_warm)
+            options = self._settings(functions, program, is_warm=is_warm)
             remaining_s = max(SHORTEST_S, self.max_time_s - recorder.measure_elapsed_s())
             return {"ipopt.max_wall_time": remaining_s} | options
 
@@ -246,7 +246,9 @@ class InteriorPoint(MethodOptions):
         )
         return replace(solution, notes=(*solution.notes, missing))
 
-    def _settings(self, functions: NlpFunctions, *, is_warm: bool) -> dict[str, Any]:
+    def _settings(
+        self, functions: NlpFunctions, program: Collocation, *, is_warm: bool
+    ) -> dict[str, Any]:
         """Return the options except the time limit; those of the user replace the others."""
         settings = nlpsol.ipopt_settings(
             functions, self.linear_solver, self.tolerance, self.max_iterations
@@ -269,13 +271,11 @@ class InteriorPoint(MethodOptions):
         if self.hessian == "limited-memory":
             settings["ipopt.hessian_approximation"] = "limited-memory"
         else:
-            settings["hess_lag"] = functions.function("hess_lag", "triu_hess")
-            collocation = functions.collocation
-            sharpness = _largest_curvature(collocation)
+            sharpness = _largest_curvature(program)
             settings |= {
                 # Rows of pressures are nearly dependent where a surface lies on another.
                 "ipopt.perturb_always_cd": "no"
-                if lifted_count(complete_program(collocation), "pressure")
+                if lifted_count(complete_program(program), "pressure")
                 else "yes",
                 "ipopt.jacobian_regularization_exponent": 0.0,
                 "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),

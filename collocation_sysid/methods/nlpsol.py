@@ -18,8 +18,9 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.signal_handling import ABANDONED_THREAD, INTERRUPTS, raises_interrupt
 from ..errors import InputError
+from ..program.casadi_functions import HessianValues, NlpFunctions
 from ..program.collocation import Collocation, convert_variables
-from .callbacks import HessianValues, IterationMonitor, NlpFunctions
+from .callbacks import IterationMonitor
 from .condensed_program import complete_multipliers
 from .solution import Solution, Status
 from .solve_recorder import Recorder
@@ -163,8 +164,8 @@ def solve(
 def ipopt_settings(
     functions: NlpFunctions, linear_solver: str, tolerance: float, max_iterations: int
 ) -> dict[str, Any]:
-    """Return settings of IPOPT without output and with exact first derivatives, whose callbacks are
-    added to `functions`.
+    """Return settings of IPOPT without output and with exact derivatives, whose callbacks are added
+    to `functions`.
     """
     return {
         "ipopt.linear_solver": linear_solver,
@@ -173,8 +174,7 @@ def ipopt_settings(
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
         "ipopt.option_file_name": "",  # IPOPT reads ipopt.opt of the working folder otherwise
-        "jac_g": functions.function("jac_g", "g", "jac_g"),
-        "grad_f": functions.function("grad_f", "f", "grad_f"),
+        **functions.derivatives("ipopt"),
     }
 
 

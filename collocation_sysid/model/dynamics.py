@@ -27,11 +27,11 @@ from ..common.array_types import Array
 from ..common.time_dependence import PARTS_OVER_TIME, at_times, over_time
 from ..fem.body import Body, Linearisation
 from ..fem.pattern import SymmetricPattern
+from ..fem.schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from ..recording.experiment import Experiment
 from .force_internal_variables import ForceHistory
 from .forces import Forces
 from .internal_variables import AnyHistory, histories_of_trajectory, insert_histories
-from .schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from .weight import DofMasses
 
 

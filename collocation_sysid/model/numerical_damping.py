@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError
-from .schemes import Scheme, Stencil
+from ..fem.schemes import Scheme, Stencil
 
 # Largest number of substeps tried by `substeps_needed`; more would be too slow to be useful.
 MAX_SUBSTEPS = 4096

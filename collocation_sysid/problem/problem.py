@@ -16,12 +16,13 @@ from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.laws.constants import with_undamped
+from ..fem.schemes import Scheme, as_scheme
 from ..methods import METHODS, require_method
 from ..methods.interior_point import InteriorPoint
 from ..methods.solution import Method
 from ..model.parameters import Parameters, Tied, Unknown
-from ..model.schemes import Scheme, as_scheme
 from ..program.collocation import Collocation
+from ..program.lifted.collocation import with_lifted_variables
 from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
@@ -244,9 +245,16 @@ class Problem:
         fitted = (each for each in self.experiments if not each.validation)
         return max(map(impact_steps, fitted), default=1)
 
-    def collocation(self) -> Collocation:
-        """Return a new nonlinear program of the problem, with `choose_first_substeps`."""
-        return Collocation(
+    def collocation(self, lifted: bool = False) -> Collocation:
+        """Return a new nonlinear program of the problem, with `choose_first_substeps`.
+
+        Parameters
+        ----------
+        lifted : bool
+            Whether history variables, measured reactions and pressures of obstacles are variables
+            with equations of their own, which `Collocation.casadi` needs; they follow all others.
+        """
+        program = Collocation(
             self.experiments,
             self.parameters,
             scheme=self.scheme,
@@ -254,6 +262,7 @@ class Problem:
             has_grasp_constraints=self.explicit_grasps,
             huber=self.huber,
         )
+        return with_lifted_variables(program) if lifted else program
 
     def solver(self, method: str | Method | None = None) -> Method:
         """Return the method for a name, or the method itself; None means the method of the problem.

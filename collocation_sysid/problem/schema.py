@@ -23,9 +23,9 @@ from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
 from ..fem.laws.fibres import Fibres
 from ..fem.laws.materials import DAMPINGS, MATERIALS
+from ..fem.schemes import MOST_STEPS, SCHEMES
 from ..fem.spatial_field import Field as SpatialField
 from ..model.parameters import Unknown
-from ..model.schemes import MOST_STEPS, SCHEMES
 from ..recording.environment import usual_air_density
 from ..recording.node_selection import Nodes
 from ..statistics.budget.systematic_effects import Assumptions, ExactIfNone

@@ -35,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -43,10 +44,11 @@ from ..common.array_types import Array, Index
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
 from ..errors import InputError
+from ..fem.schemes import Scheme, as_scheme
 from ..model.parameters import Parameters
-from ..model.schemes import Scheme, as_scheme
 from ..recording.experiment import Experiment
 from .association import Association
+from .casadi_functions import CasadiProgram, Hessian
 from .experiment_iterate import ExperimentIterate
 from .linear_algebra.sparse_assembly import SparseAssembly
 from .measurement_models import belongs_to, first_association
@@ -54,6 +56,11 @@ from .motion_transcription import Offsets, RowWeights, WeightedHistory
 from .shared_nuisances import nuisance_indices, shared_associations
 from .transcription import Transcription
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Most pixels of the picture of a pattern along a side.
+MOST_PIXELS = 400
 # Distance of a parameter from its bound, in units of z, at which it counts as at the bound: more
 # than the distance at which interior-point methods stop.
 BOUND_TOLERANCE = 1e-6
@@ -128,6 +135,8 @@ class Collocation:
     InputError
         If all experiments are for validation, or an option is not positive.
     """
+
+    OTHER_CONSTRUCTORS: ClassVar = ("problem.collocation()",)
 
     experiments: Sequence[Experiment]
     parameters: Parameters
@@ -728,6 +737,85 @@ class Collocation:
         own[: len(rows)] = by_q[rows[order], columns[order]]
         self._hessian.assemble(values, own, groups=further)
         return values
+
+    # The program for other solvers ------------------------------------------------------------
+
+    @property
+    def eliminates_variables(self) -> bool:
+        """Whether history variables, measured reactions or pressures of obstacles are eliminated, so
+        that not all derivatives of the program are sparse and exact.
+        """
+        return any(
+            transcription.has_histories()
+            or len(transcription.sensed_dofs)
+            or transcription.dynamics.forces.complementarity_terms
+            for transcription in self.transcriptions
+        )
+
+    def casadi(self, hessian: Hessian = "exact") -> CasadiProgram:
+        """Return the program as a CasADi function with exact derivatives, for `casadi.nlpsol`.
+
+        Parameters
+        ----------
+        hessian : {"exact", "gauss-newton"}
+            Second derivatives; those of Gauss–Newton are convex, see `hessian_values`.
+
+        Raises
+        ------
+        InputError
+            If the program eliminates variables, or a parameter has no guess.
+        """
+        if self.eliminates_variables:
+            raise InputError(
+                "this program eliminates history variables, measured reactions or pressures of "
+                "obstacles, whose derivatives are not sparse; expected "
+                "problem.collocation(lifted=True), in which they are variables"
+            )
+        positions = [
+            s.with_prescribed_positions(
+                s.experiment.rigid_positions(s.dynamics.t_s).reshape(s.grid_times, -1), s.guess_phi
+            )
+            for s in self.transcriptions
+        ]
+        lower, upper = self.bounds()
+        start = self.pack(self.guess_p, positions)
+        return CasadiProgram(self, hessian, x0=start, lbx=lower, ubx=upper)
+
+    def plot(self) -> Figure:
+        """Draw the patterns of the Jacobian of g and of the Hessian of the Lagrangian: darker
+        pixels have more entries.
+
+        Returns
+        -------
+        Figure
+            Matplotlib figure; ``savefig`` writes it.
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(9, 4.5), layout="constrained")
+        size, count = self.variable_count, self.constraint_count
+        indptr, indices = self.hessian_structure
+        columns = np.repeat(np.arange(size), np.diff(indptr))
+        is_above = indices < columns
+        both = (
+            np.concatenate([indices, columns[is_above]]),
+            np.concatenate([columns, indices[is_above]]),
+        )
+        indptr, indices = self.jacobian_structure
+        jacobian = indices, np.repeat(np.arange(size), np.diff(indptr))
+        patterns = (
+            (r"Jacobian $\partial g/\partial z$", jacobian, count),
+            (r"Hessian $\nabla^2(wf + y^Tg)$", both, size),
+        )
+        for axes, (title, (rows, at), height) in zip(figure.subplots(1, 2), patterns, strict=True):
+            pixels = [min(MOST_PIXELS, height), min(MOST_PIXELS, size)]
+            filled, *_ = np.histogram2d(rows, at, pixels, range=[[0, height], [0, size]])
+            axes.imshow(
+                np.sqrt(filled), cmap="Greys", extent=(0, size, height, 0), interpolation="nearest"
+            )
+            axes.set_title(f"{title}: {height} × {size}, {len(rows)} entries")
+            axes.set_aspect("auto")
+        return figure
 
     def kkt_residual(self, z: Array, multipliers: Array) -> float:
         """Return the largest violation of the first-order optimality conditions at z, in the

@@ -14,11 +14,11 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..errors import SimulationError
+from ..fem.schemes import Scheme
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.grasp_constraint import PrescribedDisplacements
 from ..model.inputs import Inputs
 from ..model.parameters import Parameters
-from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from .collocation import Collocation
 from .forward.newton_solver import NewtonOptions

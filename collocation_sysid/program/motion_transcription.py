@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..common.array_types import Array, Index
 from ..common.time_dependence import at_times
 from ..fem.body import Body, Linearisation, SecondDerivatives
+from ..fem.schemes import Scheme
 from ..model.dynamics import Dynamics, StencilRow
 from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.grasp_constraint import GraspConstraint, PrescribedDisplacements
@@ -29,7 +30,6 @@ from ..model.inputs import Inputs, inputs_from_experiment, with_inputs
 from ..model.internal_variables import AnyHistory
 from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
-from ..model.schemes import Scheme
 from ..recording.experiment import Experiment
 from .linear_algebra.block_band import (
     BandBlock,

@@ -23,9 +23,9 @@ from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, SimulationError
 from ..fem.laws.constants import with_undamped
+from ..fem.schemes import MOST_STEPS, Scheme, as_scheme
 from ..model.dynamics import Dynamics
 from ..model.parameters import Parameters, resolve_theta
-from ..model.schemes import MOST_STEPS, Scheme, as_scheme
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers

@@ -23,7 +23,7 @@ from ..common.written_files import (
     listed_hashes,
 )
 from ..errors import InputError, require_among
-from ..model.schemes import SCHEMES
+from ..fem.schemes import SCHEMES
 from ..problem import Problem
 from ..problem.bench_files import (
     BenchTable,

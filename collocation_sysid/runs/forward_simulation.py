@@ -15,10 +15,10 @@ from ..errors import InputError, SimulationError
 from ..features.measurement_results import CopyError, SimulatedExperiment
 from ..features.measurements import instrument_misfits, prediction_error, units_by_name
 from ..fem.kernels import map_experiments
+from ..fem.schemes import MOST_STEPS, as_scheme
 from ..methods.complementarity import with_contact_energy
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution
-from ..model.schemes import MOST_STEPS, as_scheme
 from ..problem import Problem
 from ..program.measured_motion import residual_changes, simulated_values
 from ..program.simulation import Trajectory, simulate

@@ -11,9 +11,9 @@ from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne
 from ..errors import InputError
 from ..fem.meshes.refinement import refine_body
+from ..fem.schemes import as_scheme
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Watch
-from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..recording import experiment_refinement
 from ..statistics.budget.discretisation_error import (

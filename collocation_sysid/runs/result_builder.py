@@ -23,10 +23,10 @@ from ..features.measurement_results import (
 )
 from ..features.measurements import prediction_error, stated_sigmas
 from ..fem.laws.constants import GAMMA_R, YOUNG
+from ..fem.schemes import as_scheme
 from ..methods.solution import pooled_wrench_rms
 from ..methods.starts.start import ScanSummary
 from ..model.contact.summary import friction_summaries
-from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..recording.deviation import in_readable_unit

@@ -10,9 +10,9 @@ from ..common.array_types import Array, root_mean
 from ..errors import SimulationError
 from ..features.registry import FEATURES
 from ..features.specimens.concerns import as_specimen_concerns
+from ..fem.schemes import as_scheme
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
-from ..model.schemes import as_scheme
 from ..problem import Problem
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities

@@ -93,7 +93,7 @@ def find_unused(trees: dict[Path, ast.Module]) -> Iterator[str]:
                 and "_method_key" in ast.unparse(node.value)
             ):
                 continue
-            if file.name == "callbacks.py" and owner:
+            if file.name in ("callbacks.py", "casadi_functions.py") and owner:
                 continue  # CasADi calls the methods
             if isinstance(node, Definition) and decorators(node) & REGISTERED:
                 continue

@@ -16,7 +16,7 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment
 

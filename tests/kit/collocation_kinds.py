@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.model.parameters import Parameter, Parameters
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment
 from kit.problems import GUESS, hung_cube

@@ -16,9 +16,9 @@ from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.methods.solution import Solution
 from collocation_sysid.model.parameters import Parameter, Parameters
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.lifted.collocation import lifted_variables
 from collocation_sysid.program.simulation import simulate, with_markers

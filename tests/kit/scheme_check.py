@@ -12,7 +12,7 @@ from collocation_sysid.common.array_types import Array
 from collocation_sysid.errors import SimulationError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.model.schemes import Scheme, Stencil, as_scheme
+from collocation_sysid.fem.schemes import Scheme, Stencil, as_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.testing.property_check import PropertyCheck
 from collocation_sysid.testing.small_problems import (

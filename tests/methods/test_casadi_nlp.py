@@ -15,7 +15,6 @@ from kit.problems import GUESS, TRUTH, hung_cube, measured, noisy
 from collocation_sysid import solve as solve_problem
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
-from collocation_sysid.methods.callbacks import NlpFunctions
 from collocation_sysid.methods.comparison.casadi_nlp import (
     PLUGINS,
     REFUSED,
@@ -25,6 +24,7 @@ from collocation_sysid.methods.comparison.casadi_nlp import (
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status, Watch
 from collocation_sysid.problem import Problem
+from collocation_sysid.program.casadi_functions import NlpFunctions
 from collocation_sysid.program.collocation import Collocation
 
 

@@ -12,7 +12,7 @@ from kit.checks import observed_order
 from kit.problems import TRUTH, as_theta, box, hung_cube, nodes_where, smooth_poses, vertex_markers
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.schemes import SCHEMES, STATIC, as_scheme
+from collocation_sysid.fem.schemes import SCHEMES, STATIC, as_scheme
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp
 

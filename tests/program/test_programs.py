@@ -50,10 +50,10 @@ from kit.wrenches import EVERYTHING, felt, sensing, wristed_cube
 import collocation_sysid as cs
 from collocation_sysid.fem.meshes.selection import Indices
 from collocation_sysid.fem.node_force import On
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.methods.comparison.shooting import adjoint_gradient, simulate_variables
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.lifted.collocation import LiftedCollocation, with_lifted_variables
 from collocation_sysid.program.sweep import Sweep

@@ -26,9 +26,9 @@ from kit.problems import (
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError, SimulationError
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.forces import Forces
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.forward.newton_solver import NewtonOptions, NewtonSolver
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme

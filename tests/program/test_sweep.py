@@ -20,9 +20,9 @@ from kit.problems import (
 )
 
 from collocation_sysid.errors import SimulationError
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.methods.solution import constraint_multipliers
 from collocation_sysid.model.equations_at_parameters import EquationsAtParameters
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program import sweep
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme

@@ -13,11 +13,11 @@ from kit.wrench_kinds import pressed
 from kit.wrenches import EVERYTHING, felt, fitted, predicted_wrenches, sensing, wristed_cube
 from scipy.spatial.transform import Rotation
 
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.methods.comparison.shooting import simulate_variables
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.recursion import RecursionTrajectory
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.observables import ObservedMotion, ReactionForces

@@ -144,6 +144,7 @@ LIFTING = (
     "methods.starts.initial_point",
     "methods.complementarity",
     "methods.comparison",
+    "problem.problem",
     "runs.check",
     "testing",
 )

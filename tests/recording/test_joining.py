@@ -13,9 +13,9 @@ from kit.problems import GUESS, IDEAL, TRUTH, bar_loaded, box, hung_cube, nodes_
 
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.errors import InputError
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.nuisance_map import NuisanceMap
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem, RolloutOptions, UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation

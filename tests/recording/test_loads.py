@@ -22,7 +22,7 @@ from kit.problems import (
 )
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.schemes import SCHEMES
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Force, Grasp, PointMass, PoseSequence

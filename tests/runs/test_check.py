@@ -30,8 +30,8 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.fem.schemes import SCHEMES, as_scheme
 from collocation_sysid.model.numerical_damping import numerical_mode
-from collocation_sysid.model.schemes import SCHEMES, as_scheme
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording.obstacle import Obstacle
 from collocation_sysid.recording.obstacle_solids import Sphere

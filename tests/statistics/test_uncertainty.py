@@ -20,9 +20,9 @@ from scipy.stats import chi2
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.laws.moduli import engineering_constants
+from collocation_sysid.fem.schemes import SCHEMES
 from collocation_sysid.methods.loss_curvature import sensitivities
 from collocation_sysid.model.parameters import Parameter, Parameters
-from collocation_sysid.model.schemes import SCHEMES
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import with_markers

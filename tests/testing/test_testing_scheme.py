@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from kit.scheme_check import check_scheme
 
-from collocation_sysid.model.schemes import SCHEMES, Scheme, Stencil
+from collocation_sysid.fem.schemes import SCHEMES, Scheme, Stencil
 
 MIDPOINT = SCHEMES["midpoint"]
 BDF2 = SCHEMES["bdf2"]

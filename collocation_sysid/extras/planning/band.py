@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...common.array_types import Array
-from ...model.schemes import as_scheme
+from ...fem.schemes import as_scheme
 from ...program.collocation import Collocation
 from ...recording import Experiment
 from ...recording.nuisance import GRIP, PLACE

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
-from ...methods.callbacks import NlpFunctions, TimedFunction
 from ...methods.nlpsol import create_solver, ipopt_settings
+from ...program.casadi_functions import NlpFunctions, TimedFunction
 from .planned_program import PlannedProgram
 from .reduced_solver import PlanAnswer, Watch
 
@@ -309,7 +309,6 @@ def solve_full(
     settings = {
         **ipopt_settings(functions, "mumps", TOLERANCE, MOST_ITERATIONS),
         "iteration_callback": monitor,
-        "hess_lag": functions.function("hess_lag", "triu_hess"),
         # The gradient at the initial point may be large: IPOPT would scale the jerk away.
         "ipopt.nlp_scaling_method": "none",
         "ipopt.mu_init": INITIAL_BARRIER,

@@ -1,9 +1,7 @@
 """Further NLP solvers of CasADi, by the name of their plugin: "casadi:sqpmethod" and
 "casadi:sleqp".
 
-They get the same NLP and the same derivatives as interior point. A plugin requests its functions by
-names of its own, of which only some are options: all are put into its cache of functions, so that
-it does not try to derive them, which is impossible for callbacks.
+They get the same NLP and the same derivatives as interior point.
 
 ============  ==================================================================================
 sqpmethod     SQP; its QPs by PIQP, an interior-point solver for sparse convex QPs
@@ -22,22 +20,20 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import field
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ...common.array_types import Array
 from ...common.validated_classes import validated
 from ...common.validated_types import Count, Positive
+from ...program.casadi_functions import Hessian, NlpFunctions, hessian_values
 from ...program.collocation import Collocation
 from ...program.lifted.collocation import with_lifted_variables
 from .. import nlpsol
-from ..callbacks import HessianValues, NlpFunctions
 from ..options import MethodOptions
 from ..solution import Solution, Status, Watch
 from ..solve_recorder import Recorder
-
-Hessian = Literal["gauss-newton", "exact"]
 
 PREFIX = "casadi:"
 # Largest constraint of a solution, in the scaling of the NLP.
@@ -52,8 +48,6 @@ class CasadiSolver(MethodOptions):
 
     Attributes
     ----------
-    functions : mapping
-        Outputs, as `NlpFunctions` names them, of the functions by the plugin's names.
     statuses : mapping
         `Status` by the plugin's return status.
     hessian : {"gauss-newton", "exact"}
@@ -69,7 +63,6 @@ class CasadiSolver(MethodOptions):
         Further options of the plugin by name; they override the ones above.
     """
 
-    functions: ClassVar[Mapping[str, str]]
     statuses: ClassVar[Mapping[str, Status]]
 
     hessian: Hessian = "exact"
@@ -93,7 +86,7 @@ class CasadiSolver(MethodOptions):
             program,
             start=start,
             plugin=plugin,
-            hessian=_hessian_values(program, self.hessian),
+            hessian=hessian_values(program, self.hessian),
             settings=self._settings,
             statuses=self.statuses,
             judge=partial(_judge, collocation),
@@ -104,8 +97,8 @@ class CasadiSolver(MethodOptions):
         (`casadi`) replace those of the method, and mappings are merged. The functions of the cache
         are new, and are added to `functions`.
         """
-        cache = {n: functions.function(n, *o.split()) for n, o in self.functions.items()}
-        settings = {"cache": cache, **self._plugin_settings()}
+        plugin = self.name.removeprefix(PREFIX)
+        settings = {**functions.derivatives(plugin), **self._plugin_settings()}
         for name, value in self.casadi.items():
             are_mappings = isinstance(value, Mapping) and isinstance(settings.get(name), Mapping)
             settings[name] = settings[name] | value if are_mappings else value
@@ -121,11 +114,6 @@ class SqpMethod(CasadiSolver):
     """Sequential quadratic programming (SQP) with convex quadratic programs."""
 
     name: ClassVar[str] = "casadi:sqpmethod"
-    functions: ClassVar[Mapping[str, str]] = {
-        "nlp_fg": "f g",
-        "nlp_jac_fg": "f grad_f g jac_g",
-        "nlp_hess_l": "hess",
-    }
     statuses: ClassVar[Mapping[str, Status]] = {
         "Solve_Succeeded": Status.CONVERGED,
         "Maximum_Iterations_Exceeded": Status.ITERATION_LIMIT,
@@ -155,13 +143,6 @@ class Sleqp(CasadiSolver):
     """SLP-EQP in a trust region: steps of QPs with the active constraints of linear programs."""
 
     name: ClassVar[str] = "casadi:sleqp"
-    functions: ClassVar[Mapping[str, str]] = {
-        "nlp_f": "f",
-        "nlp_g": "g",
-        "nlp_grad_f": "f grad_f",
-        "nlp_jac_g": "g jac_g",
-        "nlp_grad_l": "grad_l",
-    }
     statuses: ClassVar[Mapping[str, Status]] = {
         "optimal": Status.CONVERGED,
         "iteration limit": Status.ITERATION_LIMIT,
@@ -234,18 +215,3 @@ def _judge(collocation: Collocation, status: Status, z: Array, multipliers: Arra
     if is_stalled and collocation.kkt_residual(z, multipliers) <= ACCEPTABLE:
         return Status.ACCEPTABLE
     return status
-
-
-def _hessian_values(collocation: Collocation, hessian: Hessian) -> HessianValues:
-    """Return the function (z, weight, multipliers, out) that overwrites `out` with the values of
-    the upper triangle of the Hessian of weight · f + multipliers · g at z, in the order of
-    `hessian_structure`.
-    """
-
-    def values(z: Array, weight: float, multipliers: Array, out: Array) -> None:
-        """Write the Hessian's values of weight · f + multipliers · g at z to `out`, in place."""
-        collocation.hessian_values(
-            z, weight, multipliers=multipliers if hessian == "exact" else None, out=out
-        )
-
-    return values

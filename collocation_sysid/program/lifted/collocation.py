@@ -36,6 +36,8 @@ class LiftedCollocation(Collocation):
     The attributes are those of `Collocation`.
     """
 
+    eliminates_variables = False
+
     @cached_property
     def lifted(self) -> tuple[LiftedVariables, ...]:
         """Lifted variables, experiment by experiment."""
@@ -135,13 +137,7 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
 
     The transcriptions are shared with the result.
     """
-    has_sensors = any(len(s.sensed_dofs) for s in collocation.transcriptions)
-    has_complementarity = any(
-        s.dynamics.forces.complementarity_terms for s in collocation.transcriptions
-    )
-    if isinstance(collocation, LiftedCollocation) or not (
-        collocation.has_eliminated_histories or has_sensors or has_complementarity
-    ):
+    if not collocation.eliminates_variables:
         return collocation
     settings = {field.name: getattr(collocation, field.name) for field in fields(Collocation)}
     lifted = LiftedCollocation(**settings)

@@ -22,6 +22,7 @@ from ...common.time_limit import TimeLimitReached, time_limit
 from ...errors import SimulationError
 from ...features.measurements import lost_samples
 from ...features.registry import FEATURES
+from ...fem.schemes import as_scheme
 from ...methods.best_iterate import best_iterate
 from ...methods.reduced_space import ReducedSpace
 from ...methods.starts.initial_trajectories import initial_variables
@@ -31,7 +32,6 @@ from ...methods.starts.stiffness_scan import (
     typical_constants,
     typical_parameters,
 )
-from ...model.schemes import as_scheme
 from ...problem import Problem
 from ...problem.size import Size
 from ...program.collocation import Collocation

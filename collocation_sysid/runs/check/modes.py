@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...errors import SimulationError
+from ...fem.schemes import Scheme
 from ...model.forces import Forces
 from ...model.numerical_damping import PERIOD_ERROR, numerical_mode, substeps_needed
-from ...model.schemes import Scheme
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.forward.newton_solver import NewtonSolver
 from ...program.modes.natural import Modes, natural_modes

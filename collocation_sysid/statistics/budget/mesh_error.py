@@ -39,9 +39,9 @@ from ...common.last_results import known_at_last
 from ...errors import InputError
 from ...fem.body import Body
 from ...fem.meshes.refinement import refine_body
+from ...fem.schemes import Scheme
 from ...model.dynamics import Dynamics
 from ...model.forces import Forces
-from ...model.schemes import Scheme
 from ...program.collocation import Collocation
 from ...program.linear_algebra.factorisation import NONE, Factoriser
 from ...program.linear_algebra.reused_factor import (
