@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import socket
 import sys
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -69,6 +70,11 @@ def _follow(
         print_result(run_summary(finished.result))
 
 
+def _ignored(bad: Sequence[InputError]) -> str:
+    others = f"; this line and {len(bad) - 1} others are ignored" if len(bad) > 1 else ""
+    return f"{bad[0]}{others or '; this line is ignored'}"
+
+
 @command(
     commands, "live problem.toml < frames.jsonl", "live problem.toml --udp 9870 > estimates.jsonl"
 )
@@ -91,9 +97,9 @@ def live(
 
     The command reads frames, and solves the recording so far about once a second. It prints a line
     of JSON for each solve, and one with the final result. A frame is a line: {"t_s": 0.01, "pose":
-    {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z, w]}, "markers": {"tip": [x, y, z]}}. A
-    line that is not a frame is reported and ignored, and the exit code is then 2. An empty datagram
-    ends the recording. After Ctrl-C the last answer is kept.
+    {"position_m": [x, y, z], "quaternion_xyzw": [x, y, z, w]}, "markers": {"tip": [x, y, z]}}.
+    Lines that are not frames are ignored; the first one is reported, and the exit code is then 2.
+    An empty datagram ends the recording. After Ctrl-C the last answer is kept.
     """
     if udp is None and sys.stdin is None:  # closed by whoever started the process
         raise InputError(
@@ -111,21 +117,33 @@ def live(
         lines, name = receive_lines(receiver), f"UDP port {receiver.getsockname()[1]}"
         error_console.print(f"listening on {name} of this machine")
     reader = FrameReader(estimator.experiment, problem, name)
-    bad = 0
+    bad: list[InputError] = []
+    found_s, is_reported = 0.0, False
 
     def batches() -> Iterator[list[Frame]]:
-        nonlocal bad
+        nonlocal found_s, is_reported
         for batch in arrived(lines):
+            # At once would be beside the reason why the end of a short recording is not solved.
+            if bad and not is_reported and time.monotonic() > found_s + every_s:
+                error_console.print(Text(f"error: {_ignored(bad)}"), soft_wrap=True)
+                is_reported = True
             frames = []
             for line in batch:
                 try:
                     frames.append(reader.read(line))
                 except InputError as error:
-                    bad += 1
-                    error_console.print(Text(f"error: {error}"), soft_wrap=True)
+                    found_s = found_s if bad else time.monotonic()
+                    bad.append(error)
             yield [frame for frame in frames if frame is not None]
 
-    _follow(estimator, batches(), every_s=every_s, has_json=True)
+    try:
+        _follow(estimator, batches(), every_s=every_s, has_json=True)
+    except InputError as error:
+        if not bad or is_reported:
+            raise
+        raise InputError(f"{_ignored(bad)}; without them: {error}") from error
+    if bad and not is_reported:
+        raise InputError(_ignored(bad))
     if bad:
         raise typer.Exit(EXIT_BAD_INPUT)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import socket
 import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from kit.sensors import CLAMPED, accelerometer, instrumented, strain_gauge
 from kit.wrenches import SIGMA_N, SIGMA_NM, sensing
 
 import collocation_sysid as cs
+from collocation_sysid.cli import stream_commands
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.live import Frame, FrameReader, LiveEstimator, LiveUpdate, estimator
 from collocation_sysid.extras.live.sources import arrived, frames_of_recording, receive_lines
@@ -292,7 +295,7 @@ def live_command(monkeypatch, *lines: bytes) -> Outcome:
 
 
 @pytest.mark.long
-def test_malformed_lines_are_reported_one_by_one_with_exit_code_2(tiny, monkeypatch):
+def test_malformed_lines_are_ignored_and_reported_in_one_line_with_exit_code_2(tiny, monkeypatch):
     with (tiny / "problem.toml").open("a") as file:
         file.write('\n[uncertainty]\nassumptions = "none"\n')  # which no solve of a part has
     lines = lines_of(cs.Problem.read("problem.toml"))
@@ -307,9 +310,30 @@ def test_malformed_lines_are_reported_one_by_one_with_exit_code_2(tiny, monkeypa
     bad = (b"{", lines[0].replace(b"0", b"\xff"), b"\xff\xfe", b'{"t_s":' + 10_000 * b"[")
     again = live_command(monkeypatch, *lines[:2], *bad, *lines[2:])
     assert again.code == 2
-    assert "standard input, line 3: this line is not valid JSON" in again.err
-    assert len([line for line in again.err.splitlines() if "standard input" in line]) == len(bad)
+    (line,) = again.err.splitlines()
+    assert line.startswith("error: standard input, line 3: this line is not valid JSON")
+    assert line.endswith("; this line and 3 others are ignored")
     assert json.loads(again.out.splitlines()[-1]) == final
+
+
+def test_a_recording_without_enough_frames_has_one_line_about_the_damaged_ones(tiny, monkeypatch):
+    lines = lines_of(cs.Problem.read("problem.toml"))
+    ended = live_command(monkeypatch, lines[0], b"{", b"", b"[]", b"\xff")
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.err == (
+        "error: standard input, line 2: this line is not valid JSON (Expecting property name "
+        "enclosed in double quotes); expected one JSON object per line; this line and 2 others are "
+        "ignored; without them: found 1 poses of grasp 1; expected at least 3\n"
+    )
+
+
+def test_a_damaged_line_of_a_stream_is_reported_while_it_goes_on(tiny, monkeypatch):
+    monkeypatch.setattr(stream_commands, "arrived", lambda lines: ([line] for line in lines))
+    clock = itertools.count()
+    monkeypatch.setattr(stream_commands, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    first, last = live_command(monkeypatch, b"{", b"{", b"[]").err.splitlines()
+    assert first.startswith("error: standard input, line 1: ")
+    assert last == "error: found 0 poses of grasp 1; expected at least 3"
 
 
 def test_ctrl_c_keeps_the_last_answer(tiny, monkeypatch):
