@@ -3,7 +3,7 @@
 Each command is a function in one of the modules `FAMILIES`: `problem_commands` (solve, simulate,
 check), `run_commands` (refine, export, plot, report, animate), `study_commands`
 (compare-methods, compare-models), `plan_commands` (plan), `stream_commands` (live,
-replay), `installation_commands` (doctor) and `texts`
+replay), `track_commands` (track), `installation_commands` (doctor) and `texts`
 (methods, schema, explain, log, new). `command_options` makes command-line options from parameters,
 `common` has exit codes and output, and `markdown` shows documentation on a terminal.
 
@@ -46,6 +46,7 @@ FAMILIES = (
     "plan_commands",
     "run_commands",
     "stream_commands",
+    "track_commands",
     "texts",
     "installation_commands",
 )
@@ -54,7 +55,7 @@ COMMAND_GROUPS = {
     "Identify parameters": ("new", "check", "solve", "refine", "live", "replay"),
     "Inspect a run": ("report", "plot", "animate"),
     "Extend a study": ("simulate", "compare-models", "compare-methods", "plan"),
-    "Exchange data": ("log", "export"),
+    "Exchange data": ("log", "track", "export"),
     "Reference and installation": ("explain", "methods", "schema", "doctor"),
 }
 # Commands that were replaced, with the message to who types their old name.

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.common.array_types import Array
+from collocation_sysid.extras.tracking import corners_of, follow, images_of, read_image, write_table
 
 TRUTH = {"young_pa": 4.5e4, "poisson": 0.35, "gamma_r_s": 3e-3, "gamma_m_1_s": 0.0}
 SIZE_M = np.array([0.02, 0.03, 0.12])
@@ -242,7 +243,6 @@ def film(
     The images are those at the times (S,) [s] by the robot's clock, later by the drawn delay.
     """
     import cv2
-    import track_video
 
     pose = looking(np.array(EYES_M[name]))
     described = Described.drawn(pose, np.random.default_rng(seed))
@@ -254,8 +254,11 @@ def film(
         video.write(image)
     video.release()
     cv2.imwrite(str(folder / "mask.png"), mask_of(shape, pose, float(t_s[0])))
-    options = ["--mask", str(folder / "mask.png"), "--most", str(most)]
-    track_video.main([str(folder / f"{name}.mp4"), "--out", str(folder / f"{name}.csv"), *options])
+    video_file, mask = folder / f"{name}.mp4", read_image(folder / "mask.png", is_grey=True)
+    corners = corners_of(next(images_of(video_file, None))[1], mask, most)
+    names = [f"p{k + 1}" for k in range(len(corners))]
+    tracks = follow(images_of(video_file, None), names, corners, lost_px=2.0)
+    write_table(tracks, folder / f"{name}.csv")
     rows = ", ".join(f"{each:.2f}" for each in described.matrix.ravel())
     calibration = f"""%YAML:1.0
 ---

@@ -260,6 +260,14 @@ def make_folders(folder: Path) -> list[tuple[str, str, str, tuple[str, ...]]]:
         for file in sorted(each.name for each in (run / "run").iterdir() if each.is_file()):
             if file.endswith((".json", ".npz", ".toml")):
                 kinds.append((f"{words[0]} {file}", "run", f"run/{file}", words))
+    film = folder / "film"
+    film.mkdir()
+    rng = np.random.default_rng(0)
+    images = (Image.fromarray(rng.integers(256, size=(90, 120), dtype=np.uint8)) for _ in range(3))
+    for k, image in enumerate(images):
+        image.save(film / f"{k}.png")
+    track = ("track", ".", "--rate-hz", "30", "--out", "tracks.csv", "-q")
+    kinds.append(("track image", "film", "1.png", track))
     kinds.append(("live frames", "run", "frames.jsonl", ("live", "problem.toml", "<frames.jsonl")))
     return kinds
 

@@ -7,7 +7,7 @@ tracked in the film; where they are on the body, nobody has measured. The stated
 is wrong by about 1° and 5 mm.
 
 The film is simulated here. ``collocation-sysid new bar --kind video`` writes a problem with a video
-that MuJoCo has rendered and ``track_video`` has tracked, programs that this page does not need.
+that MuJoCo has rendered and ``collocation-sysid track`` has tracked.
 """
 
 # sphinx_gallery_thumbnail_path = 'pictures/5_camera.png'

@@ -1,0 +1,237 @@
+"""Points of a body in images: corners, stated points, and centres of markers, followed over time.
+
+Corners and stated points are followed by the pyramidal method of Lucas and Kanade, forwards and
+backwards: the likelihood of a sample decreases with the distance by which the way back misses the
+point, and a point that misses by more than a limit is lost. In order that errors of single steps do
+not add up, the surroundings of each point are then aligned with the first image by an affine
+transform (enhanced correlation coefficient); a point whose surroundings do not agree is lost.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...common.array_types import Array
+from ...errors import InputError
+from .video import Image, grey, opencv
+
+# Window of the method [pixels], levels of its pyramid, and iterations of each level.
+WINDOW_PX = 21
+LEVELS = 3
+ITERATIONS = 40
+# Distance of the way back at which the likelihood has fallen to 1/e [pixels].
+HALF_TRUST_PX = 0.5
+# Quality of corners relative to the best, and their least distance [pixels].
+LEAST_QUALITY = 0.02
+LEAST_DISTANCE_PX = 12
+# Half size of the surroundings that are aligned with the first image [pixels], least correlation of
+# an alignment, and its largest distance from the point that is followed [pixels].
+HALF_PATCH_PX = 15
+LEAST_CORRELATION = 0.85
+FARTHEST_PX = 4.0
+
+
+class Loss(NamedTuple):
+    """Where a point was lost."""
+
+    name: str
+    image: int  # number of the first image without it, from 1
+    t_s: float
+    pixel: tuple[float, float]  # where it was in the image before
+    step_px: float  # how far the points moved between the images before
+    has_left: bool  # whether its window reached beyond the image
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Tracks of points in images."""
+
+    names: Sequence[str]
+    t_s: Array  # (S,): time since the first image
+    pixels: Array  # (S, N, 2): (u, v); NaN where missing
+    likelihood: Array  # (S, N)
+    losses: Sequence[Loss] = ()
+
+
+def corners_of(image: Image, mask: Image | None, most: int) -> Array:
+    """Return up to `most` corners (N, 2) of an image within a mask, to a part of a pixel."""
+    cv2 = opencv()
+    plain = grey(image)
+    found = cv2.goodFeaturesToTrack(plain, most, LEAST_QUALITY, LEAST_DISTANCE_PX, mask=mask)
+    if found is None:
+        return np.zeros((0, 2))
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-3)
+    return cv2.cornerSubPix(plain, found, (5, 5), (-1, -1), stop).reshape(-1, 2)
+
+
+def stated_points(text: str, option: str) -> tuple[list[str], Array]:
+    """Return names and pixels (N, 2) of points stated as "tip=612,388;hook=540,401"; points without
+    a name have that of the option and their number.
+    """
+    names, points = [], []
+    for k, part in enumerate(filter(None, text.split(";")), start=1):
+        name, _, pixel = part.rpartition("=")
+        try:
+            u, v = map(float, pixel.split(","))
+        except ValueError:
+            raise InputError(f"found {part!r}; expected NAME=U,V", where=option) from None
+        names.append(name.strip() or f"{option.strip('-')}_{k}")
+        points.append((u, v))
+    if len({*names}) < len(names):
+        raise InputError(f"found {text!r}; expected different names", where=option)
+    return names, np.array(points).reshape(-1, 2)
+
+
+def follow(
+    images: Iterable[tuple[float, Image]], names: Sequence[str], start: Array, lost_px: float
+) -> Tracks:
+    """Follow points (N, 2) of the first image through all images."""
+    cv2 = opencv()
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-4)
+    options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": LEVELS, "criteria": stop}
+    times, pixels, likelihood = [], [], []
+    losses: list[Loss] = []
+    before: Image | None = None
+    patches: list[_Patch] = []
+    now = start.astype(np.float32)
+    step_px = np.zeros(len(start))
+    alive = np.ones(len(start), dtype=bool)
+    for t_s, image in images:
+        plain = grey(image)
+        size = np.array(plain.shape[::-1])
+        trust = np.ones(len(start))
+        if before is not None and plain.shape != before.shape:
+            raise InputError(
+                f"image {len(times) + 1} has another size; expected one size of all images"
+            )
+        if before is not None:
+            ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, plain, now[:, None], None, **options)
+            back, returned, _ = cv2.calcOpticalFlowPyrLK(plain, before, ahead, None, **options)
+            missed = np.linalg.norm(back[:, 0] - now, axis=1)
+            inside = ((ahead[:, 0] >= 0) & (ahead[:, 0] < size)).all(axis=1)
+            alive_before = alive.copy()
+            alive &= (found[:, 0] == 1) & (returned[:, 0] == 1) & (missed <= lost_px) & inside
+            trust = np.exp(-missed / HALF_TRUST_PX)
+            reached = np.where(alive[:, None], ahead[:, 0], now).astype(np.float32)
+            for k in np.flatnonzero(alive):
+                place = patches[k].aligned(plain, reached[k])
+                alive[k] = place is not None
+                reached[k] = now[k] if place is None else place
+            common_px = float(np.median(step_px[alive_before])) if alive_before.any() else 0.0
+            for k in np.flatnonzero(alive_before & ~alive):
+                margin_px = min(*now[k], *(size - 1 - now[k]))
+                has_left = bool(margin_px < WINDOW_PX / 2 + step_px[k])
+                place, moved_px = (float(now[k, 0]), float(now[k, 1])), max(step_px[k], common_px)
+                losses.append(Loss(names[k], len(times) + 1, t_s, place, float(moved_px), has_left))
+            step_px = np.linalg.norm(reached - now, axis=1)
+            now = reached
+        else:
+            if ((start < 0) | (start > size - 1)).any():
+                raise InputError(
+                    f"a stated point is outside the first image of {size[0]} × {size[1]} pixels"
+                )
+            patches = [_Patch(plain, point) for point in start]
+        times.append(t_s)
+        pixels.append(np.where(alive[:, None], now, np.nan))
+        likelihood.append(np.where(alive, trust, 0.0))
+        before = plain
+    t0_s = times[0]
+    losses = [each._replace(t_s=each.t_s - t0_s) for each in losses]
+    return Tracks(names, np.array(times) - t0_s, np.array(pixels), np.array(likelihood), losses)
+
+
+class _Patch:
+    """Surroundings of a point (2,) in the first image."""
+
+    def __init__(self, image: Image, point: Array) -> None:
+        cv2 = opencv()
+        size = 2 * HALF_PATCH_PX + 1
+        self.patch = cv2.getRectSubPix(image, (size, size), point.astype(np.float32).tolist())
+        self.linear = np.eye(2)
+
+    def aligned(self, image: Image, point: Array) -> Array | None:
+        """Return the pixel (2,) near `point` at which the image agrees with the patch up to an
+        affine transform; None if it does not, and `point` if the surroundings are beyond the image.
+        """
+        cv2 = opencv()
+        corner = np.floor(point) - 2 * HALF_PATCH_PX
+        (left, top), side = corner.astype(int).tolist(), 4 * HALF_PATCH_PX + 1
+        height, width = image.shape
+        if left < 0 or top < 0 or left + side > width or top + side > height:
+            return point
+        middle = np.full(2, float(HALF_PATCH_PX))
+        shift = point - corner - self.linear @ middle
+        warp = np.column_stack([self.linear, shift]).astype(np.float32)
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-4)
+        part = image[top : top + side, left : left + side]
+        try:
+            correlation, warp = cv2.findTransformECC(
+                self.patch, part, warp, cv2.MOTION_AFFINE, stop, None, 3
+            )
+        except cv2.error:  # it does not converge
+            return None
+        found = warp[:, :2] @ middle + warp[:, 2] + corner
+        if correlation < LEAST_CORRELATION or np.linalg.norm(found - point) > FARTHEST_PX:
+            return None
+        self.linear = warp[:, :2].astype(float)
+        return found
+
+
+def tag_centres(images: Iterable[tuple[float, Image]], dictionary: str) -> Tracks:
+    """Return the centres of the ArUco or AprilTag markers that each image shows."""
+    cv2 = opencv()
+    number = getattr(cv2.aruco, dictionary, None)
+    if not isinstance(number, int):
+        raise InputError(
+            f"found {dictionary!r}; expected a dictionary of OpenCV, such as DICT_4X4_50",
+            where="--tags",
+        )
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
+    times: list[float] = []
+    seen: list[dict[int, Array]] = []
+    for t_s, image in images:
+        corners, numbers, _ = detector.detectMarkers(grey(image))
+        times.append(t_s)
+        ids: list[Any] = [] if numbers is None else np.ravel(numbers).tolist()
+        seen.append({k: _crossing(c[0]) for k, c in zip(ids, corners, strict=True)})
+    tags = sorted({tag for each in seen for tag in each})
+    none = np.full(2, np.nan)
+    pixels = np.array([[each.get(tag, none) for tag in tags] for each in seen])
+    pixels = pixels.reshape(len(seen), len(tags), 2)
+    trust = np.isfinite(pixels).all(axis=2).astype(float)
+    t_s = np.array(times) - times[0]
+    losses = []
+    for k, tag in enumerate(tags):
+        last = int(np.flatnonzero(trust[:, k])[-1])
+        if last < len(t_s) - 1:
+            u, v = pixels[last, k].tolist()
+            losses.append(Loss(f"tag_{tag}", last + 2, float(t_s[last + 1]), (u, v), 0.0, False))
+    return Tracks([f"tag_{tag}" for tag in tags], t_s, pixels, trust, losses)
+
+
+def _crossing(corners: Array) -> Array:
+    """Return where the diagonals of a tag cross: the image of its centre, unlike the mean."""
+    a, b, c, d = corners.astype(float)
+    share = np.linalg.solve(np.column_stack([c - a, b - d]), b - a)
+    return a + share[0] * (c - a)
+
+
+def write_table(tracks: Tracks, file: Path) -> None:
+    """Write the pixels as a wide table; missing samples are empty cells."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        columns = [f"{name}_{c}" for name in tracks.names for c in ("u", "v", "likelihood")]
+        writer.writerow(["t_s", *columns])
+        for t_s, pixels, trust in zip(tracks.t_s, tracks.pixels, tracks.likelihood, strict=True):
+            cells: list[str] = []
+            for (u, v), likelihood in zip(pixels, trust, strict=True):
+                known = np.isfinite(u)
+                cells += [f"{u:.4f}", f"{v:.4f}"] if known else ["", ""]
+                cells.append(f"{likelihood:.4f}")
+            writer.writerow([f"{t_s:.6f}", *cells])
