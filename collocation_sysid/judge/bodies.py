@@ -1,4 +1,4 @@
-"""Misspecification hypotheses about the model of a body: its laws, its mesh, and how the mesh was
+"""Misspecification hypotheses about the model of a body: its law, its mesh, and how the mesh was
 made.
 
 Each hypothesis is one more column of the linearised fit: the change of the residuals along the
@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from ..common.array_types import Array
 from ..errors import InputError
 from ..fem.body import Body
-from ..fem.laws.materials import DAMPINGS, MATERIALS, DampingLaw, Material
+from ..fem.laws.materials import MATERIALS, Material
 from ..fem.meshes.mesh import TetMesh
 from ..fem.rest_shape import UnderGravity
 from ..program.collocation import ExperimentIterate
@@ -53,24 +53,9 @@ def other_materials(body: Body) -> tuple[str, ...]:
     )
 
 
-def other_dampings(body: Body) -> tuple[str, ...]:
-    """Return the names of damping laws with the same constants as all parts of a body have."""
-    own = {part.damping for part in body.parts}
-    if len(own) > 1 or not own <= {*DAMPINGS.values()}:
-        return ()
-    (damping,) = own
-    return tuple(
-        name
-        for name, each in DAMPINGS.items()
-        if each is not damping and each.constants == damping.constants
-    )
-
-
-def with_laws(body: Body, material: Material | None, damping: DampingLaw | None) -> Body:
-    """Return a body with another material or damping law in all parts; None keeps the law."""
-    laws = {"material": material, "damping": damping}
-    changed = {name: law for name, law in laws.items() if law is not None}
-    return body.with_parts(tuple(replace(part, **changed) for part in body.parts))
+def with_material(body: Body, material: Material) -> Body:
+    """Return a body with another material in all parts."""
+    return body.with_parts(tuple(replace(part, material=material) for part in body.parts))
 
 
 def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
@@ -90,8 +75,7 @@ def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
     )
     is_strained = np.abs(moved_m / rest_m - 1).max() > LEAST_STRAIN
     for material in other_materials(body) if is_strained else ():
-        for damping in ("", *other_dampings(body)):
-            yield _other_laws(material, damping)
+        yield _other_law(material)
     if not _is_uniform(body):
         return
     if other_section(body.mesh, body.nodes.points_m) is not None:
@@ -100,17 +84,16 @@ def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
         yield REST_SHAPE
 
 
-def _other_laws(material: str, damping: str) -> Doubt:
+def _other_law(name: str) -> Doubt:
     def effect(at: ExperimentAtAnswer, _: int) -> Effect:
-        other = with_laws(at.stress_free_body, MATERIALS.get(material), DAMPINGS.get(damping))
+        other = with_material(at.stress_free_body, MATERIALS[name])
         return Effect(at.internal_n(body=other) - at.internal_force_n)
 
     def corrected(experiment: Experiment, _: Array) -> Correction:
-        laws = MATERIALS.get(material), DAMPINGS.get(damping)
-        other = with_body(experiment, with_laws(experiment.body, *laws))
-        return other and (other, {"material": material, "damping": damping})
+        other = with_body(experiment, with_material(experiment.body, MATERIALS[name]))
+        return other and (other, {"material": name})
 
-    return Doubt("law/both" if damping else "law", "1", effect=effect, correct=corrected)
+    return Doubt("law", "1", effect=effect, correct=corrected)
 
 
 def _scan_effect(at: ExperimentAtAnswer, axis: int) -> Effect:

@@ -11,6 +11,7 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..statistics.budget.systematic_effects import Effect, ExperimentAtAnswer
 from ..statistics.hypothesis import Hypothesis
+from ..statistics.thresholds import LEAST_IMPROVEMENT
 
 # Description without a mistake, and data of its message; None if the mistake is impossible.
 Correction = tuple[Any, dict[str, object]] | None
@@ -67,21 +68,17 @@ class Doubt:
 
 
 def accepted(
-    rows: Iterable[Doubt],
-    described: Any,
-    misfit_of: Callable[[Any], float],
-    factor: float,
-    least: float = 0.0,
+    rows: Iterable[Doubt], described: Any, misfit_of: Callable[[Any], float]
 ) -> Iterator[Hypothesis]:
-    """Yield the mistakes whose correction decreases the misfit of a description by more than a
-    factor, with this decrease over the handicap as strength; misfits below `least` count as this.
+    """Yield the mistakes whose correction decreases the misfit of a description by more than
+    `LEAST_IMPROVEMENT`, with this decrease over the handicap as strength.
     """
     stated = misfit_of(described)
     for row in rows:
         if (found := row.hypothesis(described)) is not None:
             remaining = misfit_of(found.corrected)
-            strength = stated / max(least, remaining) / row.handicap
-            if strength > factor:
+            strength = stated / max(remaining, 1e-300) / row.handicap
+            if strength > LEAST_IMPROVEMENT:
                 yield replace(found, strength=strength, remaining=remaining)
 
 

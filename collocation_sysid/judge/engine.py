@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ..common.array_types import Array
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
 from ..methods.reduced_search import UNLIMITED
@@ -22,12 +21,12 @@ from ..methods.starts.stiffness_scan import start_problem, without_guesses
 from ..recording.experiment import Experiment
 from ..recording.measurement_selection import measured_count
 from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
-from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL, REPRODUCED
+from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL
 from .fit import TestedFit, discrepancy, has_trend, thinned
 from .modes import find_misspecifications_by_modes
 from .motion import motion_candidates, motion_rows
 from .registry import SOURCES
-from .tracks import exchanged_places, filtered_signals, same_tracks
+from .tracks import exchanged_places, filtered_tracks, same_tracks
 
 # Largest number of samples of a refit.
 MOST_SAMPLES = 100
@@ -50,8 +49,8 @@ LEAST_DECREASE = 1e-2
 REFUTED = 10.0
 # What is tested on benches and of motions.
 TESTED = {
-    True: "hysteresis, layer of the grasp, sensors, the law of the material",
-    False: "clock, slip in the grasp, gravity, layer of the grasp, sensors, the laws of the material",
+    True: "layer of the grasp, sensors, the law of the material",
+    False: "clock, gravity, layer of the grasp, sensors, the law of the material",
 }
 
 
@@ -75,10 +74,9 @@ def find_misspecifications(
     if is_consistent:
         return rank(each for source in SOURCES for each in source.consistent(solution))
     found = [each for source in SOURCES for each in source.fitted(solution)]
-    for part in solution.parts:
+    for part, fitted_m in zip(solution.parts, solution.readings_m, strict=True):
         experiment = part.transcription.experiment
-        fitted = solution.fitted_values[experiment.name]
-        found += [*same_tracks(experiment), *filtered_signals(experiment, fitted)]
+        found += [*same_tracks(experiment), *filtered_tracks(experiment, fitted_m)]
         found += exchanged_places(part)
     misfits = [discrepancy(part) for part in solution.parts]
     worst = int(np.argmax(misfits))
@@ -105,28 +103,9 @@ def _shown_by_modes(solution: Solution, number: int) -> Iterator[Hypothesis]:
     """The fit moved the body, not only its natural modes: what leaves more than the fit is refuted."""
     experiment = solution.parts[number].transcription.experiment
     rms_m = solution.rms_by_experiment_m.get(experiment.name, np.inf)
-    huber = solution.collocation.huber
-    for each in find_misspecifications_by_modes(experiment, solution.parameters, huber=huber):
+    for each in find_misspecifications_by_modes(experiment, solution.parameters):
         if each.remaining is None or each.remaining < rms_m:
-            residual_m = np.where(
-                experiment.markers.is_measured,
-                solution.readings_m[number] - experiment.markers.positions_m,
-                np.nan,
-            )
-            if not _is_reproduced(each, experiment, residual_m):
-                yield each
-
-
-def _is_reproduced(hypothesis: Hypothesis, experiment: Experiment, residual_m: Array) -> bool:
-    """Return whether all residuals (T, M, 3) [m] are below `REPRODUCED` times the step."""
-    if hypothesis.cause not in ("marker-slip", "markers-jump") or "by_mm" not in hypothesis.data:
-        return False
-    names = experiment.markers.names
-    name = hypothesis.data.get("marker", "")
-    own_m = residual_m[:, [names.index(name)]] if name in names else residual_m
-    distances_m = np.linalg.norm(own_m, axis=2)
-    largest_m = np.max(distances_m, initial=0.0, where=np.isfinite(distances_m))
-    return bool(largest_m < REPRODUCED * 1e-3 * hypothesis.data["by_mm"])
+            yield each
 
 
 def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
@@ -170,8 +149,8 @@ def _named_alone_or_together(
     tested: Sequence[Hypothesis], loss_of: Callable[[Any], float]
 ) -> list[Hypothesis]:
     """Return the hypothesis that brings the residuals to the noise; as one of several if others do
-    so with a loss that is larger by at most `INDISTINGUISHABLE`, of one cause the one that changes
-    less; if none does, those that reduce them most, as one hypothesis.
+    so with a loss that is larger by at most `INDISTINGUISHABLE`; if none does, those that reduce
+    them most, as one hypothesis.
     """
     sufficient = [each for each in tested if each.remaining is not None and each.remaining <= 1.0]
     if not sufficient:
@@ -184,10 +163,7 @@ def _named_alone_or_together(
         for each, loss in zip(sufficient, losses, strict=True)
         if loss <= min(losses) + INDISTINGUISHABLE
     ]
-    simplest: dict[str, Hypothesis] = {}
-    for each in sorted(likely, key=lambda each: each.code.endswith("/both")):
-        simplest.setdefault(each.cause, each)
-    likely = rank(simplest.values())
+    likely = rank(likely)
     return [*likely] if len(likely) == 1 else _together("several", likely)
 
 

@@ -117,18 +117,17 @@ class TestedFit:
         pairs = zip(self.experiment.measurements, fitted_values(self.part), strict=True)
         return {each: values for each, values in pairs if isinstance(values, np.ndarray)}
 
-    def blocks_of(self, changes: Mapping[Measurement, Sequence[Array]], count: int) -> list[Array]:
-        """Return changes of all residuals in σ from `count` changes (S, m) of measurements."""
+    def blocks_of(self, changes: Mapping[Measurement, Array]) -> list[Array]:
+        """Return changes of all residuals in σ from changes (S, m) of measurements."""
         transcription = self.part.transcription
         models = dict(zip(self.experiment.measurements, transcription.main_residuals, strict=True))
         numbers = {id(each): k for k, each in enumerate(transcription.residuals)}
-        blocks = [np.zeros((*each.residual.shape, count)) for each in self.linearised.blocks]
-        for measurement, columns in changes.items():
+        blocks = [np.zeros((*each.residual.shape, 1)) for each in self.linearised.blocks]
+        for measurement, change in changes.items():
             own = numbers[id(models[measurement])]
             samples, groups, each = self.linearised.blocks[own].residual.shape
-            filled = np.zeros((samples, groups * each, count))
-            for k, column in enumerate(columns):
-                filled[: len(column), : column.shape[1], k] = np.nan_to_num(column)
+            filled = np.zeros((samples, groups * each))
+            filled[: len(change), : change.shape[1]] = np.nan_to_num(change)
             blocks[own] = filled.reshape(blocks[own].shape)
         return blocks
 

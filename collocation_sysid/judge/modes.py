@@ -24,15 +24,9 @@ from ..recording.experiment import Experiment
 from ..recording.placement import LocatedBody, place_markers
 from ..statistics.axes import with_other_axes
 from ..statistics.hypothesis import Hypothesis, rank
-from ..statistics.thresholds import FITTED, LEAST_IMPROVEMENT, ONE_OF_MANY
-from .contradictions import (
-    load_sign_hypotheses,
-    name_exchange_hypotheses,
-    step_hypotheses,
-    undriven_motion,
-)
+from ..statistics.thresholds import FITTED, ONE_OF_MANY
+from .contradictions import load_sign_hypotheses
 from .doubt import Doubt, accepted, clock_data, exchanged_names
-from .initial_motion import initial_motion_hypotheses
 
 # Accuracy of small strains and a few modes, over the size of the body.
 ROUGHLY = 0.005
@@ -59,7 +53,7 @@ FRAME_CAUSES = (
 
 
 def find_misspecifications_by_modes(
-    experiment: Experiment, constants: Mapping[str, float], huber: float | None = None
+    experiment: Experiment, constants: Mapping[str, float]
 ) -> tuple[Hypothesis, ...]:
     """Return hypotheses about a recording's description, likeliest first; mostly empty.
 
@@ -67,14 +61,11 @@ def find_misspecifications_by_modes(
     ----------
     constants : mapping of str to float
         Constants of the body; only ratios of stiffness within it matter.
-    huber : float, optional
-        Threshold of Huber's loss; None means a quadratic loss.
 
     Notes
     -----
     Without markers only signs of loads are tested; in a static experiment, or where modes are of no
-    use (`ModalComparison.from_experiment`), no modes are used. That the body was not at rest at the
-    beginning is only reported if no other hypothesis is.
+    use (`ModalComparison.from_experiment`), no modes are used.
     """
     if not experiment.markers.names:
         return rank(load_sign_hypotheses(experiment))
@@ -82,15 +73,7 @@ def find_misspecifications_by_modes(
         return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
     comparison = ModalComparison.from_experiment(experiment, constants)
     tried = _rigid_axes(experiment) if comparison is None else comparison.hypotheses()
-    hypotheses = [
-        *tried,
-        *name_exchange_hypotheses(experiment, huber),
-        *step_hypotheses(experiment),
-    ]
-    hypotheses += undriven_motion(experiment)
-    if not hypotheses:
-        hypotheses += initial_motion_hypotheses(experiment)
-    return rank(_with_stated_frames(experiment, hypotheses))
+    return rank(_with_stated_frames(experiment, [*tried]))
 
 
 def _with_stated_frames(experiment: Experiment, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
@@ -126,7 +109,7 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
     if markers.sample_count:
         tracks_m = markers.positions_at_samples_m
         rows = _axes(f"'{experiment.name}'", tracks_m)
-        yield from accepted(rows, tracks_m, remaining_misfit, LEAST_IMPROVEMENT)
+        yield from accepted(rows, tracks_m, remaining_misfit)
 
 
 def _axes(name: str, tracks_m: Array) -> Iterator[Doubt]:
@@ -230,9 +213,9 @@ class ModalComparison:
         """
         declared = self.declared
         at_places = self.misfit_at_implied_places_m
-        yield from accepted(simple_rows(declared), declared, at_places, LEAST_IMPROVEMENT)
+        yield from accepted(simple_rows(declared), declared, at_places)
         fitted = [*self._frame_rows(), *self._clock_rows()]
-        yield from accepted(fitted, declared, self.misfit_m, LEAST_IMPROVEMENT)
+        yield from accepted(fitted, declared, self.misfit_m)
         yield from self._name_hypotheses()
         yield from self._other_axes()
 
@@ -245,7 +228,7 @@ class ModalComparison:
 
         tracks_m = self.declared.tracks_m
         rows = _axes(f"'{self.declared.name}'", tracks_m)
-        yield from accepted(rows, tracks_m, remaining_misfit, LEAST_IMPROVEMENT)
+        yield from accepted(rows, tracks_m, remaining_misfit)
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
         """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared
@@ -312,7 +295,7 @@ class ModalComparison:
         )
         shown = exchanged_names(names, chosen)
         row = Doubt.whole("markers-exchanged", renamed, names=shown)
-        yield from accepted([row], few, self.misfit_m, LEAST_IMPROVEMENT)
+        yield from accepted([row], few, self.misfit_m)
 
 
 def _with_markers(declared: DeclaredMotion, tracks_m: Array, markers: Index) -> DeclaredMotion:

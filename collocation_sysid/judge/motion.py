@@ -1,5 +1,5 @@
-"""Rows of likely mistakes about a motion: clock, slip, grasp, gravity, unloading, and the mesh and
-laws of the body.
+"""Rows of likely mistakes about a motion: clock, grasp, gravity, and the mesh and laws of the
+body.
 """
 
 from __future__ import annotations
@@ -12,23 +12,18 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.time_dependence import at_times
 from ..errors import InputError
-from ..methods.solution import Solution
-from ..program.modes.modal_prediction import DeclaredMotion
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp
-from ..recording.hysteresis import branch_differences, loading_branch, unloading_difference
 from ..recording.nuisance import GRASP_SHIFT, GRASP_TURN, TILT, TIME
 from ..recording.poses import PoseSequence
 from ..statistics.hypothesis import Hypothesis
-from ..statistics.thresholds import ESTIMATED_LAGS, FAR, SLIP
+from ..statistics.thresholds import ESTIMATED_LAGS, FAR
 from .bodies import body_rows, mirrored_meshes
 from .doubt import Correction, Doubt, clock_data
 from .fit import Candidate, TestedFit
 from .modes import ModalComparison, other_gravity
-from .sensors import sensor_rows
+from .sensors import sensor_candidates
 
-# Most samples of a loading branch that is fitted.
-MOST_SAMPLES = 100
 # Deviation of a clock in the linear step [s].
 WIDE_LAG_S = 0.1
 # Deviation of the thickness of a layer in the linear step, over the extent of the body.
@@ -39,13 +34,10 @@ BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
 SLOW_MOTIONS = (4.0, 8.0)
 # Share of χ² that remains of which linear steps come before mirrored meshes.
 UNMEASURED = 0.9
-# Fewest samples before and after a slip.
-SHORTEST = 4
 
 
 def motion_rows(fit: TestedFit) -> Iterator[Doubt]:
     """Yield the rows of a motion that have a linear step."""
-    yield from sensor_rows(fit)
     if not fit.experiment.is_static:
         yield from _clock(fit)
     yield from _layers(fit)
@@ -53,14 +45,12 @@ def motion_rows(fit: TestedFit) -> Iterator[Doubt]:
 
 
 def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
-    """Yield the likely mistakes of a motion without a linear step, by a criterion of their own: a
-    slip by the step in the residuals, softer unloading, which the measured forces show, and mirrored
-    meshes and the direction of gravity if the fit moved the body far from its stated pose.
+    """Yield the likely mistakes of a motion without a linear step, by a criterion of their own:
+    sensors, mirrored meshes, films in slow motion, and the direction of gravity if the fit moved the body far
+    from its stated pose.
     """
     experiment = fit.experiment
-    yield from _slip(fit)
-    if unloading := _unloading(fit.whole).hypothesis(experiment):
-        yield 0.0, replace(unloading, subject="")
+    yield from sensor_candidates(fit)
     for row in (*_slow_motions(experiment), *mirrored_meshes(experiment)):
         if found := row.hypothesis(experiment):
             yield UNMEASURED, found
@@ -82,7 +72,7 @@ def _clock(fit: TestedFit) -> Iterator[Doubt]:
     """Yield the row of poses that are late or early; its column is the rate of all predictions."""
     prior_s = fit.experiment.nuisance.sigma(TIME) or 0.0
     rates = {
-        each: [np.gradient(values, each.sample_times_s, axis=0) / each.sample_sigmas]
+        each: np.gradient(values, each.sample_times_s, axis=0) / each.sample_sigmas
         for each, values in fit.predictions.items()
         if len(values) > 1
     }
@@ -94,7 +84,7 @@ def _clock(fit: TestedFit) -> Iterator[Doubt]:
         other = with_pose_lag(experiment, lag_s)
         return other and (other, clock_data(lag_s))
 
-    changes = fit.blocks_of(rates, 1)
+    changes = fit.blocks_of(rates)
     yield Doubt("clock", "s", correct, changes=changes, mean=0.0, wide=WIDE_LAG_S)
 
 
@@ -157,61 +147,6 @@ def _other_layer(experiment: Experiment, deeper: bool) -> Correction:
     except InputError:
         return None
     return other, {"deep": "more" if deeper else "fewer"}
-
-
-def _unloading(solution: Solution) -> Doubt:
-    """Return the row of a material that unloads below its loading curve on a bench; without it only
-    the loading branch is fitted. The message has the differences of all fitted experiments.
-    """
-
-    def corrected(experiment: Experiment, _: Array) -> Correction:
-        branch = loading_branch(experiment, MOST_SAMPLES)
-        if branch is None or (unloading_difference(experiment) or 0.0) >= 0.0:
-            return None
-        fitted = [each.experiment for each in solution.collocation.transcriptions]
-        return branch, {"sizes": branch_differences(each for each in fitted if not each.specimen)}
-
-    return Doubt("hysteresis", "1", corrected)
-
-
-def _slip(fit: TestedFit) -> Iterator[Candidate]:
-    """Yield a marker of whose residuals two means explain `SLIP` times more than one."""
-    experiment, markers = fit.experiment, fit.experiment.markers
-    if len(markers.names) < 2 or not markers.sample_count:
-        return
-    fitted_m = fit.solution.readings_m[0]
-    residual = np.where(markers.is_measured, fitted_m - markers.positions_m, np.nan)
-    described = DeclaredMotion.from_experiment(experiment)
-    if described is not None:
-        residual = np.einsum("tji,tmj->tmi", described.rotations, residual[: len(described.t_s)])
-    clearest = [_largest_step(residual[:, m]) for m in range(residual.shape[1])]
-    m = int(np.argmax([ratio for ratio, _ in clearest]))
-    if clearest[m][0] < SLIP:
-        return
-    tracks = np.array(markers.positions_m)
-    tracks[:, m] = np.nan
-    squares = np.nansum(residual**2, axis=(0, 2))
-    data = {"marker": markers.names[m], "t_s": experiment.t_s[clearest[m][1]]}
-    other = replace(experiment, markers=replace(markers, positions_m=tracks))
-    found = Hypothesis("marker-slip", f"'{experiment.name}'", data=data, corrected=other)
-    yield 1 - squares[m] / squares.sum(), found
-
-
-def _largest_step(residual: Array) -> tuple[float, int]:
-    """Return how much better two means explain residuals (T, 3) than one, and where they change."""
-    present = np.flatnonzero(np.isfinite(residual[:, 0]))
-    if len(present) < 2 * SHORTEST:
-        return 1.0, 0
-    x = residual[present]
-    total = np.cumsum(x, axis=0)[:-1]
-    count = np.arange(1, len(x))[:, None]
-    before = total / count
-    after = (x.sum(axis=0) - total) / (len(x) - count)
-    gain = np.sum(count * before**2 + (len(x) - count) * after**2, axis=1)
-    k = SHORTEST - 1 + int(np.argmax(gain[SHORTEST - 1 : len(x) - SHORTEST]))
-    one = np.sum((x - x.mean(axis=0)) ** 2)
-    two = np.sum(x**2) - gain[k]
-    return float(np.sqrt(one / max(two, 1e-30))), int(present[k + 1])
 
 
 def with_pose_lag(experiment: Experiment, lag_s: float) -> Experiment | None:

@@ -1,90 +1,80 @@
-"""Rows of likely mistakes of sensors that a fit misses: sign, unit, axes, zero and clock.
-
-Of recordings with markers, `features.wrenches.doubts` compares wrenches with the prediction of the
-markers. Here nothing else may be measured.
-"""
+"""Rows of likely mistakes of wrenches and custom sensors that a fit misses: sign, unit and axes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from ..common.array_types import Array, root_mean
-from ..errors import InputError
+from ..errors import InputError, SimulationError
+from ..methods.reduced_space import ReducedSpace
+from ..program.measured_motion import fitted_values
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement
+from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ..statistics.axes import with_other_axes
 from ..statistics.thresholds import BETTER, NOISE
 from .doubt import Correction, Doubt
-from .fit import TestedFit, scaled_residuals
+from .fit import Candidate, TestedFit, scaled_residuals
 
-# Factors of wrong units: prefixes, percent, degrees, kilograms-force, pounds-force, psi, inches.
-FACTORS = (1e6, 1e3, 1e2, 1e1, 180 / np.pi, 9.80665, 4.4482216, 6894.757, 25.4)
+# Factors of wrong units: prefixes, percent, gram-force, degrees, kilograms-force, pounds-force, psi, inches.
+FACTORS = (1e6, 1e3, 1e2, 1e1, 101.97162, 180 / np.pi, 9.80665, 4.4482216, 6894.757, 25.4)
 # Largest ratio of the size of the prediction and that of the values in another unit.
 SAME_SIZE = 3.0
 # Most units that are fitted again.
 MOST_UNITS = 2
-# Largest lag over the length of the recording.
-LATEST = 0.25
+# Most sweeps of a fit of all other measurements.
+MOST_SWEEPS = 40
 
 
-def sensor_rows(fit: TestedFit) -> Iterator[Doubt]:
-    """Yield the rows of the sensors that miss by more than noise: of custom sensors, and of wrenches
-    without markers.
+def sensor_candidates(fit: TestedFit) -> Iterator[Candidate]:
+    """Yield the likely mistakes of the wrenches and custom sensors that miss by more than noise,
+    compared with the prediction of all other measurements, which a wrong sensor does not distort.
     """
+    measurements = fit.experiment.measurements
     for sensor, ratios in scaled_residuals(fit.part):
-        has_markers = bool(fit.experiment.markers.sample_count)
-        is_alone = isinstance(sensor, Wrench) and not has_markers
         misses = root_mean(ratios[np.isfinite(ratios)] ** 2) > NOISE
-        if misses and (isinstance(sensor, CustomSensor) or is_alone):
-            yield from _rows_of(fit, sensor)
+        if not misses or sensor.counts_pixels or not isinstance(sensor, CustomSensor | Wrench):
+            continue
+        predicted = _predicted_by_others(fit, sensor)
+        of = f"{sensor.samples_text or sensor.title} of '{fit.experiment.name}'"
+
+        def squares(values: Array, sensor: Measurement = sensor, own: Array = predicted) -> float:
+            return float(np.nansum(((values - own) / sensor.sample_sigmas) ** 2))
+
+        for row in whole_mistakes(sensor, predicted):
+            if (found := row.hypothesis(fit.experiment)) is not None:
+                other = found.corrected.measurements[measurements.index(sensor)]
+                share = squares(other.measured_values) / squares(sensor.measured_values)
+                if share < BETTER**-2:
+                    yield share, replace(found, subject=of)
 
 
-def _rows_of(fit: TestedFit, sensor: Measurement) -> Iterator[Doubt]:
-    predicted = fit.predictions[sensor]
-    of = f"{sensor.samples_text or sensor.title} of '{fit.experiment.name}'"
-    sigmas = sensor.sample_sigmas
-    measured = sensor.measured_values
-    t_s = sensor.sample_times_s
-
-    def row(code: str, columns: list[Array], correct: Callable[..., Correction], **keys: object):
-        changes = fit.blocks_of({sensor: columns}, len(columns))
-        return Doubt(code, sensor.unit, correct, changes=changes, subject=of, **keys)  # type: ignore
-
-    if not sensor.counts_pixels:
-        for each in whole_mistakes(sensor, predicted):
-            other = each.hypothesis(fit.experiment)
-            if other is not None:
-                place = fit.experiment.measurements.index(sensor)
-                values = other.corrected.measurements[place].measured_values
-                yield row(each.name, [(measured - values) / sigmas], each.correct)
-        used = np.flatnonzero(np.isfinite(measured).any(axis=0))
-        units = np.broadcast_to(1 / sigmas, measured.shape)
-        zeros = [np.eye(measured.shape[1])[k] * units for k in used]
-
-        def zeroed(experiment: Experiment, size: Array) -> Correction:
-            offset = np.zeros(measured.shape[1])
-            offset[used] = size
-            shown = f"{', '.join(f'{each:.3g}' for each in size)} {sensor.unit}".rstrip()
-            return _changed(experiment, sensor, t_s, measured - offset, offset=shown)
-
-        axes = " ".join(map(str, used))
-        yield row("sensor-zero", zeros, zeroed, axes=axes, mean=0.0, wide=np.inf)
-    if fit.experiment.is_static or len(t_s) < 3:
-        return
-
-    def delayed(experiment: Experiment, size: Array) -> Correction:
-        (lag_s,) = size.tolist()
-        data = {"by_ms": 1e3 * abs(lag_s), "when": "later" if lag_s > 0 else "earlier"}
-        if not 0 < abs(lag_s) < LATEST * float(np.ptp(t_s)):
-            return None
-        return _changed(experiment, sensor, t_s + lag_s, measured, **data)
-
-    rates = np.gradient(predicted, t_s, axis=0) / sigmas
-    yield row("sensor-clock", [rates], delayed, mean=0.0, wide=np.inf)
+def _predicted_by_others(fit: TestedFit, sensor: Measurement) -> Array:
+    """Return the values (S, m) by a fit of all other measurements, else by that of all."""
+    part, experiment = fit.part, fit.experiment
+    others = [None if each is sensor else each for each in experiment.measurements]
+    if not any(each is not None and each.has_samples() for each in others):
+        return fit.predictions[sensor]
+    collocation = fit.solution.collocation
+    try:
+        blind = replace(collocation, experiments=(experiment.with_measurements(others),))
+        solution = ReducedSpace(max_iterations=MOST_SWEEPS)(blind)
+    except (InputError, SimulationError):
+        return fit.predictions[sensor]
+    (own,) = solution.unless_interrupted().parts
+    nuisance = part.transcription.nuisance
+    known = dict(zip(own.transcription.nuisance.names, own.phi, strict=True))
+    # A tare of the wrong sensor is none; a tool may weigh more than the body.
+    phi = np.array([known.get(name, 0.0) for name in nuisance.names])
+    tools = nuisance.indices_of_rows(TOOL_MASS, TOOL_CENTRE)
+    phi[tools] = part.phi[tools]
+    iterate = replace(part, q=own.q, phi=phi, x=own.x)
+    return np.asarray(fitted_values(iterate)[experiment.measurements.index(sensor)])
 
 
 def measurement_mistake(
@@ -106,14 +96,6 @@ def measurement_mistake(
     return Doubt(code, stated.unit, correct)
 
 
-def _changed(
-    experiment: Experiment, sensor: Measurement, t_s: Array, values: Array, **data: object
-) -> Correction:
-    """Return the experiment with a sensor that measured other values (S, m) at times (S,)."""
-    row = measurement_mistake("", sensor, lambda each: each.with_samples(t_s, values), **data)
-    return row.correct(experiment, np.ones(1))
-
-
 def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Doubt]:
     """Yield wrong signs, units and axes of a sensor."""
     measured = sensor.measured_values
@@ -127,16 +109,23 @@ def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Doubt]:
 
     yield mistake("sensor-sign", -measured)
     known = np.isfinite(measured + predicted)
-    size = root_mean((measured / sigmas)[known] ** 2)
-    ratio = root_mean((predicted / sigmas)[known] ** 2) / max(size, 1e-300)
-    units = sorted(
-        (max(ratio / factor, factor / ratio), factor)
-        for each in (FACTORS if ratio > 0 else ())
-        for factor in (each, 1 / each)
-    )
-    for apart, factor in units[:MOST_UNITS]:
-        if apart < SAME_SIZE:
-            yield mistake("sensor-unit", factor * measured, factor=factor)
+    kinds = ("forces", "torques") if isinstance(sensor, Wrench) else ("values",)
+    for what, columns in zip(
+        kinds, np.split(np.arange(measured.shape[1]), len(kinds)), strict=True
+    ):
+        own = known & np.isin(np.arange(measured.shape[1]), columns)
+        size = root_mean((measured / sigmas)[own] ** 2) if own.any() else 0.0
+        ratio = root_mean((predicted / sigmas)[own] ** 2) / max(size, 1e-300) if size else 0.0
+        units = sorted(
+            (max(ratio / factor, factor / ratio), factor)
+            for each in (FACTORS if ratio > 0 else ())
+            for factor in (each, 1 / each)
+        )
+        for apart, factor in units[:MOST_UNITS]:
+            if apart < SAME_SIZE:
+                other = measured.copy()
+                other[:, columns] *= factor
+                yield mistake("sensor-unit", other, what=what, factor=factor)
     if measured.shape[1] % 3 == 0:
 
         def misfit(values: Array) -> float:

@@ -1,10 +1,10 @@
-"""Misspecification hypotheses about measured values that are copies of others, about filtered ones,
-as by the software of cameras, and about markers that have each other's names.
+"""Misspecification hypotheses about tracks that are copies of others, about filtered ones, as by
+the software of cameras, and about markers that have each other's names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -12,9 +12,7 @@ from scipy.spatial import KDTree
 
 from ..common.array_types import Array, root_mean
 from ..program.experiment_iterate import ExperimentIterate
-from ..program.measured_motion import Predicted
 from ..recording.experiment import Experiment
-from ..recording.markers import Markers
 from ..recording.nuisance import PLACE
 from ..statistics.distributions import normal_isf
 from ..statistics.hypothesis import Hypothesis
@@ -104,33 +102,30 @@ def same_tracks(experiment: Experiment) -> Iterator[Hypothesis]:
         return
 
 
-def filtered_signals(experiment: Experiment, fitted: Iterable[Predicted]) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that values of a fitted experiment were low-passed, for each measurement
-    whose residuals have a spectrum of noise at low frequencies that falls far below it at high ones.
+def filtered_tracks(experiment: Experiment, fitted_m: Array) -> Iterator[Hypothesis]:
+    """Yield the hypothesis that the tracks of a fitted experiment, with predictions (T, M, 3) [m], were
+    low-passed, if their residuals have a spectrum of noise at low frequencies that falls far below it
+    at high ones.
     """
-    for measurement, predicted in zip(experiment.measurements, fitted, strict=True):
-        t_s = measurement.sample_times_s
-        if experiment.is_static or not isinstance(predicted, np.ndarray):
-            continue
-        scaled = (predicted - measurement.measured_values) / measurement.sample_sigmas
-        used = np.isfinite(scaled).any(axis=1)
-        complete = np.isfinite(scaled[used]).all(axis=0)
-        if used.sum() < FEWEST_SAMPLES or not complete.any():
-            continue
-        intervals_s = np.diff(t_s[used])
-        if np.ptp(intervals_s) > EVEN * intervals_s.mean():
-            continue
-        frequency_hz, amplitude = _amplitudes(scaled[used][:, complete], float(intervals_s.mean()))
-        cutoff = _cutoff(amplitude)
-        if cutoff is None:
-            continue
+    markers = experiment.markers
+    if experiment.is_static:
+        return
+    scaled = (fitted_m - markers.positions_m) / markers.sigma_m[:, None]
+    scaled = scaled.reshape(len(scaled), -1)
+    used = np.isfinite(scaled).any(axis=1)
+    complete = np.isfinite(scaled[used]).all(axis=0)
+    if used.sum() < FEWEST_SAMPLES or not complete.any():
+        return
+    intervals_s = np.diff(markers.t_s[used])
+    if np.ptp(intervals_s) > EVEN * intervals_s.mean():
+        return
+    frequency_hz, amplitude = _amplitudes(scaled[used][:, complete], float(intervals_s.mean()))
+    cutoff = _cutoff(amplitude)
+    if cutoff is not None:
         high = float(np.sqrt(np.mean(amplitude[2 * cutoff :] ** 2)))
         data = {"frequency_hz": float(frequency_hz[cutoff]), "percent": 100 * high}
-        code = "tracks-filtered"
-        if not isinstance(measurement, Markers):
-            code = "sensor-filtered"
-            data |= {"what": measurement.title, "stated": measurement.sigma_text}
-        yield Hypothesis(code, f"'{experiment.name}'", data=data, strength=1 / STOPPED)
+        of = f"'{experiment.name}'"
+        yield Hypothesis("tracks-filtered", of, data=data, strength=1 / STOPPED)
 
 
 def _amplitudes(values: Array, interval_s: float) -> tuple[Array, Array]:

@@ -15,9 +15,9 @@ from ..errors import listed, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
 from ..recording.homogeneous_deformation import shape_factor
-from ..recording.hysteresis import loading_rows
 from ..recording.specimen_averages import RESOLUTION, with_averaged_rows
 from ..recording.specimen_checks import (
+    loading_rows,
     order_warnings,
     require_plausible_specimen,
     rows_after_cycles,

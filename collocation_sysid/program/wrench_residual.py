@@ -10,7 +10,7 @@ motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
-from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.nuisance import SENSOR_TIME, TARE
 from ..recording.sample_times import TIME_TOLERANCE_S
@@ -149,13 +148,6 @@ class WrenchResidual(MeasurementResidual):
         predicted = self.predict(values, phi)
         return np.where(self.is_covered(len(values))[:, None, None], predicted, np.nan)
 
-    def with_wrench(self, wrench: Wrench) -> WrenchResidual:
-        """Return the model of other samples, in their own frame and about their own point, with a
-        quadratic loss and names without suffix.
-        """
-        observable = replace(self.observable, frame=wrench.frame, point_m=wrench.point_m)
-        return WrenchResidual.from_sensor(observable, wrench)
-
 
 def _is_covered(observable: ReactionResultant, t_s: Array, known: int) -> NDArray[np.bool_]:
     """Return which samples lie in the known times for any shift of the clock."""
@@ -199,13 +191,3 @@ class WrenchModel(MeasurementModel):
         self, association: Association, correspondences: Correspondences | None
     ) -> tuple[WrenchResidual]:
         return (self._residual,)
-
-
-def without_grasp_sensors(experiment: Experiment) -> Experiment:
-    """Return the experiment without force–torque sensors and without custom sensors of grasps;
-    custom sensors of points are kept.
-    """
-    is_at_grasp = {*experiment.wrenches, *(g for g in experiment.readings if g.grasp is not None)}
-    return experiment.with_measurements(
-        None if each in is_at_grasp else each for each in experiment.measurements
-    )

@@ -13,8 +13,7 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 - `nuisance`: unknowns of a single recording, with their priors.
 - `environment`: the density of the air.
 - `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh;
-  `specimen_files` reads their tables, `specimen_checks` finds mistakes in them, and
-  `hysteresis` compares loading and unloading.
+  `specimen_files` reads their tables, and `specimen_checks` finds mistakes and cycles in them.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `sources`; `writers` writes

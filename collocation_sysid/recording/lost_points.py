@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,37 +26,11 @@ FEWEST_BESIDE = 2
 FEWEST_TRACKS = 3
 # Distance from the track before all jumps over the largest jump, up to which the point is found again.
 FOUND_AGAIN = 0.5
-# Numbers of intervals that one may be if images are missing, and how far the ratio of the motions may
-# be from them; from the ratios of the others, which are 1 (median); part of the motion that may
-# differ from the mean of those before and after.
-MISSING = (2, 3)
-NEAR_MISSING = 0.2
-STEADY = 0.2
-UNLIKE = 0.25
 
 
-@dataclass(frozen=True)
-class HeldTrack:
-    """A track that is exactly at one place in some samples, while another one moves."""
-
-    track: int
-    runs: list[tuple[int, int]]  # first and last samples
-    moved: float  # largest motion of another track meanwhile [σ]
-
-    @property
-    def longest(self) -> tuple[int, int]:
-        """First and last sample of the longest run."""
-        return max(self.runs, key=lambda run: run[1] - run[0])
-
-    @property
-    def count(self) -> int:
-        """Number of samples in all runs."""
-        return sum(last - first + 1 for first, last in self.runs)
-
-
-def held_tracks(tracks: Array, sigma: float) -> Iterator[HeldTrack]:
+def held_tracks(tracks: Array, sigma: float) -> Iterator[tuple[int, list[tuple[int, int]]]]:
     """Yield the tracks (S, M, d) that are exactly at one place for some samples while others move,
-    as gaps that were filled with the last position or with zeros are.
+    as gaps that were filled with the last position or with zeros are; with first and last samples.
     """
     repeats = (np.diff(tracks, axis=0) == 0).all(axis=2)
     for m in range(tracks.shape[1]):
@@ -72,7 +45,7 @@ def held_tracks(tracks: Array, sigma: float) -> Iterator[HeldTrack]:
         extents = np.linalg.norm(np.ptp(others, axis=0), axis=1)
         moved = float(np.max(extents, initial=0.0, where=np.isfinite(extents))) / sigma
         if moved > STILL_SIGMAS:
-            yield HeldTrack(m, runs, moved)
+            yield m, runs
 
 
 def jumps(tracks: Array, sigma: float) -> Iterator[tuple[int, int, Array]]:
@@ -113,41 +86,11 @@ def followed_samples(tracks: Array, sigma: float) -> NDArray[np.bool_]:
     followed &= np.linalg.norm(off, axis=2) <= FOUND_AGAIN * largest
     early = 2 * followed.sum(axis=0) < (~followed).sum(axis=0)
     followed[:, early] = ~followed[:, early]
-    for held in held_tracks(tracks, sigma):
-        for first, last in held.runs:
-            followed[first : last + 1, held.track] = False
+    for track, runs in held_tracks(tracks, sigma):
+        for first, last in runs:
+            followed[first : last + 1, track] = False
     if tracks.shape[1] >= FEWEST_TRACKS:
         repeated = (np.diff(tracks, axis=0) == 0).all(axis=(1, 2))
         if repeated.sum() <= REPEATED * len(repeated):
             followed[1:][repeated] = False
     return followed
-
-
-def missing_images(tracks: Array, t_s: Array, sigma: float) -> Iterator[tuple[int, int]]:
-    """Yield the samples before which images are missing, and how many: tracks (S, M, d) at the times
-    t_s (S,) move about twice or three times as far there as the mean of the steps before and after.
-    """
-    if len(t_s) < FEWEST_HELD:
-        return
-    speeds = np.diff(tracks, axis=0) / np.diff(t_s)[:, None, None]
-    still = STILL_SIGMAS * sigma / float(np.median(np.diff(t_s)))
-    ratios = np.full(len(speeds), np.nan)
-    alike = np.zeros(len(speeds), dtype=bool)
-    for k in range(1, len(speeds) - 1):
-        usual = (speeds[k - 1] + speeds[k + 1]) / 2
-        known = np.isfinite(usual + speeds[k]).all(axis=1)
-        if known.sum() < FEWEST_TRACKS:
-            continue
-        own, usual = speeds[k][known], usual[known]
-        change = np.sqrt(np.mean(np.sum((speeds[k + 1] - speeds[k - 1])[known] ** 2, axis=1)))
-        size = np.sqrt(np.mean(np.sum(usual**2, axis=1)))
-        if size > still:
-            ratios[k] = np.sum(own * usual) / np.sum(usual**2)
-            rest = np.sqrt(np.mean(np.sum((own - ratios[k] * usual) ** 2, axis=1)))
-            alike[k] = rest < UNLIKE * size * abs(ratios[k]) and change < size
-    known = np.isfinite(ratios)
-    if known.sum() < FEWEST_HELD or np.median(np.abs(ratios[known] - 1)) > STEADY:
-        return
-    for times in MISSING:
-        for k in np.flatnonzero(alike & (np.abs(ratios - times) < NEAR_MISSING)).tolist():
-            yield k + 1, times - 1

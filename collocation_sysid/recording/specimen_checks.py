@@ -253,6 +253,15 @@ def cycle_starts(strain: Array) -> list[int]:
     return starts
 
 
+def loading_rows(strain: Array) -> slice:
+    """Return the rows of the last loading cycle in which the magnitude of the strain (T,)
+    increases, as a slice: from the first row of the cycle to its peak; see `cycle_starts`.
+    """
+    start = cycle_starts(strain)[-1]
+    peak = start + int(np.argmax(np.abs(strain[start:])))
+    return slice(start, peak + 1)
+
+
 def rows_after_cycles(strain: Array, count: int) -> slice:
     """Return the rows after the first `count` loading cycles as a slice; all rows for 0.
 

@@ -23,7 +23,6 @@ from ..errors import InputError
 from ..fem.elements import EDGES
 from ..fem.laws.constants import symbol_of, without_region
 from ..recording.experiment import Experiment
-from ..recording.hysteresis import bench_travel
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_files import specimen_strains
 from ..runs.result_content import Result
@@ -78,6 +77,8 @@ ARRAY_LAYOUT = {
 }
 # Words for the kinds of numbers in `ARRAY_LAYOUT`.
 KINDS_TEXT = {"f": "floats", "iu": "whole numbers", "b": "booleans"}
+# Part of its way by which a bench may leave the line along which it moves.
+LINE_TOLERANCE = 1e-3
 # Side of the square that represents a plane, over the body's largest extent.
 PLANE_SIZE_RATIO = 1.4
 # Arrays that may have NaN or infinity.
@@ -251,7 +252,7 @@ class MotionRecord:
             },
             reading_columns={each.name: [*each.columns] for each in experiment.readings},
             strain=specimen_strains(experiment)[0] if experiment.specimen else None,
-            travel_m=bench_travel(experiment),
+            travel_m=_bench_travel(experiment),
             **recorded,
         )
 
@@ -531,3 +532,23 @@ def damaged_run_refused(run: Path) -> AbstractContextManager[None]:
     names the files; an `InputError` itself passes.
     """
     return damage_refused(run, f"{RESULT_FILE} or {ARRAYS_FILE}", remedy="solve the problem again")
+
+
+def _bench_travel(experiment: Experiment) -> Array | None:
+    """Return the displacement (T, 3) [m] of the grasp or obstacle that moves farthest, of the whole
+    specimen; None if no force is measured, anything turns, or the displacement is on no line.
+    """
+    if experiment.specimen or not experiment.wrenches:
+        return None
+    travels = [np.zeros((len(experiment.t_s), 3))]
+    for grasp in experiment.grasps:
+        rotations, shifts = grasp.poses.at(experiment.t_s)
+        if not np.allclose(rotations, np.eye(3), atol=1e-6):
+            return None
+        travels.append(shifts / grasp.displacement_scale)
+    farthest = max(travels, key=lambda travel: float(np.ptp(travel, axis=0).max()))
+    for travel in (farthest, farthest - farthest[0]):
+        sizes = np.linalg.svd(travel, compute_uv=False)
+        if len(sizes) == 1 or sizes[1] <= LINE_TOLERANCE * sizes[0]:
+            return travel if np.ptp(travel, axis=0).max() > 0 else None
+    return None

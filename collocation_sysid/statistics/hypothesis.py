@@ -20,7 +20,7 @@ NO_CAUSE = "possible causes of the misfit were tested: none explains it"
 class Hypothesis:
     """One possible mistake in the description of a problem."""
 
-    code: str  # cause and how it shows, such as "marker-slip/alone"
+    code: str  # cause and how it shows, such as "specimen-kind/likelier"
     subject: str = ""  # what is described, as the beginning of the message; may be empty
     # mapping of str to value: values of the placeholders in the message.
     data: Mapping[str, Any] = field(default_factory=dict)

@@ -135,11 +135,6 @@ BETTER = Threshold(
     "Factor by which the misfit of a refit must decrease, unless only noise remains.",
     study="mistakes",
 )
-SLIP = Threshold(
-    2.0,
-    "Factor by which two means, before and after, must explain residuals better than one.",
-    study="mistakes",
-)
 CERTAIN = Threshold(
     4.0,
     "Factor of the misfit from which on no other hypothesis, and no other specimen, is tested.",
@@ -166,12 +161,6 @@ FAR = Threshold(
     "images of the mesh and other directions of gravity are fitted.",
     study="mistakes",
 )
-REPRODUCED = Threshold(
-    0.25,
-    "Largest residual over a step of the tracks that the fit reproduces; a slip leaves half of "
-    "it on both sides.",
-    study="mistakes",
-)
 LEAST_IMPROVEMENT = Threshold(2.0, "Factor by which the misfit must decrease.", study="mistakes")
 FITTED = Threshold(1.5, "Additional factor for hypotheses with fitted numbers.", study="mistakes")
 ONE_OF_MANY = Threshold(
@@ -181,15 +170,6 @@ LEAST_DECREASE = Threshold(
     16.0,
     "Decrease of χ² by a linear step below which a hypothesis is not fitted again: e⁻⁸ as likely.",
     study="mistakes",
-)
-NOISE_LEVEL = Threshold(
-    1.3,
-    "Root mean square of residuals and nuisance parameters, in standard deviations, up to "
-    "which there is nothing to explain.",
-    study="mistakes",
-)
-UNIT_LIKE = Threshold(
-    20.0, "Factor between initial slopes from which on a wrong unit is tested.", study="mistakes"
 )
 UNCORRELATED = Threshold(
     2.0,
@@ -225,13 +205,6 @@ AGAINST = Threshold(
     -0.8,
     "Correlation of load and displacement below which a sign is wrong; noise and hysteresis "
     "leave it positive.",
-    study="mistakes",
-)
-SUDDEN = Threshold(4.0, "Size of a step over usual changes between samples.", study="mistakes")
-CLEARLY = Threshold(2.5, "Factor by which exchanged names must fit better.", study="mistakes")
-TAMED = Threshold(
-    0.2,
-    "With Huber's loss, exchanges of a smaller share of the samples are tolerated as outliers.",
     study="mistakes",
 )
 NOTEWORTHY = Threshold(

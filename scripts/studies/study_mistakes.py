@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import contact_twins
@@ -24,20 +25,17 @@ import filmed_twins
 import numpy as np
 import record
 from script_arguments import make_parser
-from twins import BODIES, SOFT, sensing_twin, twin
+from twins import BODIES, SOFT, STIFF, sensing_twin, twin
 from wrong_cameras import DEPTH_FAULTS, MOVING_FAULTS
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, WRENCH_FAULTS, Fault
 from wrong_videos import PAIR_FAULTS, PLACE_FAULTS, VIDEO_FAULTS
 
 from collocation_sysid.errors import InputError, SimulationError
-from collocation_sysid.features.cameras.doubts import depth_image_hypotheses, may_be_images
-from collocation_sysid.features.wrenches.doubts import wrench_mistakes
-from collocation_sysid.methods.starts.initial_trajectories import initial_variables
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.runs.check import misspecification_hypotheses
-from collocation_sysid.statistics.hypothesis import Hypothesis, rank
+from collocation_sysid.statistics.hypothesis import Hypothesis
 
 # Seed of the random choices of a mistake, such as which markers are exchanged.
 FAULT_SEED = 3
@@ -90,7 +88,7 @@ def main() -> None:
     print(_line(["mistake", "`check`", "`solve`"]), _line(["---"] * 3), sep="\n")
     rows = []
     for row in table_rows(
-        families(options.body, options.samples),
+        families(options.samples),
         groups=options.groups,
         seeds=options.seeds,
         only=options.only,
@@ -108,7 +106,6 @@ def _options() -> argparse.Namespace:
     parser = make_parser(__doc__)
     groups = ["tracks", "wrench", "depth", "video", "obstacle"]
     parser.add_argument("--groups", nargs="+", choices=groups, default=groups)
-    parser.add_argument("--body", choices=list(BODIES), default="bar")
     parser.add_argument("--samples", type=int, default=40)
     parser.add_argument(
         "--seeds", type=int, default=5, help="number of correct problems of each kind"
@@ -119,29 +116,33 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def families(body: str, samples: int) -> list[ProblemFamily]:
-    """Return all kinds of problems; the arguments are the body and the number of samples of those
-    with markers.
-    """
-    shear_pa = SOFT["mu_pa"]
+def families(samples: int) -> list[ProblemFamily]:
+    """Return all kinds of problems; the argument is the number of samples of those with markers."""
     bar_pa = depth_twins.TRUTH["young_pa"]
     block_pa = contact_twins.TRUTH["young_pa"]
     return [
-        ProblemFamily(
-            "tracks",
-            "markers",
-            lambda seed: twin(body, SOFT, seed, samples),
-            {**FAULTS, **TRACK_FAULTS},
-            "mu_pa",
-            shear_pa,
+        *(
+            ProblemFamily(
+                group,
+                f"{kind}, {body}",
+                partial(make, body, SOFT, samples=samples),
+                {name if body == "bar" else f"{name} ({body})": fault for name, fault in faults},
+                "mu_pa",
+                SOFT["mu_pa"],
+            )
+            for group, kind, make, faults in (
+                ("tracks", "markers", twin, {**FAULTS, **TRACK_FAULTS}.items()),
+                ("wrench", "markers and sensor", sensing_twin, WRENCH_FAULTS.items()),
+            )
+            for body in BODIES
         ),
         ProblemFamily(
-            "wrench",
-            "markers and sensor",
-            lambda seed: sensing_twin(body, SOFT, seed, samples),
-            WRENCH_FAULTS,
+            "tracks",
+            "markers, stiff bar",
+            partial(twin, "bar", STIFF, samples=samples),
+            {f"{name} (stiff)": fault for name, fault in FAULTS.items() if "clock" in name},
             "mu_pa",
-            shear_pa,
+            STIFF["mu_pa"],
         ),
         ProblemFamily(
             "depth", "one depth image", depth_twins.hanging_twin, DEPTH_FAULTS, "young_pa", bar_pa
@@ -218,7 +219,7 @@ def table_row(
     try:
         correct = family.make(seed)
         described = correct if fault is None else fault(correct, np.random.default_rng(FAULT_SEED))
-        causes = checked_causes(described)
+        causes = misspecification_hypotheses(described)
     except (InputError, SimulationError) as error:
         refusal = f"refused: {error}"
     report = SolveReport("", False)
@@ -237,20 +238,6 @@ def table_row(
         right=() if fault is None else fault.causes,
         named=(*(each.code for each in causes[:1]), *report.named),
     )
-
-
-def checked_causes(problem: Problem) -> tuple[Hypothesis, ...]:
-    """Return the causes that `check` lists."""
-    causes = misspecification_hypotheses(problem)
-    has_images = any(e.depths for e in problem.experiments)
-    if causes and not (has_images and may_be_images(causes)):
-        return causes
-    collocation = problem.collocation()
-    if has_images:
-        variables, _ = initial_variables(collocation)
-        mistakes = depth_image_hypotheses(problem, collocation.iterates(variables))
-        causes = rank((*causes, *mistakes))
-    return causes or rank(wrench_mistakes(collocation)[0])
 
 
 def solve_report(problem: Problem, family: ProblemFamily) -> SolveReport:

@@ -129,6 +129,20 @@ def with_turned_camera(pose: Array) -> Array:
     return turned
 
 
+def in_millimetres(pose: Array) -> Array:
+    """Return the pose with its position in millimetres."""
+    scaled = pose.copy()
+    scaled[:3, 3] *= MILLIMETRES_PER_METRE
+    return scaled
+
+
+def beside(pose: Array) -> Array:
+    """Return the pose of a camera that was moved by half a metre along its horizontal axis."""
+    moved = pose.copy()
+    moved[:3, 3] += 0.5 * pose[:3, 0]
+    return moved
+
+
 def late(experiment: Experiment, rng: Rng) -> Experiment:
     """Return the experiment with a camera whose times are late; images after the end are left
     out.
@@ -154,24 +168,24 @@ DEPTH_FAULTS = {
     "depth: millimetres as metres": Fault(
         images(lambda each: MILLIMETRES_PER_METRE * each), ("camera",)
     ),
-    "depth: focal length doubled": Fault(with_focal_lengths_times(2.0), ("camera",)),
+    "depth: focal length doubled": Fault(with_focal_lengths_times(2.0), ()),
     "depth: principal point mirrored": Fault(depths(with_mirrored_principal_point), ("camera",)),
-    "depth: image rows flipped": Fault(images(lambda each: each[:, ::-1]), ("camera",)),
-    "depth: image mirrored left to right": Fault(
-        images(lambda each: each[:, :, ::-1]), ("camera",)
-    ),
+    "depth: image rows flipped": Fault(images(lambda each: each[:, ::-1]), ()),
+    "depth: image mirrored left to right": Fault(images(lambda each: each[:, :, ::-1]), ()),
     "depth: pose inverted": Fault(poses(with_inverse_pose), ("camera",)),
     "depth: pose of an OpenGL frame": Fault(poses(lambda pose: pose @ OPENGL), ("camera",)),
     "depth: pose of a frame with x forward": Fault(poses(with_axes_of_robot), ("camera",)),
     "depth: rotation transposed": Fault(poses(with_transposed_rotation), ("camera",)),
-    "depth: camera turned by 15 deg": Fault(poses(with_turned_camera), ("camera",)),
-    "depth: distance along the ray": Fault(depths(with_ray_lengths), ("camera",)),
+    "depth: camera turned by 15 deg": Fault(poses(with_turned_camera), ()),
+    "depth: distance along the ray": Fault(depths(with_ray_lengths), ()),
+    "depth: pose in mm": Fault(poses(in_millimetres), ("camera",)),
+    "depth: camera beside the body": Fault(poses(beside), ("camera",)),
     "depth: background not removed": Fault(images(with_wall), ()),
 }
 MOVING_FAULTS = {
-    "depth: camera 0.1 s late": Fault(late, ("camera-clock",)),
-    "depth: images in reverse order": Fault(images(lambda each: each[::-1]), ("camera-order",)),
+    "depth: camera 0.1 s late": Fault(late, ()),
+    "depth: images in reverse order": Fault(images(lambda each: each[::-1]), ()),
     "depth: image of the start throughout": Fault(
-        images(lambda each: np.repeat(each[:1], len(each), axis=0)), ("camera-constant",)
+        images(lambda each: np.repeat(each[:1], len(each), axis=0)), ()
     ),
 }

@@ -58,34 +58,30 @@ def zeroed_in_contact(wrench: Wrench) -> Wrench:
 
 
 POKING_FAULTS = {
-    "obstacle: load reversed": Fault(wrench_times(-1, -1), ("sign",)),
+    "obstacle: load reversed": Fault(wrench_times(-1, -1), ("sign", "obstacle-pull")),
     "obstacle: load in gram-force": Fault(wrench_times(1 / GRAM_FORCE_N, 1), ()),
     "obstacle: load of the whole for a quarter": Fault(wrench_times(PARTS, 1), ()),
     "obstacle: load zeroed in contact": Fault(wrenches(zeroed_in_contact), ("obstacle-pull",)),
     "obstacle: displacement in mm": Fault(
-        obstacles(with_ways(lambda ways: MILLIMETRES_PER_METRE * ways)), ("obstacle-stroke",)
+        obstacles(with_ways(lambda ways: MILLIMETRES_PER_METRE * ways)), ()
     ),
     "obstacle: diameter for radius": Fault(obstacles(with_ball(radius_factor=2.0)), ()),
-    "obstacle: 5 mm into the body": Fault(
-        obstacles(with_ball(shift_m=-MISPLACED_M)), ("obstacle-load",)
-    ),
-    "obstacle: 5 mm away from the body": Fault(
-        obstacles(with_ball(shift_m=MISPLACED_M)), ("obstacle-load",)
-    ),
+    "obstacle: 5 mm into the body": Fault(obstacles(with_ball(shift_m=-MISPLACED_M)), ()),
+    "obstacle: 5 mm away from the body": Fault(obstacles(with_ball(shift_m=MISPLACED_M)), ()),
     "obstacle: stroke begins 0.5 mm late": Fault(
         obstacles(with_ways(lambda ways: ways + STROKE_OFFSET_M * np.eye(3)[2])), ()
     ),
     "obstacle: fixed while it moves": Fault(
-        obstacles(with_ways(lambda ways: np.zeros_like(ways))), ("obstacle-fixed",)
+        obstacles(with_ways(lambda ways: np.zeros_like(ways))), ()
     ),
     "obstacle: moves along x in place of z": Fault(
-        obstacles(with_ways(lambda ways: -ways[:, [2, 1, 0]])), ("obstacle-load",)
+        obstacles(with_ways(lambda ways: -ways[:, [2, 1, 0]])), ()
     ),
 }
 PLATE_FAULTS = {
-    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-normal",)),
+    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-pull",)),
     "obstacle: friction 0 in place of 0.5": Fault(
-        obstacles(lambda each: replace(each, friction=0.0)), ("obstacle-friction",)
+        obstacles(lambda each: replace(each, friction=0.0)), ()
     ),
     "obstacle: load of a plate reversed": Fault(wrench_times(-1, -1), ("obstacle-pull", "sign")),
 }

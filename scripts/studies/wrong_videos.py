@@ -193,6 +193,11 @@ def drifting(values: Array) -> Array:
     return values
 
 
+def of_another_scene(values: Array) -> Array:
+    """Return the pixels of tracks in another video."""
+    return np.random.default_rng(8).uniform(0, 300, values.shape)
+
+
 def rolling(each: ImageTracks) -> ImageTracks:
     """Return tracks of a rolling shutter whose line delay is not stated."""
     values = np.array(each.pixels)
@@ -276,6 +281,7 @@ VIDEO_FAULTS = {
     "video: one track on the wall": Fault(pixels(on_background), ("image-track",)),
     "video: one track of a reflection": Fault(pixels(on_gripper), ("image-track",)),
     "video: all tracks drift": Fault(pixels(drifting), ("image-track",)),
+    "video: tracks of another scene": Fault(pixels(of_another_scene), NAMED),
     "video: sigma_px a tenth": Fault(tracks(lambda t: replace(t, sigma_px=0.1 * t.sigma_px)), ()),
 }
 PLACE_FAULTS = {

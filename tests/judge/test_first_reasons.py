@@ -58,6 +58,11 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "times of the markers.* 4 times too long",
         "none explains it",
     ),
+    "slow motion, 240 Hz": (
+        lambda: wrong.ring_down(8.0),
+        "times of the markers.* 8 times too long",
+        "none explains it",
+    ),
     "rolling shutter": (lambda: wrong.rolling_shutter(0.0), "line[_ ]delay", "none explains it"),
     "mirrored mesh": (lambda: wrong.mirrored_mesh(True), "mirror image", "First compare laws"),
     "round rod meshed square": (

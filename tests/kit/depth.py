@@ -9,7 +9,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
+from collocation_sysid.program.depth.outline_residual import OutlineResidual
+from collocation_sysid.program.depth.residual import DepthResidual
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
+from collocation_sysid.program.transcription import Transcription
 
 TRUTH = {"young_pa": 1.5e5, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
 
@@ -110,3 +113,9 @@ name = "front"
 file = "front.npz"
 sigma_m = 0.0002
 """
+
+
+def camera_residuals(transcription: Transcription) -> list[DepthResidual]:
+    """Residuals of the points of the depth cameras, without those of outlines."""
+    found = transcription.residuals_of(DepthResidual)
+    return [each for each in found if not isinstance(each, OutlineResidual)]

@@ -79,3 +79,11 @@ def wristed_cube(steps: int = 12, nuisance: Nuisance | None = None, **changes) -
     """The hung cube in a hand with a sensor."""
     cube = hung_cube(steps) if nuisance is None else hung_cube(steps, nuisance=nuisance)
     return sensing(cube, **changes)
+
+
+def without_grasp_sensors(experiment: Experiment) -> Experiment:
+    """The experiment without the sensors of grasps."""
+    at_grasp = {*experiment.wrenches, *(g for g in experiment.readings if g.grasp is not None)}
+    return experiment.with_measurements(
+        None if each in at_grasp else each for each in experiment.measurements
+    )

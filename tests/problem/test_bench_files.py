@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,12 +19,10 @@ from collocation_sysid.fem.meshes.mesh import ElementNodes
 from collocation_sysid.fem.meshes.selection import Face
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_of_edge
 from collocation_sysid.judge.modes import find_misspecifications_by_modes
-from collocation_sysid.judge.motion import _unloading
 from collocation_sysid.problem import Problem
 from collocation_sysid.problem.new import TEMPLATES, create_problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import displaced_axes, read_displacement, read_wrench
-from collocation_sysid.recording.hysteresis import loading_branch, unloading_difference
 from collocation_sysid.recording.sources.units import si_factor
 from collocation_sysid.recording.time_tables import read_pressure
 from collocation_sysid.result.run_sections import run_report
@@ -352,43 +348,10 @@ def cycle_of_a_bench(folder: Path, softening: float, each_way: int = 9) -> Path:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("softening", "each_way"), [(0.0, 9), (0.1, 9), (0.1, 121)])
-def test_hysteresis_of_a_bench_is_the_cause_where_loading_alone_fits(tmp_path, softening, each_way):
-    problem = Problem.read(cycle_of_a_bench(tmp_path, softening, each_way))
-    (experiment,) = problem.experiments
-    found = run(problem)
-    said = [e.message for e in found.trust.concerns if e.code == "description/hysteresis"]
-    shown = plain_text(run_summary(found.result))
-    if not softening:
-        assert unloading_difference(experiment) is None
-        assert said == []
-    else:
-        assert unloading_difference(experiment) == pytest.approx(-0.1, abs=0.01)
-        assert found.trust.verdict != "good"
-        assert re.search(r"in unloading differs from that in loading by -\d+ % in 'press'", *said)
-        assert "window_s" in said[0]
-        assert "hysteresis" in found.trust.concerns[0].message  # the cause comes first
-        assert "none explains" not in shown
-        assert "drift" not in shown
-
-
-def test_only_a_softer_unloading_is_hysteresis(tmp_path):
-    """A force that is larger in unloading would gain energy: its cause is another."""
-    (experiment,) = Problem.read(cycle_of_a_bench(tmp_path, -0.1)).experiments
-    assert unloading_difference(experiment) == pytest.approx(0.1, abs=0.01)
-    collocation = Problem.read(tmp_path / "problem.toml").collocation()
-    solution = SimpleNamespace(collocation=collocation)
-    assert _unloading(cast(Any, solution)).hypothesis(experiment) is None
-
-
-def test_the_loading_branch_has_the_peak_and_at_most_as_many_samples(tmp_path):
-    (experiment,) = Problem.read(cycle_of_a_bench(tmp_path, 0.1)).experiments
-    branch = loading_branch(experiment, 100)
-    assert branch is not None
-    np.testing.assert_array_equal(branch.t_s, experiment.t_s[:9])
-    thinned = loading_branch(experiment, 4)
-    assert thinned is not None
-    np.testing.assert_array_equal(thinned.t_s, experiment.t_s[[2, 5, 8]])
+@pytest.mark.parametrize("each_way", [9, 121])
+def test_hysteresis_of_a_bench_is_not_good(tmp_path, each_way):
+    found = run(Problem.read(cycle_of_a_bench(tmp_path, 0.1, each_way)))
+    assert found.trust.verdict != "good"
 
 
 @pytest.mark.long

@@ -19,6 +19,7 @@ from kit.depth import (
     SHAPE,
     TRUTH,
     bar,
+    camera_residuals,
     fitted,
     hanging,
     hanging_m,
@@ -32,7 +33,6 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.depth.camera_model import DepthCameraModel
-from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.sources.depth_files import read_depth

@@ -29,7 +29,6 @@ from PIL import Image
 
 import collocation_sysid as cs
 from collocation_sysid.common import array_files
-from collocation_sysid.features.outlines.doubts import hypotheses
 from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
 from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
 from collocation_sysid.features.outlines.residual import OutlinesResidual
@@ -198,12 +197,6 @@ def test_own_masks_are_those_of_another_program() -> None:
 def test_impossible_masks_are_refused(mask: np.ndarray, message: str) -> None:
     with pytest.raises(cs.InputError, match=message):
         outlines_of(mask)
-
-
-def test_a_mask_of_something_else_is_named() -> None:
-    other = np.roll(photograph(), 200, axis=0)
-    assert [h.data["common"] < 0.05 for h in hypotheses(hanging([outlines_of(other)]))] == [True]
-    assert [*hypotheses(hanging([outlines_of()]))] == []
 
 
 def test_outlines_can_be_pickled_and_shortened() -> None:

@@ -10,7 +10,6 @@ from kit.problem_files import run_command, write_problem
 
 import collocation_sysid as cs
 from collocation_sysid.features.measurements import prediction_error
-from collocation_sysid.features.specimens.doubts import exchanged_moduli
 from collocation_sysid.recording.specimen import is_harmonic
 from collocation_sysid.result.pictures.stress_strain import harmonic_picture
 from collocation_sysid.runs.check.measurements import check_recording
@@ -123,17 +122,6 @@ def test_a_harmonic_test_of_a_liquid_determines_its_instantaneous_modulus():
     assert found.status.converged
     assert 1e6 * found.parameters["young_pa"] == pytest.approx(instantaneous_pa, rel=0.01)
     assert found.parameters["b.tau_s"] == pytest.approx(tau_s, rel=0.02)
-
-
-@pytest.mark.parametrize("is_exchanged", [False, True])
-def test_exchanged_moduli_are_named(is_exchanged):
-    frequency_hz = np.geomspace(1e-3, 1e3, 19)
-    storage, loss = complex_modulus_pa(frequency_hz)
-    noise = 0.01 * np.hypot(storage, loss) * np.random.default_rng(0).normal(size=(2, 19))
-    columns = np.abs(np.array([storage, loss]) + noise)
-    specimen = cs.Specimen.harmonic(frequency_hz, *columns[:: -1 if is_exchanged else 1], 0.01)
-    found = exchanged_moduli(specimen.experiment("neo-hookean", "dma", prony=("a",)))
-    assert [each.cause for each in found] == ["specimen-moduli"] * is_exchanged
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ import pytest
 from kit.problem_files import run_command
 
 import collocation_sysid as cs
-from collocation_sysid.recording.hysteresis import loading_rows, unloading_difference
+from collocation_sysid.recording.specimen_checks import loading_rows
 
 LOADING = np.linspace(0.0, 0.8, 21)
 CYCLE = np.concatenate([LOADING, LOADING[-2:0:-1]])
@@ -70,17 +70,6 @@ def test_an_unknown_branch_is_refused(tmp_path):
     file = written(tmp_path, keys='branch = "unloading"\n')
     with pytest.raises(cs.InputError, match=r"branch.*loading"):
         cs.Problem.read(file)
-
-
-def test_the_difference_of_the_branches_is_measured(tmp_path):
-    experiment = only_experiment(tmp_path, softening=0.12)
-    assert unloading_difference(experiment) == pytest.approx(-0.12, abs=0.02)
-
-
-def test_branches_that_agree_or_a_single_one_have_no_difference(tmp_path):
-    assert unloading_difference(only_experiment(tmp_path)) is None
-    loading = only_experiment(tmp_path, softening=0.12, keys='branch = "loading"\n')
-    assert unloading_difference(loading) is None
 
 
 @pytest.mark.long

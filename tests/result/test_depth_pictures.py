@@ -15,6 +15,7 @@ from kit.depth import (
     SHAPE,
     TRUTH,
     bar,
+    camera_residuals,
     fitted,
     hanging,
     image_m,
@@ -27,7 +28,6 @@ from kit.results import a_result
 import collocation_sysid as cs
 from collocation_sysid.features.cameras.poses import camera_hypotheses
 from collocation_sysid.pipeline import run
-from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording.depth_camera import points_from_image

@@ -17,7 +17,6 @@ from kit.fits import PARAMETERS, autoregressive, problem
 from kit.problems import hung_cube, measured
 from kit.silhouettes import hanging as hung_in_photograph
 from kit.silhouettes import outlines_of
-from scipy.signal import butter, sosfiltfilt
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -29,7 +28,6 @@ from collocation_sysid.features.measurements import (
     reason_against_copy,
 )
 from collocation_sysid.features.specimens.concerns import SPECIMEN_CODES, as_specimen_concerns
-from collocation_sysid.judge.tracks import filtered_signals
 from collocation_sysid.program.depth.surface_comparison import DepthError, SurfaceComparison
 from collocation_sysid.runs.verdict import _outlier_counts
 from collocation_sysid.statistics.assessment import (
@@ -352,24 +350,6 @@ def outlier_share(kind):
     assert [each.code for each in outlier_share_concerns(10, 100)] == ["residuals/wild"]
 
 
-def filtered(kind):
-    rng = np.random.default_rng(0)
-    experiment = only(kind, hung_cube(199))
-    t_s = experiment.t_s
-    (measurement,) = (e for e in experiment.measurements if e.has_samples())
-    noise = rng.normal(size=measurement.measured_values.shape)
-    smooth = sosfiltfilt(butter(2, 8.0, output="sos", fs=100.0), noise, axis=0)
-    slow = 3 * np.sin(9 * t_s)[:, None]
-    for error, is_named in ((noise, False), (smooth, True)):
-        predicted = measurement.measured_values + (error + slow) * measurement.value_sigmas
-        fitted: list[Any] = [
-            predicted if e is measurement else None for e in experiment.measurements
-        ]
-        found = [*filtered_signals(experiment, fitted)]
-        assert bool(found) == is_named
-        assert not found or measurement.sigma_text in found[0].message or kind == "markers"
-
-
 def forward(kind):
     experiment = only(kind)
     near, far = (instrument_misfits(experiment, predictions(experiment, k)) for k in (1.0, 9.0))
@@ -410,7 +390,6 @@ CHECKS = {
     "single samples": single_samples,
     "share of outliers": outlier_share,
     "disagreement of recordings": recordings_disagree,
-    "filtered signals": filtered,
     "forward simulation": forward,
     "validation": validation,
     "prediction without a fit": prediction,

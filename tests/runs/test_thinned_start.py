@@ -8,13 +8,12 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from kit.depth import MATRIX, NOISE_M, TRUTH, hanging, moved, noisy
+from kit.depth import MATRIX, NOISE_M, TRUTH, camera_residuals, hanging, moved, noisy
 
 import collocation_sysid as cs
 from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Status
-from collocation_sysid.program.depth.comparison import camera_residuals
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
 from collocation_sysid.runs import several_starts, thinned_start
 from collocation_sysid.runs.smaller_problem import NoStartError

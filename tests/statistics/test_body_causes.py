@@ -11,12 +11,12 @@ from scipy.signal import butter, sosfiltfilt
 from study_hidden_errors import TRUTH, twin
 
 from collocation_sysid import Problem, Unknown
-from collocation_sysid.fem.laws.materials import DAMPINGS
+from collocation_sysid.fem.laws.materials import MATERIALS
 from collocation_sysid.judge.bodies import (
     body_rows,
     mirrored_meshes,
     with_body,
-    with_laws,
+    with_material,
     with_shape,
 )
 from collocation_sysid.judge.engine import _named_alone_or_together, _Refits, find_misspecifications
@@ -85,13 +85,6 @@ def test_a_cause_is_named_alone_only_if_no_other_suffices():
     assert _named_alone_or_together([law, other], {2: 100.0, 3: 150.0}.__getitem__) == [law]
 
 
-def test_the_smaller_change_among_laws_of_equal_fit_is_named():
-    both = Hypothesis("law/both", "'a'", corrected=1, strength=3.1, remaining=0.9)
-    material = Hypothesis("law", "'a'", corrected=2, strength=3.0, remaining=0.9)
-    assert _named_alone_or_together([both, material], {1: 100.0, 2: 103.0}.get) == [material]
-    assert _named_alone_or_together([both, material], {1: 100.0, 2: 150.0}.get) == [both]
-
-
 def test_a_cube_has_no_other_mirror_image_and_keeps_its_grasp_when_scaled():
     hung = hung_cube(5)
     assert not [row for row in mirrored_meshes(hung) if row.hypothesis(hung)]
@@ -106,7 +99,9 @@ def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
     described = measured(hung_cube(8))
     solution = solve(Problem([described], GUESS, substeps=1), "reduced-space")
     (experiment,) = (each.experiment for each in solution.collocation.transcriptions)
-    changed = with_body(experiment, with_laws(experiment.body, None, DAMPINGS["rayleigh"]))
+    changed = with_body(
+        experiment, with_material(experiment.body, MATERIALS["st-venant-kirchhoff"])
+    )
     assert changed is not None
     refits = _Refits(solution, [experiment])
     refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
@@ -119,7 +114,7 @@ def test_no_other_material_is_suggested_for_small_strains():
     rest_m = np.tile(part.transcription.body.nodes_m.ravel(), (len(part.x), 1))
     for stretch, is_suggested in ((1.04, False), (1.06, True)):
         rows = body_rows(replace(part, x=stretch * rest_m))
-        assert any(row.name in ("law", "law/both") for row in rows) == is_suggested
+        assert any(row.name == "law" for row in rows) == is_suggested
 
 
 @pytest.mark.slow

@@ -5,8 +5,6 @@ is another: a law that is too simple, a toe region, and an unloading branch. Tha
 is tested in tests/recording/test_specimen.py.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -162,45 +160,20 @@ def test_a_hypothesis_keeps_contradicting_lateral_stretches():
 
 
 @pytest.mark.long
-def test_magnitudes_of_a_compression_test_are_named():
-    """Strain, stress and lateral strain are all positive in the file."""
-    strain = np.linspace(-0.02, -0.4, 14)
-    alpha, beta = 2.0, 0.75
-    stretch = 1 + strain
-    lateral = stretch ** (-beta / (1 + 2 * beta))
-    volume = stretch * lateral**2
-    stress_pa = 1e5 * (stretch ** (alpha - 1) - volume ** (-alpha * beta) / stretch)
-    rng = np.random.default_rng(0)
-    noise = rng.normal(size=(2, 14))
-    pressed = cs.Specimen(
-        "uniaxial",
-        -strain,
-        -stress_pa + 100 * noise[0],
-        100.0,
-        lateral_stretch=lateral + 0.002 * noise[1],
-        lateral_sigma=0.002,
-    ).experiment("hyperfoam-1", "press")
-    assert pressed.specimen is not None
-    columns = ("strain", "lateral_strain", "stress")
-    pressed = replace(pressed, specimen=replace(pressed.specimen, columns=columns))
-    unknown = {name: cs.Unknown() for name in ("mu_1_pa", "alpha_1", "beta_1")}
-    run = cs.run(cs.Problem([pressed], unknown))
-    assert run.causes[0].code == "specimen-compression/widening"
-    assert "multiply the lateral strains in the file by -1" in run.trust.reasons[0]
-
-
-@pytest.mark.long
-def test_lateral_stretches_of_one_are_named_as_a_placeholder():
+@pytest.mark.parametrize(
+    ("test", "power", "measured", "quantity"),
+    [
+        ("uniaxial", 2, {"lateral_stretch": 1 + 0 * STRAIN}, "lateral strain"),
+        ("planar", 3, {"second_stress_pa": 0 * STRAIN}, "second stress"),
+    ],
+)
+def test_a_column_of_zeros_is_named_as_a_placeholder(test, power, measured, quantity):
     noise_pa = SIGMA_PA * np.random.default_rng(5).normal(size=25)
+    stress_pa = 1e5 * (1 + STRAIN - (1 + STRAIN) ** -power) + noise_pa
     unknown = {"mu_pa": cs.Unknown()} | FIXED
-    causes = causes_of_test(
-        "uniaxial",
-        unknown,
-        stress_pa=neo_hookean_pa(STRAIN) + noise_pa,
-        lateral_stretch=1 + 0 * STRAIN,
-    )
+    causes = causes_of_test(test, unknown, stress_pa=stress_pa, **measured)
     assert causes[0].cause == "specimen-placeholder"
-    assert "its lateral strain is zero in all rows" in causes[0].message
+    assert f"its {quantity} is zero in all rows" in causes[0].message
 
 
 # Words --------------------------------------------------------------------------------------------

@@ -374,7 +374,7 @@ def test_the_verdict_is_shown_stored_and_fed():
     assert "mm expected from noise alone" in markers
     noise_mm = float(markers.partition("RMS, ")[2].partition(" mm")[0])
     assert noise_mm == pytest.approx(1e3 * np.sqrt(3) * NOISE_M, rel=0.1)
-    caused = replace(found, causes=(Hypothesis("wrench-tare", "the wrench", strength=9.0),))
+    caused = replace(found, causes=(Hypothesis("sensor-sign", "the wrench", strength=9.0),))
     assert caused.trust.verdict == "doubtful"
     assert caused.trust.reasons[0].startswith(
         "likely: the wrench: the sensor was probably zeroed while it carried the body"

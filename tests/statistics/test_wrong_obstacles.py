@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from contact_twins import DRAGGED_NOISE_N, poked_twin, sheared_twin
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
-from wrong_twins import obstacles, wrench_times
+from wrong_twins import wrench_times
 
 from collocation_sysid.features.contact.doubts import obstacle_hypotheses
 from collocation_sysid.problem import Problem
@@ -76,21 +76,3 @@ def test_a_pull_within_the_tare_is_not_doubted():
     tared = replace(plate, nuisance=replace(Nuisance.none(), tare=4 / DRAGGED_NOISE_N))
     pulled = wrench_times(-1, 1)(tared, np.random.default_rng(0))
     assert "obstacle-pull" not in {each.cause for each in obstacle_hypotheses(pulled)}
-
-
-def test_friction_that_is_estimated_is_not_doubted():
-    free = obstacles(lambda each: replace(each, friction="plate_friction"))
-    (experiment,) = sheared_twin(1).experiments
-    given = free(experiment, np.random.default_rng(0))
-    assert [*obstacle_hypotheses(given)] == []
-
-
-def test_a_hanging_body_may_touch_an_obstacle_clear_of_the_undeformed_mesh():
-    """Its weight may take it to the obstacle or away."""
-    (experiment,) = poked_twin(1).experiments
-    away = POKING_FAULTS["obstacle: 5 mm away from the body"].change(
-        experiment, np.random.default_rng(0)
-    )
-    heavy = replace(away, gravity_m_s2=(0.0, 0.0, -9.81))
-    assert [each.cause for each in obstacle_hypotheses(away)] == ["obstacle-load"]
-    assert [*obstacle_hypotheses(heavy)] == []

@@ -26,7 +26,7 @@ from kit.filmed import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.doubts import places_off_body, track_hypotheses
+from collocation_sysid.features.image_tracks.doubts import track_hypotheses
 from collocation_sysid.features.image_tracks.feature import notes
 from collocation_sysid.features.image_tracks.places import find_places
 from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
@@ -178,16 +178,6 @@ def test_a_video_of_half_the_stated_rate_is_named_in_the_template() -> None:
     assert "their rate is 0.5 times the stated one" in found.message
 
 
-def test_an_image_that_is_missing_is_named_in_the_template() -> None:
-    experiment = video_template()
-    (tracks,) = (each for each in experiment.readings if isinstance(each, cs.ImageTracks))
-    left = np.delete(pixels_of(tracks), 39, axis=0).reshape(-1, 2 * len(tracks.names))
-    shorter = tracks.with_samples(tracks.t_s[:-1], left)
-    (found,) = hypotheses(replace(experiment, readings=[shorter]))
-    assert found.cause == "image-tracks"
-    assert f"the first before {tracks.t_s[39]:.4g} s" in found.message
-
-
 def test_a_wrong_rate_is_named_where_four_points_far_from_the_grasp_determine_the_pose() -> None:
     experiment = video_template()
     (tracks,) = (each for each in experiment.readings if isinstance(each, cs.ImageTracks))
@@ -232,22 +222,8 @@ def stuck(pixels: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def jumping(pixels: np.ndarray) -> np.ndarray:
-    pixels[22:25, 3] = np.nan
-    pixels[25:, 3] += [20.0, -8.0]
-    return pixels
-
-
-FAULTS = {
-    "exchanged": (exchanged, "the tracks tip_front and tip_top fit each other's places"),
-    "stuck": (stuck, "the track tip_top hardly moves"),
-    "jumps": (jumping, "the track middle_front jumps by 21.5 pixels at 0.25 s"),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_lost_tracks_are_named(fault: str) -> None:
-    change, words = FAULTS[fault]
+@pytest.mark.parametrize("change", [exchanged, stuck])
+def test_lost_tracks_are_named(change: Callable[[np.ndarray], np.ndarray]) -> None:
     true = projected(filming("front"), motion_m())
     rng = np.random.default_rng(9)
     pixels = change(true + NOISE_PX * rng.normal(size=true.shape))
@@ -255,8 +231,8 @@ def test_lost_tracks_are_named(fault: str) -> None:
     program = cs.Problem([experiment], parameters=unknown_young()).collocation()
     (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
     found = [*track_hypotheses(residual, true, "'front'")]
-    assert [each.code for each in found] == [f"image-track/{fault}"]
-    assert words in found[0].message
+    assert {each.code for each in found} == {"image-track"}
+    assert "tip_top" in {each.data["point"] for each in found}
 
 
 def test_samples_after_a_jump_are_left_out() -> None:
@@ -272,20 +248,6 @@ def test_samples_after_a_jump_are_left_out() -> None:
     x = rigid_m.reshape(len(rigid_m), -1)
     (note,) = notes(program.iterates_at(program.guess_p, [x])[0])
     assert f"{len(T_S) - 25} samples of {NAMES[3]} in which the tracker has lost the point" in note
-
-
-def test_a_place_that_is_estimated_off_the_body_is_named() -> None:
-    tracks = tracks_of(known=False)
-    program = cs.Problem([swung([tracks])], parameters=unknown_young()).collocation()
-    transcription = program.transcriptions[0]
-    (residual,) = transcription.residuals_of(ImageTrackResidual)
-    phi = transcription.guess_phi
-    assert not list(places_off_body(residual, phi, "'front'"))
-    place = residual.correspondences.coordinate_parameters[NAMES.index("tip_top")]
-    phi[place] += 0.1 / transcription.nuisance.scales[place]
-    (found,) = places_off_body(residual, phi, "'front'")
-    assert found.data["point"] == "tip_top"
-    assert found.data["off_mm"] > 6.0
 
 
 def test_good_tracks_are_not_doubted() -> None:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kit.wrenches import without_grasp_sensors
 
 from collocation_sysid import Problem, run, simulate, solve
 from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.pipeline import Run
-from collocation_sysid.program.wrench_residual import without_grasp_sensors
 from collocation_sysid.recording import Nuisance
 from collocation_sysid.runs.check import check_problem
 from collocation_sysid.statistics.pose_noise import uncertainty_at

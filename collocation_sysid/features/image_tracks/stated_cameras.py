@@ -20,11 +20,9 @@ from ...judge.doubt import Doubt
 from ...judge.sensors import measurement_mistake
 from ...recording.camera import Camera
 from ...recording.experiment import Experiment
-from ...recording.lost_points import missing_images
 from ...recording.measurement import Measurement
 from ...recording.placement import LocatedBody, nearest_points_of_triangles
 from ...statistics.hypothesis import Hypothesis
-from ...statistics.thresholds import CERTAIN
 from .places import SIMILAR_POSES, poses_of_tracks
 from .rays import facing, points_on_surface
 from .tracks import ImageTracks, stated_places
@@ -95,21 +93,6 @@ def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     for tracks in experiment.readings:
         if isinstance(tracks, ImageTracks) and tracks.pixels is not None:
             yield from _camera_hypotheses(experiment, tracks)
-            yield from missing_image_hypotheses(experiment, tracks)
-
-
-def missing_image_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that images are missing, whose times were not left out; the pixels alone
-    show it for certain.
-    """
-    pixels = np.where(tracks.is_followed[..., None], np.asarray(tracks.pixels), np.nan)
-    t_s = tracks.sample_times_s
-    missing = dict(missing_images(pixels, t_s, tracks.sigma_px))
-    if missing:
-        first = min(missing)
-        data = {"count": sum(missing.values()), "t_s": float(t_s[first])}
-        of = f"'{tracks.name}' of '{experiment.name}'"
-        yield Hypothesis("image-tracks/missing", of, data=data, strength=2 * CERTAIN)
 
 
 def _camera_hypotheses(experiment: Experiment, tracks: ImageTracks) -> Iterator[Hypothesis]:

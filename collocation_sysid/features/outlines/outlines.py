@@ -225,13 +225,7 @@ def edge_pixels(mask: Mask) -> Array:
     return np.argwhere(mask & ~inner)[:, ::-1].astype(float)
 
 
-def mask_of(
-    outlines: Outlines,
-    experiment: Experiment,
-    nodes_m: Array,
-    t_s: float,
-    shape: tuple[int, ...] | None = None,
-) -> Mask:
+def mask_of(outlines: Outlines, experiment: Experiment, nodes_m: Array, t_s: float) -> Mask:
     """Return the mask (rows, columns) of a body at rest in a shape (n, 3) [m], without errors of the
     camera: pixels whose centre is within a projected triangle of its surface.
     """
@@ -239,7 +233,7 @@ def mask_of(
     rotations, translations = outlines.camera.pose_at([t_s])
     corners = surface.subdivided_triangles(nodes_m[surface.nodes])
     own = (corners.reshape(-1, 3) - translations[0]) @ rotations[0]
-    rows, columns = shape or (outlines.camera.size_px or USUAL_SIZE_PX)[::-1]
+    columns, rows = outlines.camera.size_px or USUAL_SIZE_PX
     mask = np.zeros((rows, columns), dtype=bool)
     if (own[:, 2] <= 0).any():
         return mask

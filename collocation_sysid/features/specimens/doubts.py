@@ -2,7 +2,7 @@
 
 Mistakes in a table that show without a fit are in `recording.specimen_checks`. The others leave a
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
-place of ratios, stresses in another unit, another kind of test, and columns of zeros that were not
+place of ratios, another unit or area, another kind of test, and columns of zeros that were not
 measured. All specimens are fitted again with one of them corrected; the misfit contains the
 nuisance parameters, so that a wrong area does not explain all. A correction keeps all measurements,
 unless the mistake is that one was none.
@@ -46,7 +46,7 @@ from ...recording.specimen import (
 from ...recording.specimen_checks import is_unloading
 from ...recording.specimen_files import specimen_strains
 from ...statistics.hypothesis import Hypothesis
-from ...statistics.thresholds import KIND_CHANGE, LIKELIER, UNIT_LIKE
+from ...statistics.thresholds import KIND_CHANGE, LIKELIER
 
 # Fewest samples of a specimen whose curve distinguishes hypotheses.
 FEWEST_SAMPLES = 4
@@ -55,8 +55,6 @@ FEWEST_SAMPLES = 4
 SCREENING = (8, 15)
 COMPARING = (60, 30)
 TOLERANCE = 1e-2
-# Units that stresses are confused in: name of the factor that corrects the file.
-UNIT_FACTORS = {"kPa": 1e-3, "MPa": 1e3}
 # Factors on the stress of a specimen, or their inverses, that correct its area or load, by the mistake.
 LOAD_FACTORS = {
     "a diameter that is taken for a radius": 4.0,
@@ -66,6 +64,7 @@ LOAD_FACTORS = {
     "pounds that are taken for newtons": 4.448222,
     "one of two loaded faces that is taken for both": 0.5,
     "a length of the section that is off by ten": 10.0,
+    "kPa that are taken for Pa, or MPa for kPa": 1e3,
 }
 # Largest change of a ratio of initial slopes by nonlinear laws and zeros of the strain.
 SLOPE_RANGE = 1.5
@@ -77,8 +76,6 @@ CONFUSED_TESTS = {
     "simple-shear": ("planar", "uniaxial"),
     "confined": ("uniaxial",),
 }
-# Decrease of a modulus with the frequency that is no noise, over its standard deviation.
-DECREASE = 6.0
 # Largest strain from which on a table of ratios may be one of percent.
 PERCENT_STRAIN = 1.0
 
@@ -104,42 +101,6 @@ def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
             refit = _refit(solution, [*few[:index], tried.corrected, *few[index + 1 :]], SCREENING)
             if refit is not None:
                 yield _square_sum(refit.parts) / max(_square_sum(stated.parts), 1e-300), whole
-
-
-def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
-    """Yield exchanged moduli of harmonic tests."""
-    for transcription in solution.collocation.transcriptions:
-        if transcription.experiment.specimen is not None:
-            yield from exchanged_moduli(transcription.experiment)
-
-
-def exchanged_moduli(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield the hypothesis that storage and loss modulus of a harmonic test are exchanged, if the
-    storage modulus falls with the frequency, which that of no relaxation does, and the loss modulus
-    does not.
-    """
-    if not experiment.body.memory.oscillates:
-        return
-    amplitude = specimen_strains(experiment)[0][1::2]
-    (gauge,) = experiment.readings
-    # From the highest frequency to the lowest.
-    sigma_pa = gauge.value_sigmas[0] / amplitude
-    stress_pa = gauge.measured_values[:, 0]
-    of_storage, of_loss = (
-        _largest_decrease(modulus_pa[::-1], sigma_pa[::-1])
-        for modulus_pa in (stress_pa[1::2] / amplitude, -stress_pa[2::2] / amplitude)
-    )
-    if of_storage > DECREASE > of_loss:
-        of = f"'{experiment.name}'"
-        yield Hypothesis("specimen-moduli", of, strength=of_storage)
-
-
-def _largest_decrease(values: Array, sigmas: Array) -> float:
-    """Return the largest decrease of successive values (F,) over their standard deviations."""
-    is_known = np.isfinite(values)
-    known = values[is_known]
-    decrease = np.maximum.accumulate(known) - known
-    return float((decrease / sigmas[is_known]).max(initial=0.0))
 
 
 def likelier_kinds(solution: Solution) -> list[Hypothesis]:
@@ -233,8 +194,7 @@ def _square_sum(parts: Sequence[ExperimentIterate]) -> float:
 def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) -> Iterator[Doubt]:
     """Yield the likely mistakes about a specimen. The name of a row is the code of its hypothesis."""
     yield _mistake("specimen-true-stress", _of_engineering_stress)
-    for code, is_widening in (("", False), ("/widening", True)):
-        yield _mistake(f"specimen-compression{code}", partial(_compressed, is_widening=is_widening))
+    yield _mistake("specimen-compression", _compressed)
     yield _mistake("specimen-percent", _of_ratios)
     for gauge in experiment.readings[1:]:
         yield _mistake("specimen-placeholder", partial(_without_placeholder, name=gauge.name))
@@ -243,10 +203,6 @@ def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) ->
     has_fibres = any(part.axes is not None for part in experiment.body.parts)
     others_pa = () if has_fibres else other_slopes_pa
     ratios = [other / _initial_slope(experiment) for other in others_pa]
-    for unit, factor in UNIT_FACTORS.items():
-        decades = np.sign(np.log(factor)) * np.log(ratios) if ratios else np.zeros(0)
-        if (decades > np.log(UNIT_LIKE)).any():
-            yield _mistake("specimen-unit", partial(_of_unit, unit=unit))
     for what, stated in LOAD_FACTORS.items():
         for factor in (stated, 1 / stated):
             if any(1 / SLOPE_RANGE < ratio / factor < SLOPE_RANGE for ratio in ratios):
@@ -287,12 +243,6 @@ def _of_ratios(experiment: Experiment) -> Correction:
     if deformation.held or strain.max() <= PERCENT_STRAIN or deformation.test == "volumetric":
         return None
     return _strained(experiment, 0.01), {}
-
-
-def _of_unit(experiment: Experiment, unit: str) -> Correction:
-    factor = UNIT_FACTORS[unit]
-    other = _with_stress(experiment, np.full(len(experiment.t_s), factor))
-    return other, {"unit": unit, "factor": factor}
 
 
 def _of_area(experiment: Experiment, what: str, factor: float) -> Correction:
@@ -381,8 +331,8 @@ def _strained(experiment: Experiment, factor: float) -> Experiment:
     return replace(experiment, grasps=[scaled(grasp) for grasp in experiment.grasps])
 
 
-def _compressed(experiment: Experiment, is_widening: bool) -> Correction:
-    """Reverse lateral strains too, unless they are positive where the specimen becomes wider."""
+def _compressed(experiment: Experiment) -> Correction:
+    """Reverse lateral strains too."""
     deformation = experiment.specimen
     assert deformation is not None
     strain, _ = specimen_strains(experiment)
@@ -395,15 +345,13 @@ def _compressed(experiment: Experiment, is_widening: bool) -> Correction:
         return None
     reversed_stress = _with_stress(experiment, np.full(len(experiment.t_s), -1.0))
     is_reversed = "lateral_strain" in deformation.columns
-    if is_widening and not is_reversed:
-        return None
     readings = [
         replace(gauge, values=2.0 - gauge.measured_values)
-        if gauge.name == LATERAL_NAME and is_reversed and not is_widening
+        if gauge.name == LATERAL_NAME and is_reversed
         else gauge
         for gauge in reversed_stress.readings
     ]
     return _strained(replace(reversed_stress, readings=readings), -1.0), {}
 
 
-SPECIMENS = Source(fitted=fit_hypotheses, candidates=specimen_candidates, consistent=likelier_kinds)
+SPECIMENS = Source(candidates=specimen_candidates, consistent=likelier_kinds)

@@ -6,20 +6,8 @@ import numpy as np
 
 from ...common.array_types import Array
 from ..experiment_iterate import ExperimentIterate
-from ..transcription import Transcription
 from .outline_residual import OutlineResidual
 from .residual import DepthResidual
-
-
-def camera_residuals(transcription: Transcription) -> list[DepthResidual]:
-    """Return the measurement models of the points of the depth cameras, in their order, without
-    those of outlines.
-    """
-    return [
-        each
-        for each in transcription.residuals_of(DepthResidual)
-        if not isinstance(each, OutlineResidual)
-    ]
 
 
 def depth_residuals(iterate: ExperimentIterate) -> list[tuple[DepthResidual, Array]]:

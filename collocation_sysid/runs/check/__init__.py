@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -83,8 +82,6 @@ DESCRIPTION_FACTOR = 3.0
 DERIVATIVE_FACTOR = 5.0
 # Power of the edge length in the time of a sweep: that of a finger with 600 and 3,300 nodes.
 EDGE_POWER = 4.5
-# Time of a fit of the first samples to the markers, in simulations of these samples.
-FIT_SIMULATIONS = 15.0
 # Largest relative deviation from fourth-order central differences that rounding explains.
 DERIVATIVE_TOLERANCE = 1e-6
 SUBSTEPS_NOTE = (
@@ -246,9 +243,6 @@ def check_problem(
         If a body has no stress-free shape at the guess. A simulation that fails otherwise raises
         nothing: a note states it, and the body is moved rigidly with the grasp instead.
     """
-    from ...judge.registry import SOURCES
-    from ...judge.source import SimulatedCheck
-
     report_progress = report_progress or (lambda _: None)
     began_s = time.perf_counter()
     lost = [note for each in problem.experiments for note in lost_samples(each)]
@@ -296,26 +290,9 @@ def check_problem(
     if is_possible(DESCRIPTION_FACTOR, "natural modes and tests of the description"):
         report_progress("computing natural modes and testing the description")
         causes = misspecification_hypotheses(problem)
-        parts = simulated.iterates(z)
-        check = SimulatedCheck(
-            problem,
-            collocation,
-            parts=parts,
-            causes=causes,
-            is_full=full,
-            fit_s=partial(_fit_to_markers_s, collocation, total_s),
-            report_progress=report_progress,
-            is_simulated=not start_notes,
-        )
-        # In reverse order, because comparisons that need a fit are made only if no other is likely.
-        for source in reversed(SOURCES):
-            found, found_notes = source.simulated(check)
-            if found:
-                causes = rank((*causes, *found))
-                check = replace(check, causes=causes)
-            notes += found_notes
         motions = _natural_modes(problem, collocation)
         unstable = find_instabilities(simulated, z)
+        parts = simulated.iterates(z)
         at_guess += strain_stability_concerns(parts)
         if not start_notes:  # forces on a body that was only carried by its grasps mean nothing
             at_guess += branch_concerns(parts)
@@ -425,12 +402,6 @@ def _views_notes(collocation: Collocation, z: Array) -> list[str]:
         return [note] if (note := views_note(collocation, z)) else []
     except SimulationError:
         return []
-
-
-def _fit_to_markers_s(collocation: Collocation, total_s: float, samples: int) -> float:
-    """Return the estimated time [s] of the first samples by markers alone, one time step each."""
-    share = min(1.0, samples / _grid_rows(collocation))
-    return FIT_SIMULATIONS * total_s * share
 
 
 def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
@@ -573,7 +544,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     doubtful = (
         cause
         for e in problem.experiments
-        for cause in find_misspecifications_by_modes(e, constants, huber=problem.huber)
+        for cause in find_misspecifications_by_modes(e, constants)
     )
     by_feature = (
         cause for source in SOURCES for e in problem.experiments for cause in source.described(e)

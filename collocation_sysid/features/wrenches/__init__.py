@@ -1,1 +1,0 @@
-"""Likely mistakes in the description of measured wrenches."""
