@@ -37,7 +37,7 @@ from ..features.measurement_results import SimulatedExperiment
 from ..fem.laws.constants import symbol_of, unit_of
 from ..judge.posterior import main_sources
 from ..recording.deviation import in_readable_unit
-from ..runs.result_content import Elapsed, Result
+from ..runs.result_content import UNMOVED, Elapsed, Result
 from ..statistics.assessment import Assessment
 from ..statistics.budget.effect_estimates import effect_row
 from ..statistics.budget.systematic_effects import source_label
@@ -71,6 +71,8 @@ REASONS_OF_RESIDUALS = ("noise/", "residuals/", "specimen/law", "specimen/persis
 SMALLEST_CORRECTION = 0.005
 # Posterior over prior deviation of an effect from which on the data do not see it.
 UNSEEN = 0.95
+# Effects that the table has.
+MOST_EFFECTS = 12
 # Ratio of combined to statistical standard uncertainty beyond which the sources are named.
 SYSTEMATIC_RATIO = 1.5
 
@@ -285,10 +287,11 @@ def budget_table(result: Result) -> Table:
 
 def effects_table(result: Result) -> Table:
     """Return the table of the effects of the budget: what is expected of each, what the data say, and
-    by how many standard deviations both differ; those that the data do not see are left out.
+    by how many standard deviations both differ; those that the data do not see are left out, and of
+    many the largest are shown.
     """
     rows = []
-    for each in result.effects:
+    for each in sorted(result.effects, key=lambda each: -abs(each.surprise)):
         if each.std_error > UNSEEN * each.deviation and abs(each.surprise) < 1.0:
             continue
         unit = effect_row(each.name).unit
@@ -304,8 +307,10 @@ def effects_table(result: Result) -> Table:
                 f"{each.surprise:+.1f}",
             )
         )
-    heads = ("effect", "expected", "with the data", "standard deviations")
-    return Table("", heads, rows=tuple(rows))
+    shown = rows[:MOST_EFFECTS]
+    first = f"effect ({len(shown)} of {len(rows)})" if len(shown) < len(rows) else "effect"
+    heads = (first, "expected", "with the data", "standard deviations")
+    return Table("", heads, rows=tuple(shown))
 
 
 def estimate_row(result: Result, name: str) -> tuple[str, ...]:
@@ -607,7 +612,8 @@ def _nuisance_sections(result: Result) -> Iterator[TitledParts]:
         rows = []
         for label, each in named.items():
             words, _, unit = label.rstrip("]").rpartition(" [")
-            sizes = (each.value, each.std_error, each.prior)
+            value = 0.0 if abs(each.value) <= UNMOVED * each.prior else each.value  # rounding
+            sizes = (value, each.std_error, each.prior)
             rows.append((words, *(_size_text(size, unit) for size in sizes)))
         table = Table("", ("", "value", "±", "prior ±"), rows=tuple(rows))
         title = f"Nuisance parameters of '{experiment}'"

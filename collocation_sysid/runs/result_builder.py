@@ -36,6 +36,7 @@ from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import ScaleReference, scale_reference
 from ..statistics.uncertainty import MarkerPlace
 from .result_content import (
+    UNMOVED,
     DynamicsResult,
     FieldResult,
     NuisanceResult,
@@ -355,7 +356,8 @@ def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Itera
         elif row.by == "worst":
             groups = [[max(here, key=lambda k: abs(part.phi[k]))]]
         for own in groups:
-            yield _nuisance_sentence(part, own, values=values[own], answer=answer)
+            if float(np.linalg.norm(part.phi[own])) > UNMOVED:
+                yield _nuisance_sentence(part, own, values=values[own], answer=answer)
 
 
 def _nuisance_sentence(

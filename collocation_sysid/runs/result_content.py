@@ -28,6 +28,9 @@ from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import ScaleReference
 from ..statistics.uncertainty import MarkerPlace
 
+# Largest part of its prior deviation by which rounding moves a nuisance parameter without effect.
+UNMOVED = 1e-6
+
 
 @dataclass(frozen=True)
 class Limit:

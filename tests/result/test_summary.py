@@ -20,10 +20,16 @@ from collocation_sysid.common.display import (
     two_digits,
 )
 from collocation_sysid.result.pictures.confidence import Confidence
-from collocation_sysid.result.run_sections import _cards, refinement_table
+from collocation_sysid.result.run_sections import (
+    _cards,
+    _nuisance_sections,
+    effects_table,
+    refinement_table,
+)
 from collocation_sysid.result.run_summary import next_step, run_summary
-from collocation_sysid.runs.result_content import Result
+from collocation_sysid.runs.result_content import NuisanceResult, Result
 from collocation_sysid.statistics.budget.discretisation_error import DiscretisationError
+from collocation_sysid.statistics.budget.effect_estimates import EffectEstimate
 from collocation_sysid.statistics.concerns import Concern
 from collocation_sysid.statistics.hypothesis import NO_CAUSE
 
@@ -244,3 +250,28 @@ def test_a_run_without_markers_has_no_cards_of_markers():
     assert cards["force, fitted"] == "0.25 N"
     assert cards["E"].endswith((" kPa", " Pa"))
     assert not any("markers" in name for name in cards)
+
+
+def test_the_table_of_effects_has_the_largest_of_many():
+    effects = [
+        EffectEstimate("mass", 0.0, 0.01, 1e-3 * k, 0.005, surprise=0.1 * k * (-1) ** k)
+        for k in range(30)
+    ]
+    table = effects_table(replace(a_result({"mu_pa": value()}), effects=effects))
+    assert table.heads[0] == "effect (12 of 30)"
+    shown = [abs(float(row[-1])) for row in table.rows]
+    assert shown == pytest.approx([0.1 * k for k in range(29, 17, -1)])
+    assert (
+        effects_table(replace(a_result({"mu_pa": value()}), effects=effects[:12])).heads[0]
+        == "effect"
+    )
+
+
+def test_rounding_is_no_estimate_of_a_nuisance_parameter():
+    moved, unmoved = NuisanceResult(2.5e-3, 5e-3, 1e-3), NuisanceResult(-4.5e-21, 5e-3, 5e-3)
+    result = replace(
+        a_result({"mu_pa": value()}),
+        nuisance={"swing": {"drift [s]": moved, "time shift [s]": unmoved}},
+    )
+    ((_, table),) = (part.parts for part in _nuisance_sections(result))
+    assert [row[1] for row in table.rows] == ["2.5 ms", "0 ms"]

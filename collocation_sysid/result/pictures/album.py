@@ -59,7 +59,8 @@ def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, F
         pictures["confidence"] = confidence_ellipses(confidence)
         pictures["correlation"] = correlation_matrix(confidence)
     known = result.uncertainty
-    if known is not None and len(known.directions) > 1:
+    # Alone, each combination is one of the constants.
+    if known is not None and any(len(each.names) > 1 for each in known.directions):
         members = {name for each in known.directions for name in each.names}
         ends = {n: result.parameters[n].combined95 for n in names if n in members}
         alone = {
