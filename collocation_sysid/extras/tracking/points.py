@@ -4,7 +4,7 @@ Corners and stated points are followed by the pyramidal method of Lucas and Kana
 backwards: the likelihood of a sample decreases with the distance by which the way back misses the
 point, and a point that misses by more than a limit is lost. In order that errors of single steps do
 not add up, the surroundings of each point are then aligned with the first image by an affine
-transform (enhanced correlation coefficient); a point whose surroundings do not agree is lost.
+transform (enhanced correlation coefficient); while they do not agree, samples are missing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FARTHEST_PX = 4.0
 
 
 class Loss(NamedTuple):
-    """Where a point was lost."""
+    """Where a point was lost: seen in no image from there on."""
 
     name: str
     image: int  # number of the first image without it, from 1
@@ -57,6 +57,29 @@ class Tracks:
     pixels: Array  # (S, N, 2): (u, v); NaN where missing
     likelihood: Array  # (S, N)
     losses: Sequence[Loss] = ()
+
+    @classmethod
+    def of(
+        cls, names: Sequence[str], times: Sequence[float], pixels: Array, trust: Array, size: Array
+    ) -> Tracks:
+        """Return tracks in images of a size (columns, rows) at times (S,) [s], and where points are
+        lost that the last image does not have.
+        """
+        t_s = np.array(times) - times[0]
+        is_seen = np.isfinite(pixels).all(axis=2)
+        steps_px = np.linalg.norm(np.diff(pixels, axis=0, prepend=pixels[:1]), axis=2)
+        losses = []
+        for k in np.flatnonzero(~is_seen[-1]):
+            last = int(np.flatnonzero(is_seen[:, k])[-1])
+            steps = steps_px[last][np.isfinite(steps_px[last])]
+            step_px = float(
+                max(np.nan_to_num(steps_px[last, k]), np.median(steps) if len(steps) else 0)
+            )
+            u, v = pixels[last, k].tolist()
+            has_left = min(u, v, *(size - 1 - pixels[last, k])) < WINDOW_PX / 2 + step_px
+            at_s = float(t_s[last + 1])
+            losses.append(Loss(names[k], last + 2, at_s, (u, v), step_px, bool(has_left)))
+        return cls(names, t_s, pixels, trust, sorted(losses, key=lambda each: each.image))
 
 
 def corners_of(image: Image, mask: Image | None, most: int) -> Array:
@@ -96,16 +119,15 @@ def follow(
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-4)
     options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": LEVELS, "criteria": stop}
     times, pixels, likelihood = [], [], []
-    losses: list[Loss] = []
+    size = np.zeros(2)
     before: Image | None = None
     patches: list[_Patch] = []
     now = start.astype(np.float32)
-    step_px = np.zeros(len(start))
     alive = np.ones(len(start), dtype=bool)
     for t_s, image in images:
         plain = grey(image)
         size = np.array(plain.shape[::-1])
-        trust = np.ones(len(start))
+        trust, agrees = np.ones(len(start)), alive
         if before is not None and plain.shape != before.shape:
             raise InputError(
                 f"image {len(times) + 1} has another size; expected one size of all images"
@@ -115,22 +137,14 @@ def follow(
             back, returned, _ = cv2.calcOpticalFlowPyrLK(plain, before, ahead, None, **options)
             missed = np.linalg.norm(back[:, 0] - now, axis=1)
             inside = ((ahead[:, 0] >= 0) & (ahead[:, 0] < size)).all(axis=1)
-            alive_before = alive.copy()
             alive &= (found[:, 0] == 1) & (returned[:, 0] == 1) & (missed <= lost_px) & inside
             trust = np.exp(-missed / HALF_TRUST_PX)
-            reached = np.where(alive[:, None], ahead[:, 0], now).astype(np.float32)
+            now = np.where(alive[:, None], ahead[:, 0], now).astype(np.float32)
+            agrees = alive.copy()
             for k in np.flatnonzero(alive):
-                place = patches[k].aligned(plain, reached[k])
-                alive[k] = place is not None
-                reached[k] = now[k] if place is None else place
-            common_px = float(np.median(step_px[alive_before])) if alive_before.any() else 0.0
-            for k in np.flatnonzero(alive_before & ~alive):
-                margin_px = min(*now[k], *(size - 1 - now[k]))
-                has_left = bool(margin_px < WINDOW_PX / 2 + step_px[k])
-                place, moved_px = (float(now[k, 0]), float(now[k, 1])), max(step_px[k], common_px)
-                losses.append(Loss(names[k], len(times) + 1, t_s, place, float(moved_px), has_left))
-            step_px = np.linalg.norm(reached - now, axis=1)
-            now = reached
+                place = patches[k].aligned(plain, now[k])
+                agrees[k] = place is not None
+                now[k] = now[k] if place is None else place
         else:
             if ((start < 0) | (start > size - 1)).any():
                 raise InputError(
@@ -138,12 +152,10 @@ def follow(
                 )
             patches = [_Patch(plain, point) for point in start]
         times.append(t_s)
-        pixels.append(np.where(alive[:, None], now, np.nan))
-        likelihood.append(np.where(alive, trust, 0.0))
+        pixels.append(np.where(agrees[:, None], now, np.nan))
+        likelihood.append(np.where(agrees, trust, 0.0))
         before = plain
-    t0_s = times[0]
-    losses = [each._replace(t_s=each.t_s - t0_s) for each in losses]
-    return Tracks(names, np.array(times) - t0_s, np.array(pixels), np.array(likelihood), losses)
+    return Tracks.of(names, times, np.array(pixels), np.array(likelihood), size)
 
 
 class _Patch:
@@ -195,7 +207,9 @@ def tag_centres(images: Iterable[tuple[float, Image]], dictionary: str) -> Track
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
     times: list[float] = []
     seen: list[dict[int, Array]] = []
+    size = np.zeros(2)
     for t_s, image in images:
+        size = np.array(image.shape[1::-1])
         corners, numbers, _ = detector.detectMarkers(grey(image))
         times.append(t_s)
         ids: list[Any] = [] if numbers is None else np.ravel(numbers).tolist()
@@ -205,14 +219,7 @@ def tag_centres(images: Iterable[tuple[float, Image]], dictionary: str) -> Track
     pixels = np.array([[each.get(tag, none) for tag in tags] for each in seen])
     pixels = pixels.reshape(len(seen), len(tags), 2)
     trust = np.isfinite(pixels).all(axis=2).astype(float)
-    t_s = np.array(times) - times[0]
-    losses = []
-    for k, tag in enumerate(tags):
-        last = int(np.flatnonzero(trust[:, k])[-1])
-        if last < len(t_s) - 1:
-            u, v = pixels[last, k].tolist()
-            losses.append(Loss(f"tag_{tag}", last + 2, float(t_s[last + 1]), (u, v), 0.0, False))
-    return Tracks([f"tag_{tag}" for tag in tags], t_s, pixels, trust, losses)
+    return Tracks.of([f"tag_{tag}" for tag in tags], times, pixels, trust, size)
 
 
 def _crossing(corners: Array) -> Array:
