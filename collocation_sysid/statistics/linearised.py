@@ -145,6 +145,13 @@ class ResidualBlock:
         share = np.divide(short, long, out=np.ones_like(long), where=long > 0)
         return np.sqrt(share)[..., None]
 
+    def changed(self, change: Array) -> ResidualBlock:
+        """Return the block after a change (T, M, 3) of its residuals, which has Huber's weights."""
+        misfit = self.misfit
+        if misfit is not None:
+            misfit = misfit + change / self.compute_root_weight()
+        return replace(self, residual=self.residual + change, misfit=misfit)
+
     def may_be_slow_errors(self) -> bool:
         """Return whether the instrument may err slowly, and the residuals are within its σ."""
         return self.errs_slowly and bool(np.sum(self.residual**2) <= self.measurement_count)
@@ -254,9 +261,9 @@ class LinearisedFit:
         """Return the fit after a step (p,) of all parameters, to first order: with changed
         residuals of measurements and priors and the same derivatives.
 
-        `misfit`, `derived` and `at_bound` are not changed.
+        `derived` and `at_bound` are not changed, nor which residuals are shortened.
         """
-        blocks_after = (replace(b, residual=b.residual + b.jacobian @ step) for b in self.blocks)
+        blocks_after = (b.changed(b.jacobian @ step) for b in self.blocks)
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 

@@ -113,15 +113,19 @@ def test_terms_of_a_foam_are_found_with_one_ratio_of_compressibility():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
-def test_intervals_of_two_terms_of_a_foam_contain_the_truth(seed):
-    tests = measured("hyperfoam-2", FOAM, FOAM_TESTS, 100.0, seed)
-    answer = cs.run(without_guess("hyperfoam-2", tests))
-    assert answer.trust.verdict == "good"
-    for name, truth in FOAM.items():
-        low, high = answer.interval(name)
-        assert low < truth < high
-        assert high - low < max(abs(truth), 1.0)
+def test_intervals_of_two_terms_of_a_foam_contain_the_truth():
+    held = []
+    for seed in range(4):
+        tests = measured("hyperfoam-2", FOAM, FOAM_TESTS, 100.0, seed)
+        answer = cs.run(without_guess("hyperfoam-2", tests))
+        assert answer.trust.verdict == "good"
+        assert answer.uncertainty is not None
+        assert answer.uncertainty.level.pooled == pytest.approx(1.0, abs=0.4)
+        for name, truth in FOAM.items():
+            low, high = answer.interval(name)
+            held.append(low < truth < high)
+            assert high - low < max(abs(truth), 1.0)
+    assert np.mean(held) > 0.85  # of intervals of 95 %
 
 
 def test_different_determined_ratios_of_compressibility_are_found():
