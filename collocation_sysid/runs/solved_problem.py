@@ -29,7 +29,6 @@ from ..statistics.assessment import (
 from ..statistics.budget.combined_intervals import ReportedEstimate, combine
 from ..statistics.budget.discretisation_error import Refinement
 from ..statistics.budget.effect_estimates import EffectEstimate, JointPosterior, effect_concerns
-from ..statistics.budget.systematic_effects import DISCRETISATION
 from ..statistics.combinations import (
     Combination,
     Direction,
@@ -131,13 +130,8 @@ class SolvedProblem:
         if posterior is None or name not in self.budget:
             combined = ReportedEstimate(**vars(known))
         else:
-            combined = posterior.reported(name)
-            besides = self._besides_discretisation
-            combined = replace(
-                combined,
-                systematic=besides.systematic(name),
-                known_effect=besides.change(name, optimum),
-            )
+            systematic, change = posterior.besides_discretisation(name, optimum)
+            combined = replace(posterior.reported(name), systematic=systematic, known_effect=change)
         combined = replace(combined, optimum=optimum)
         if self.refinement is not None and name in self.refinement.errors:
             linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
@@ -160,12 +154,6 @@ class SolvedProblem:
     def _statistical(self) -> dict[str, Estimate]:
         bars = self.uncertainty
         return {} if bars is None else {**bars.estimates, **bars.derived}
-
-    @cached_property
-    def _besides_discretisation(self) -> Posterior:
-        """The posterior without the errors of mesh and time step, which a refinement measures."""
-        assert self.posterior is not None
-        return self.posterior.without(row.name for row in DISCRETISATION)
 
     @property
     def optimum(self) -> dict[str, Estimate]:
@@ -504,7 +492,7 @@ class SolvedProblem:
 
     @property
     def _q(self) -> Array:
-        return self.solution.q if self.posterior is None else self.posterior.reported_q
+        return self.solution.q if self.posterior is None else self.posterior.q
 
     @property
     def _estimated_names(self) -> tuple[str, ...]:
