@@ -39,12 +39,12 @@ from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
 from .runs.solved_problem import SolvedProblem
 from .runs.solving import (
+    AnyStart,
     continued_beyond_bounds,
     solve,
     solve_with_renewed_correspondences,
     with_workers,
 )
-from .runs.warm_start import WarmStart
 from .statistics.assessment import impact_step_concerns, rotation_step_concerns
 from .statistics.budget.discretisation_error import MESH_ORDER, MOST_SUBSTEPS, extrapolated
 from .statistics.linearised import LinearisedFit, linearise_fit
@@ -149,7 +149,7 @@ def run(
     method: str | Method | None = None,
     watch: Watch | None = None,
     log: Log | None = None,
-    start: str | Path | WarmStart | None = None,
+    start: AnyStart | None = None,
     seek_causes: bool = True,
     scheduler: str | None = None,
 ) -> Run:

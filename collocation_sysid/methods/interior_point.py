@@ -107,11 +107,11 @@ class InteriorPoint(MethodOptions):
         `warm_up` ("exact"), those of the loss with linearised measurements ("gauss-newton"), or
         IPOPT's own approximation ("limited-memory").
     initial : {"reduced-space", "simulation"}
-        Where IPOPT starts. "reduced-space": near the optimum, after a solution of the same program
-        by reduced space, with multipliers of its adjoint; IPOPT takes no iteration if its
-        conditions hold there. "simulation": from a simulation
-        at the guess, or from the given start, with multipliers of zero; this is also the fallback
-        if reduced space finds no motion.
+        Where IPOPT starts, unless the start has multipliers, with which it begins. "reduced-space":
+        near the optimum, after a solution of the same program by reduced space, with multipliers of
+        its adjoint; IPOPT takes no iteration if its conditions hold there. "simulation": from a
+        simulation at the guess, or from the given start, with multipliers of zero; this is also the
+        fallback if reduced space finds no motion.
     warm_up : float
         While an iteration still changes a parameter by more than this share (or a nuisance
         parameter by more than this many prior deviations), the exact Hessian is replaced by that of
@@ -159,10 +159,15 @@ class InteriorPoint(MethodOptions):
                     require_frictionless(each.obstacles)
 
     def __call__(
-        self, collocation: Collocation, watch: Watch | None = None, start: Array | None = None
+        self,
+        collocation: Collocation,
+        watch: Watch | None = None,
+        start: Array | None = None,
+        multipliers: Array | None = None,
     ) -> Solution:
         """Solve the NLP from `start`, by default from the guess, as `initial` states; `watch` is
-        called with every entry of the history. See `Method`.
+        called with every entry of the history. See `Method`. With `multipliers` (constraints,)
+        IPOPT itself begins at `start` with these, near the bounds and with a small barrier.
 
         With contact as complementarity, and obstacles, further solves follow a converged one, see
         `solve_complementarity`; the limits of iterations and time hold for each of them. Exceptions
@@ -171,18 +176,24 @@ class InteriorPoint(MethodOptions):
         experiments = [transcription.experiment for transcription in collocation.transcriptions]
         self.require(experiments)
         is_hard = self.contact == "complementarity" and any(e.obstacles for e in experiments)
-        solution = self._solve(collocation, watch, start=start)
+        solution = self._solve(collocation, watch, start=start, multipliers=multipliers)
         if not is_hard or not solution.status.converged:
             return solution
         relaxed_method = replace(self, initial="simulation")
         return solve_complementarity(
-            solution, lambda relaxed, z: relaxed_method._solve(relaxed, watch, start=z)
+            solution, lambda relaxed, z: relaxed_method._solve(relaxed, watch, z, multipliers=None)
         )
 
     def _solve(
-        self, collocation: Collocation, watch: Watch | None, start: Array | None
+        self,
+        collocation: Collocation,
+        watch: Watch | None,
+        start: Array | None,
+        multipliers: Array | None,
     ) -> Solution:
         recorder = Recorder(self.name, collocation, watch=watch, max_time_s=self.max_time_s)
+        if start is not None and multipliers is not None:
+            return self._solve_by_ipopt(recorder, start, known=multipliers)
         if self.initial == "simulation":
             return self._solve_by_ipopt(recorder, start)
         initial = compute_initial_point(recorder, start, max_time_s=self.max_time_s)
@@ -207,13 +218,19 @@ class InteriorPoint(MethodOptions):
         return replace(solution, evaluations=solution.evaluations + coarse.evaluations)
 
     def _solve_by_ipopt(
-        self, recorder: Recorder, start: Array | None, initial: InitialPoint | None = None
+        self,
+        recorder: Recorder,
+        start: Array | None,
+        initial: InitialPoint | None = None,
+        known: Array | None = None,
     ) -> Solution:
         multipliers = None
         with recorder.stopwatch.building():
             program = condense(with_lifted_variables(recorder.collocation))
             if initial is not None and initial.is_close:
                 multipliers = adjoint_multipliers(program, recorder.collocation, z=initial.coarse.z)
+            if start is not None and known is not None:
+                multipliers = adjoint_multipliers(program, recorder.collocation, start, known)
             is_warm = multipliers is not None
             hessian = _DampedHessian(program, replace(self, warm_up=0.0) if is_warm else self)
 

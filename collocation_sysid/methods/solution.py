@@ -270,10 +270,7 @@ class Solution:
         """
         if self.initial_multipliers is not None:
             return self.initial_multipliers
-        try:
-            return constraint_multipliers(self.collocation, self.z)
-        except SimulationError:
-            return np.zeros(self.collocation.constraint_count)
+        return multipliers_at(self.collocation, self.z)
 
     @property
     def q(self) -> Array:
@@ -538,6 +535,14 @@ def constraint_multipliers(
     if any(transcription.is_grasp_constraint.any() for transcription in collocation.transcriptions):
         _set_grasp_multipliers(collocation, z, multipliers=multipliers)
     return multipliers
+
+
+def multipliers_at(collocation: Collocation, z: Array) -> Array:
+    """Return the `constraint_multipliers` at z; zeros if the equations of a step are singular."""
+    try:
+        return constraint_multipliers(collocation, z)
+    except SimulationError:
+        return np.zeros(collocation.constraint_count)
 
 
 def _set_grasp_multipliers(collocation: Collocation, z: Array, multipliers: Array) -> None:

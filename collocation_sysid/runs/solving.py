@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Protocol
+
+from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
@@ -17,8 +20,9 @@ from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..methods.best_iterate import answers_as, best_iterate, keep
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
+from ..methods.interior_point import InteriorPoint
 from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
-from ..methods.solution import Method, Solution, Status, Watch
+from ..methods.solution import Method, Solution, Status, Watch, multipliers_at
 from ..methods.starts.initial_trajectories import associated_at_guess
 from ..methods.starts.start import Scan, Start
 from ..methods.starts.stiffness_scan import EXPLAINED, rescue, start_problem
@@ -35,6 +39,18 @@ from .smaller_problem import NoStartError, SmallerProblem
 from .thinned_start import ThinnedStart
 from .warm_start import WarmStart
 
+
+class Solved(Protocol):
+    """What has a solution, such as a `Run`."""
+
+    @property
+    def solution(self) -> Solution: ...
+
+
+# What `solve` accepts as a start.
+AnyStart = (
+    str | Path | WarmStart | Solution | Solved | ArrayLike | tuple[ArrayLike, ArrayLike | None]
+)
 # Outcomes of a failed search, after which another start may help.
 FAILED_STATUSES = (
     Status.INFEASIBLE,
@@ -71,7 +87,7 @@ def solve(
     problem: Problem | str | Path,
     method: str | Method | None = None,
     watch: Watch | None = None,
-    start: str | Path | WarmStart | None = None,
+    start: AnyStart | None = None,
     scheduler: str | None = None,
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
@@ -94,9 +110,12 @@ def solve(
         problem's own by default.
     watch : callable, optional
         Called with every `Iteration`.
-    start : str, Path or WarmStart, optional
-        An earlier solution or the folder of its run, of any mesh or timestep; its values replace
-        the guesses of parameters with the same names.
+    start : Solution, Run, str, Path or arrays, optional
+        An earlier solution, its run or the folder of the run, of any mesh or timestep; its values
+        replace the guesses of parameters with the same names. Or the variables of
+        `problem.collocation()`, alone or in a tuple with the multipliers, such as the x and lam_g of
+        `casadi.nlpsol`. With multipliers, which solutions have, IPOPT of `InteriorPoint` begins at
+        the positions of the same grids and nodes; other methods simulate the motion.
     scheduler : str, optional
         Address of a dask.distributed scheduler, whose workers share the experiments of the search;
         for reduced space only.
@@ -124,11 +143,12 @@ def solve(
     for experiment in problem.experiments:
         experiment.require_measured_values()
     solver = problem.solver(method)
+    warm_start = None if start is None else WarmStart.from_object(start, problem)
     limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else float("inf")
     try:
         with best_iterate() as best, time_limit(limit_s):
             try:
-                solution = _solve_by(solver, problem, watch, start=start, scheduler=scheduler)
+                solution = _solve_by(solver, problem, watch, start=warm_start, scheduler=scheduler)
             except KeyboardInterrupt:
                 solution = best.solution()
     except TimeLimitReached:
@@ -189,7 +209,7 @@ def _solve_by(
     solver: Method,
     problem: Problem,
     watch: Watch | None,
-    start: str | Path | WarmStart | None,
+    start: WarmStart | None,
     scheduler: str | None,
 ) -> Solution:
     if scheduler is not None and not isinstance(solver, ReducedSpace):
@@ -269,14 +289,14 @@ def _solve_from_smaller(
 
 def _solve_once(
     problem: Problem,
-    given_start: str | Path | WarmStart | None,
+    warm_start: WarmStart | None,
     solver: Method,
     watch: Watch | None,
     workers: ExperimentExecutor | None,
 ) -> Solution:
     """Solve with fixed correlation lengths, from guesses, a scan, or an earlier solution."""
     notes: list[str] = []
-    if given_start is None and isinstance(solver, ReducedSpace):
+    if warm_start is None and isinstance(solver, ReducedSpace):
         for kind in (CoarseStart, ThinnedStart):
             try:
                 smaller = kind.of(problem, solver)
@@ -287,8 +307,6 @@ def _solve_once(
                 notes.append(f"{kind.missing}: {reason}")
             else:
                 return replace(solution, notes=(*notes, *solution.notes))
-    is_folder = isinstance(given_start, (str, Path))
-    warm_start = WarmStart.read(given_start) if is_folder else given_start
     if warm_start is not None:
         problem = warm_start.apply_to_problem(problem)
     scan: Scan | None = None
@@ -305,6 +323,8 @@ def _solve_once(
         start = _program_and_start(problem, solver, warm_start=warm_start)
         scan = start.scan
         solver = with_workers(solver, workers)
+        if isinstance(solver, InteriorPoint) and start.multipliers is not None:
+            solver = partial(solver, multipliers=start.multipliers)
         solution = None
         with answers_as(finished):
             if scan is not None:
@@ -354,7 +374,14 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
     start = replace(start, collocation=associated_at_guess(start.collocation))
     if warm_start is None:
         return start
-    return replace(warm_start.start(start.collocation), note=start.note)
+    is_whole = isinstance(solver, InteriorPoint) and (
+        solver.initial == "simulation" or warm_start.has_multipliers
+    )
+    warm = warm_start.start(start.collocation, is_whole)
+    if is_whole and warm.variables is not None and warm.multipliers is None:
+        # Those that belong to the positions.
+        warm = replace(warm, multipliers=multipliers_at(warm.collocation, warm.variables))
+    return replace(warm, note=start.note)
 
 
 def _feature_notes(solution: Solution) -> list[str]:

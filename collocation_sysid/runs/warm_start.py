@@ -36,6 +36,9 @@ class WarmStart:
     # body [m].
     places_m: Mapping[str, Mapping[str, Array]]
     substeps: int = 1  # time steps per sample
+    # Program, its variables, and its multipliers or None, from which another of the same layout
+    # begins; None if only the estimates are known.
+    variables: tuple[Collocation, Array, Array | None] | None = None
 
     @classmethod
     def read(cls, folder: str | Path) -> WarmStart:
@@ -91,10 +94,60 @@ class WarmStart:
         """Return the estimates of a solution in memory, without the correction for discretisation
         errors, also of one that has not converged.
         """
-        collocation = solution.collocation
+        return cls.at(solution.collocation, solution.z)
+
+    @classmethod
+    def from_object(cls, start: object, problem: Problem) -> WarmStart:
+        """Return the start that `solve` accepts: a warm start, a solution or a run, the folder of a
+        run, or the variables of `problem.collocation()`, alone or with the multipliers.
+
+        Raises
+        ------
+        InputError
+            If it is none of these.
+        """
+        if isinstance(start, WarmStart):
+            return start
+        if isinstance(start, (str, Path)):
+            return cls.read(start)
+        solution = getattr(start, "solution", start)
+        if isinstance(solution, Solution):
+            known = solution.collocation, solution.z, solution.multipliers
+            return replace(cls.of(solution), variables=known)
+        pair = start if isinstance(start, tuple) else (start, None)
+        collocation = problem.collocation()
+        sizes = (collocation.variable_count, collocation.constraint_count)
+        largest = problem.collocation(lifted=True)
+        try:
+            z, multipliers = (None if n is None else np.array(n, dtype=float).ravel() for n in pair)
+        except (ValueError, TypeError):
+            z = multipliers = None
+        if (
+            z is None
+            or len(z) not in (sizes[0], largest.variable_count)
+            or (
+                (multipliers is not None)
+                and len(multipliers) not in (sizes[1], largest.constraint_count)
+            )
+        ):
+            kind = type(start).__name__
+            found = f"a {kind}" if z is None else f"{len(z)} variables"
+            found += "" if multipliers is None else f" and {len(multipliers)} multipliers"
+            raise InputError(
+                f"found {found}; expected a solution, a run or its folder, or the {sizes[0]} variables "
+                f"of problem.collocation(), also with its {sizes[1]} multipliers: (x, lam_g)",
+                where="start",
+            )
+        z = z[: sizes[0]]  # lifted variables are last
+        known = None if multipliers is None else multipliers[: sizes[1]]
+        return replace(cls.at(collocation, z), variables=(collocation, z, known))
+
+    @classmethod
+    def at(cls, collocation: Collocation, z: Array) -> WarmStart:
+        """Return the estimates at variables z of a program."""
         nuisance = {}
         places_m = {}
-        for part in solution.parts:
+        for part in collocation.iterates(z):
             transcription = part.transcription
             name = transcription.experiment.name
             nuisance |= {
@@ -104,7 +157,7 @@ class WarmStart:
             markers = transcription.experiment.markers.names
             places = transcription.marker_places_m(part.phi)
             places_m[transcription.experiment.name] = dict(zip(markers, places, strict=True))
-        values = parameter_values(collocation, solution.q)
+        values = parameter_values(collocation, z[: collocation.nq])
         return cls(
             Path(), values, nuisance=nuisance, places_m=places_m, substeps=collocation.substeps
         )
@@ -123,7 +176,8 @@ class WarmStart:
             raise InputError(
                 f"found the parameters {', '.join(self.values)}; expected at least one of those that are "
                 f"estimated, {', '.join(i.name for i in problem.parameters.free_scalars)}",
-                self.folder / RESULT_FILE,
+                self.folder / RESULT_FILE if self.folder.name else None,
+                where=None if self.folder.name else "start",
             )
         return replace(problem, parameters=problem.parameters.with_estimates(known))
 
@@ -168,21 +222,55 @@ class WarmStart:
                     matches += 1
         return p, matches
 
-    def start(self, collocation: Collocation) -> Start:
+    @property
+    def has_multipliers(self) -> bool:
+        """Whether multipliers are known."""
+        return self.variables is not None and self.variables[2] is not None
+
+    def start(self, collocation: Collocation, is_whole: bool = False) -> Start:
         """Return the start at the guesses with the earlier places of markers and nuisance parameters,
         limited to their bounds.
 
-        It has no variables if no nuisance parameter or place matches, or if the simulation fails.
-        Every parameter must have a guess.
+        For a method that begins at all positions (`is_whole`) these are the earlier ones where they
+        are known on the same grids and nodes; otherwise they are simulated. It has no variables if
+        the simulation fails, or, unless `is_whole`, if no nuisance parameter or place matches. Every
+        parameter must have a guess.
         """
         collocation = self.apply_to_places(collocation)
         p, matches = self.apply_to_nuisance(collocation)
         matches += sum(
             len(self._known_places(transcription)) for transcription in collocation.transcriptions
         )
-        if not matches:
-            return Start(collocation)
         p = np.clip(p, *collocation.parameter_bounds)
+        if is_whole and self.variables is not None:
+            earlier, z, multipliers = self.variables
+            positions = earlier.unpack(z)[1]
+            if _layout(earlier) == _layout(collocation):
+                known = _rescaled(multipliers, earlier, collocation)
+                return Start(collocation, collocation.pack(p, positions), multipliers=known)
+        if not matches and not is_whole:
+            return Start(collocation)
         positions, failure = simulate_trajectories(collocation, p)
         variables = None if failure is not None else collocation.pack(p, positions)
         return Start(collocation, variables)
+
+
+def _layout(collocation: Collocation) -> list[tuple[str, int, int, int]]:
+    """Name and numbers of grid times, dofs and constraints of each experiment."""
+    return [
+        (s.experiment.name, s.grid_times, s.dof_count, s.constraint_count)
+        for s in collocation.transcriptions
+    ]
+
+
+def _rescaled(
+    multipliers: Array | None, earlier: Collocation, collocation: Collocation
+) -> Array | None:
+    """Return multipliers of an earlier program in the scales of another one of the same layout."""
+    if multipliers is None:
+        return None
+    scaled = multipliers.copy()
+    for before, now in zip(earlier.transcriptions, collocation.transcriptions, strict=True):
+        of_motion = ~now.is_grasp_constraint
+        scaled[now.rows][of_motion] *= now.force_n / before.force_n
+    return scaled * collocation.loss_scale / earlier.loss_scale

@@ -157,9 +157,10 @@ def _refined_solution(coarse: Solution, refined: Solution) -> Solution:
 
 
 def adjoint_multipliers(
-    program: Collocation, collocation: Collocation, z: Array
+    program: Collocation, collocation: Collocation, z: Array, known: Array | None = None
 ) -> tuple[Array, Array] | None:
-    """Return the multipliers that make the Lagrangian stationary in all positions.
+    """Return the multipliers that make the Lagrangian stationary in all positions, or those of other
+    variables and of bounds that belong to known ones.
 
     Parameters
     ----------
@@ -167,6 +168,8 @@ def adjoint_multipliers(
         Program that is passed to IPOPT: `collocation` itself, with lifted variables, or condensed.
     z : (variables,) array
         Variables of `collocation`.
+    known : (constraints,) array, optional
+        Multipliers of `collocation`; by default those that follow from z.
 
     Returns
     -------
@@ -176,7 +179,7 @@ def adjoint_multipliers(
         multiplier is not finite.
     """
     try:
-        of_motion = constraint_multipliers(collocation, z)
+        of_motion = constraint_multipliers(collocation, z) if known is None else known
     except SimulationError:
         return None
     complete = complete_program(program)

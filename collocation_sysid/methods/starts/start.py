@@ -69,5 +69,7 @@ class Start:
     collocation: Collocation  # program with guesses of all parameters
     # (variables,): z where the search begins; None where the method simulates the guesses.
     variables: Array | None = None
+    # (constraints,): multipliers there, for a method that begins with them; None without.
+    multipliers: Array | None = None
     note: str = ""  # what a person should know of the start; may be empty
     scan: Scan | None = None  # the scan that found the guesses
