@@ -287,16 +287,15 @@ class InteriorPoint(MethodOptions):
             settings |= {"ipopt.mumps_pivtol": PIVOT_TOLERANCE}
         if self.hessian == "limited-memory":
             settings["ipopt.hessian_approximation"] = "limited-memory"
-        else:
-            sharpness = _largest_curvature(program)
-            settings |= {
-                # Rows of pressures are nearly dependent where a surface lies on another.
-                "ipopt.perturb_always_cd": "no"
-                if lifted_count(complete_program(program), "pressure")
-                else "yes",
-                "ipopt.jacobian_regularization_exponent": 0.0,
-                "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
-            }
+        sharpness = _largest_curvature(program)
+        settings |= {
+            # Rows of pressures are nearly dependent where a surface lies on another.
+            "ipopt.perturb_always_cd": "no"
+            if lifted_count(complete_program(program), "pressure")
+            else "yes",
+            "ipopt.jacobian_regularization_exponent": 0.0,
+            "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
+        }
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 
 
