@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from inspect import Parameter, Signature, get_annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_origin
 
@@ -52,7 +53,34 @@ def explain_validation_error(
     return InputError(message, path, where=where or None)
 
 
-class StatedSection(Section):
+class _StatedClass(type(BaseModel)):
+    """Metaclass of tables of which a user sees the keys, not the interface of pydantic."""
+
+    @property
+    def __signature__(cls: Any) -> Signature:
+        annotations = get_annotations(cls)
+        return Signature(
+            Parameter(
+                name,
+                Parameter.KEYWORD_ONLY,
+                default=Parameter.empty
+                if field.is_required()
+                else field.get_default(call_default_factory=True),
+                annotation=annotations.get(name, Parameter.empty),
+            )
+            for name, field in cls.model_fields.items()
+        )
+
+    @__signature__.setter
+    def __signature__(cls, value: object) -> None:
+        """The signature of pydantic is not used."""
+
+    def __dir__(cls) -> list[str]:
+        own = {name for name in super().__dir__() if not name.startswith("_")}
+        return sorted(own - set(dir(BaseModel)) - {"of", "model_config"} | set(dir(object)))
+
+
+class StatedSection(Section, metaclass=_StatedClass):
     """Section that is also stated in Python, by keyword arguments."""
 
     if not TYPE_CHECKING:  # which then know the keys
@@ -62,6 +90,9 @@ class StatedSection(Section):
                 super().__init__(**stated)
             except ValidationError as error:
                 raise explain_validation_error(error, stated, None, root=type(self)) from error
+
+    def __dir__(self) -> list[str]:
+        return sorted({*dir(type(self)), *type(self).model_fields})
 
 
 # Tags of the alternatives of a union in the location of a fault.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import shutil
 from dataclasses import replace
@@ -1979,3 +1980,12 @@ def test_an_execution_is_checked_and_identified_in_the_folder_of_a_plan(tmp_path
     again = solved("identify.toml", "again")
     # Within 10 % of the truth; the guess is a third below it.
     assert again["parameters"]["mu_pa"]["value"] == pytest.approx(300.0, rel=0.1)
+
+
+def test_tasks_and_limits_show_their_keys_alone():
+    keys = {"workspace_m", "speed_m_s", "acceleration_m_s2", "rotation_deg"}
+    keys |= {"angular_speed_deg_s", "angular_acceleration_deg_s2"}
+    assert set(inspect.signature(cs.Limits).parameters) == keys
+    assert [name for name in dir(cs.Limits) if name[0] != "_"] == ["bounds_from", "read"]
+    assert inspect.signature(cs.Task).parameters["shortest"].default is False
+    assert not {"model_dump", "copy", "json", "model_fields"} & set(dir(cs.Task))
