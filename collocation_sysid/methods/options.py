@@ -73,13 +73,6 @@ def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> 
 FEWEST = 8
 
 
-def samples_in_share(count: int, share: float) -> int:
-    """Return the number of samples in a share, from 0 to 1, of `count` samples, rounded; at least
-    `FEWEST`, at most `count`.
-    """
-    return min(count, max(FEWEST, round(share * count)))
-
-
 def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
     is_ascending = all(a < b for a, b in pairwise(shares))
     if not is_ascending or shares[-1:] != (1.0,):

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -21,9 +22,10 @@ from ..errors import SimulationError
 from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
 from .horizon import Horizon, Iterate
 from .loss_curvature import exact_curvature, secant_update, with_curvature
-from .options import FEWEST, SHARES, MethodOptions, Shares, samples_in_share
+from .options import FEWEST, SHARES, MethodOptions, Shares
 from .solution import Iteration, Status
 from .solve_recorder import Recorder, misfit_of
+from .starts.motion_share import motion_shares, rows_of_share
 from .trajectory_sweeps import Feasibility
 
 if TYPE_CHECKING:
@@ -123,8 +125,8 @@ class SearchOptions(MethodOptions):
     trust : float
         First trust region: longest step of a parameter's logarithm.
     ladder : tuple of float
-        Shares of the recording solved one after another, ending with 1. Not used if the solve
-        starts from another run.
+        Shares of the motion in the recording that are solved one after another, ending with 1.
+        Not used if the solve starts from another run.
     largest_loss : float
         The search stalls when the solve of a share of the recording except the last leaves a larger
         loss than this; unlimited by default.
@@ -305,12 +307,13 @@ class ReducedSearch:
         complete = all(map(_oscillates, self.collocation.transcriptions))
         return self.options.ladder[-1:] if complete else self.options.ladder
 
+    @cached_property
+    def _motion_shares(self) -> list[Array]:
+        return motion_shares(self.collocation)
+
     def horizon_of_share(self, share: float) -> Horizon:
-        """Return the problem on a share of the recording, one of `ladder`."""
-        rows = [
-            samples_in_share(transcription.grid_times, share)
-            for transcription in self.collocation.transcriptions
-        ]
+        """Return the problem on a share of the motion, one of `ladder`."""
+        rows = [rows_of_share(motion, share) for motion in self._motion_shares]
         return self._horizon(rows, last=share == self.options.ladder[-1])
 
     def _horizon(self, rows: list[int], last: bool) -> Horizon:

@@ -213,6 +213,17 @@ class Parameter:
         """Return the value at a solver's coordinate q."""
         return float(np.exp(q)) if self.scale == "log" else q * self.unit
 
+    def within_bounds(self, value: float) -> float:
+        """Return a value, or one within the bounds if it is not: at a distance of one in the solver's
+        coordinate from the bound, at most in the middle, because a bound is no start of a search.
+        """
+        bounds = [self.to_coordinate(self.lower), self.to_coordinate(self.upper)]
+        if self.lower <= value <= self.upper or np.isnan(bounds).any():
+            return float(np.clip(value, self.lower, self.upper))
+        distance = min(1.0, (bounds[1] - bounds[0]) / 2)
+        inside = bounds[0] + distance if value < self.lower else bounds[1] - distance
+        return float(np.clip(self.from_coordinate(inside), self.lower, self.upper))
+
     def value_derivative(self, value: float) -> float:
         """Return the derivative of the value by q, at a value (not at a q)."""
         return value if self.scale == "log" else self.unit

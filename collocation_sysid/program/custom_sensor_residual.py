@@ -54,7 +54,6 @@ class CustomSensorResidual(MeasurementResidual):
     is_static: bool
 
     sigma_key = "sigma"
-    has_offsets = True
 
     @classmethod
     def from_sensor(
@@ -143,11 +142,6 @@ class CustomSensorResidual(MeasurementResidual):
     def stencil(self, phi: Array, known: int) -> RowStencil:
         samples = int(np.count_nonzero(self._times[:, -1] < known))
         return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
-
-    @property
-    def first_needed_s(self) -> float:
-        first = int(self.is_compared.any(axis=(1, 2)).argmax())
-        return float(self.observable_s[self._times[first, -1]])
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the user's expression (m,), padded with zeros to a multiple of three numbers."""

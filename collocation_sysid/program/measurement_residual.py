@@ -236,9 +236,6 @@ class MeasurementResidual(ABC):
         Indices in φ of the nuisance parameters of each entity.
     sigma_key : str
         Key of σ in a problem file.
-    has_offsets : bool
-        Whether measurements have an unknown offset, such as a tare, which must be allowed for
-        before anything is fitted.
     group_size : int
         How many numbers the loss takes as one vector, g; three for a position.
     has_fixed_stencils : bool
@@ -266,7 +263,6 @@ class MeasurementResidual(ABC):
 
     group_size: ClassVar[int] = GROUP
     sigma_key: ClassVar[str] = "sigma_m"
-    has_offsets: ClassVar[bool] = False
     has_fixed_stencils: ClassVar[bool] = True
     has_noise_floor: ClassVar[bool] = False
     errs_slowly: ClassVar[bool] = False
@@ -276,13 +272,6 @@ class MeasurementResidual(ABC):
     @abstractmethod
     def measurement(self) -> Measurement:
         """Measurement of the experiment that is compared."""
-
-    @property
-    def first_needed_s(self) -> float:
-        """Time [s] up to which the motion must be known before the first sample can be compared,
-        for any φ; that of the first sample if none is compared.
-        """
-        return float(self.t_s[self.is_compared.any(axis=(1, 2)).argmax()])
 
     @cached_property
     def pooled_groups(self) -> PooledResiduals:

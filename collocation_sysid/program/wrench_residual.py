@@ -42,7 +42,6 @@ class WrenchResidual(MeasurementResidual):
     wrench: Wrench  # measured samples
 
     sigma_key = "sigma_n"
-    has_offsets = True
     has_fixed_stencils = False
 
     @classmethod
@@ -89,13 +88,6 @@ class WrenchResidual(MeasurementResidual):
     @property
     def measurement(self) -> Wrench:
         return self.wrench
-
-    @property
-    def first_needed_s(self) -> float:
-        """Time [s] up to which the motion must be known for the first sample that is compared, with
-        the largest possible shift of the clock.
-        """
-        return super().first_needed_s + self.observable.clock_limit_s
 
     def is_covered(self, known: int) -> NDArray[np.bool_]:
         return _is_covered(self.observable, self.t_s, known=known)

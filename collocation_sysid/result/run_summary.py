@@ -21,6 +21,7 @@ from ..fem.laws.constants import (
     unit_of,
     without_region,
 )
+from ..methods.starts.start import NO_GUESS
 from ..runs.result_content import Result
 from ..statistics.budget.systematic_effects import source_label
 from ..statistics.combinations import WIDE, precision_text
@@ -100,6 +101,7 @@ def _brief(result: Result) -> list[Shown]:
     others = [
         *remedy_command(result.trust.concerns),
         *(Line(note, "quiet") for note in result.notes if note.startswith(NO_CAUSE)),
+        *_start(result),
         *_estimates(result),
         *_limit(result),
         *_basis(result),
@@ -116,6 +118,12 @@ def _further_reasons(result: Result, shown: int) -> Iterator[Line]:
     if (count := len(result.trust.concerns) - shown) > 0:
         further = "1 further reason" if count == 1 else f"{count} further reasons"
         yield Line(f"  {further}, less grave: in the report, and with --details", "quiet")
+
+
+def _start(result: Result) -> Iterator[Line]:
+    """Yield where the search began if that is not the stated guess."""
+    if result.scan is not None and result.scan.reason != NO_GUESS:
+        yield Line(f"note: {result.scan.sentence}", "quiet")
 
 
 def _details(result: Result) -> list[Shown]:

@@ -1,9 +1,10 @@
-"""Solves from several stiffnesses of a scan, where correspondences make local minima.
+"""Solves from several stiffnesses of a scan, where there may be local minima.
 
 Points measured by a camera are associated with the nearest part of the surface: a body that is too
 soft, with the camera turned to match, can be a local minimum of the loss. So the scan's best
 stiffness and those next to it are all followed to convergence, or to a minimum that is already
-known, and the solution with the lowest loss counts.
+known, and the solution with the lowest loss counts. Without correspondences that is done where the
+first solution needs an error of a pose or clock that nobody makes.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Iteration, Method, Solution, Watch
+from ..methods.starts.initial_trajectories import associated_at_guess
 from ..methods.starts.stiffness_scan import Scan, Start
 from ..program.collocation import Collocation
 
@@ -25,6 +27,8 @@ SAME_LOSS = 10.0
 # Relative difference of all parameters below which a search with such a loss is at the same minimum
 # and need not continue.
 SAME_PARAMETERS = 0.01
+# Estimate of an error, in standard deviations of its prior, that makes a solution doubtful.
+UNLIKELY = 4.5
 Solve = Callable[[Method, Collocation], Solution]
 
 
@@ -54,7 +58,7 @@ def robust_loss(solution: Solution) -> float:
     return sum(part.loss for part in solution.parts) + float(prior @ prior) + excluded_loss
 
 
-class _KnownMinimum(Exception):
+class KnownMinimum(Exception):
     """A search has arrived at a minimum that is known."""
 
     def __init__(self, solution: Solution) -> None:
@@ -62,8 +66,8 @@ class _KnownMinimum(Exception):
         self.solution = solution
 
 
-def _until_known(method: Method, known: Sequence[Solution]) -> Method:
-    """Return a method that raises `_KnownMinimum` where a known solution is reached."""
+def until_known(method: Method, known: Sequence[Solution]) -> Method:
+    """Return a method that raises `KnownMinimum` where a known solution is reached."""
 
     def solve(
         collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -74,7 +78,7 @@ def _until_known(method: Method, known: Sequence[Solution]) -> Method:
                 watch(line)
             for solution in known:
                 if _is_at(line, solution):
-                    raise _KnownMinimum(solution)
+                    raise KnownMinimum(solution)
 
         return method(collocation, watch_for_known, start)
 
@@ -93,13 +97,19 @@ def _is_at(line: Iteration, solution: Solution) -> bool:
     )
 
 
+def _is_likely(solution: Solution) -> bool:
+    p, _ = solution.collocation.unpack(solution.z)
+    return bool((np.abs(p[solution.collocation.nq :]) <= UNLIKELY).all())
+
+
 def follow_starts(
     solver: Method, start: Start, scan: Scan, solve: Solve
 ) -> tuple[Start, Solution | None]:
     """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
 
-    The best start of the scan, `start`, is returned without a solution if the scan found only one start, if
-    the problem has no local minima, or if no start converges. Exceptions of `solve` are not caught.
+    Without local minima the first solution counts, unless one of its nuisance parameters is above
+    `UNLIKELY`. The best start of the scan, `start`, is returned without a solution if the scan found
+    only one start, or no start converges. Exceptions of `solve` are not caught.
 
     Parameters
     ----------
@@ -118,22 +128,32 @@ def follow_starts(
         a note on the losses; and the solution from there if the method is reduced space.
     """
     collocation = start.collocation
-    if not scan.others or not has_local_minima(collocation):
+    if not scan.others:
         return start, None
+    is_unique = not has_local_minima(collocation)
     own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
     is_own = own == ReducedSpace.name
+    if is_unique and not is_own:
+        return start, None
     method: Method = solver if is_own else ReducedSpace()
     candidates: list[tuple[float, int, Solution]] = []
     for number in (scan.best, *scan.others):
-        # The search associates cameras with its first shape itself.
-        started = collocation.with_parameters(scan.starts[number])
+        started = collocation
+        if number != scan.best:
+            started = collocation.with_parameters(scan.starts[number])
+        if is_unique:  # otherwise the search associates cameras with its first shape itself
+            started = associated_at_guess(started)
         try:
-            solution = solve(_until_known(method, [each for *_, each in candidates]), started)
-        except _KnownMinimum as known:
+            solution = solve(until_known(method, [each for *_, each in candidates]), started)
+        except KnownMinimum as known:
             candidates.append((robust_loss(known.solution), number, known.solution))
             continue
         if solution.status.converged:
             candidates.append((robust_loss(solution), number, solution))
+        if is_unique and (not candidates or _is_likely(solution)):
+            break
+    if is_unique and len(candidates) < 2:
+        return start, candidates[0][-1] if candidates else solution
     if not candidates:
         return start, None
     loss, best, solution = min(candidates, key=lambda each: each[0])
@@ -148,4 +168,5 @@ def follow_starts(
         note += ": there are local minima; the lowest one is reported"
     chosen = replace(scan, best=best, parameters=scan.starts[best])
     started = collocation.with_parameters(scan.starts[best])
-    return Start(started, note=note, scan=chosen), solution if is_own else None
+    chosen_start = replace(start, collocation=started, note=note, scan=chosen)
+    return chosen_start, solution if is_own else None

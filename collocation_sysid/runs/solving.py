@@ -34,7 +34,7 @@ from .check.cost import require_memory
 from .coarse_start import CoarseStart
 from .prediction import fit_misfits
 from .second_start import second_start, start_beyond_bounds, without_limitless_shares
-from .several_starts import follow_starts
+from .several_starts import KnownMinimum, follow_starts, until_known
 from .smaller_problem import NoStartError, SmallerProblem
 from .thinned_start import ThinnedStart
 from .warm_start import WarmStart
@@ -151,6 +151,11 @@ def solve(
                 solution = _solve_by(solver, problem, watch, start=warm_start, scheduler=scheduler)
             except KeyboardInterrupt:
                 solution = best.solution()
+            except TimeLimitReached:
+                if best.answer is None or limit_s == UNLIMITED_S:
+                    raise
+                status = Status.TIME_LIMIT
+                solution = replace(best.solution(), status=status, message=status.sentence)
     except TimeLimitReached:
         limit_s = _start_limit_s(problem, solver)
         raise InputError(
@@ -338,7 +343,9 @@ def _solve_once(
                 solution = solve_with_renewed_correspondences(
                     solver, start.collocation, watch=watch, start=start.variables
                 )
-            if scan is None and solution.status in FAILED_STATUSES:
+            if start.stated is not None:
+                scan, solution = _search_of_stated(solver, start, solution, watch=watch)
+            elif scan is None and solution.status in FAILED_STATUSES:
                 scan, solution = _solve_from_scan(solver, solution, watch=watch)
             if warm_start is None and solution.method == ReducedSpace.name:
                 solution = best_of_second_start(solver, solution, watch=watch)
@@ -398,6 +405,23 @@ def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
     if workers is None or not isinstance(solver, ReducedSpace):
         return solver
     return partial(solver, workers=workers)
+
+
+def _search_of_stated(
+    solver: Method, start: Start, of_scan: Solution, watch: Watch | None
+) -> tuple[Scan | None, Solution]:
+    """Solve from the stated guesses, too, as long as that may fit better than the scan's start."""
+    assert start.stated is not None
+    stated = Start(start.stated, note="the search from the stated guess")
+    method = solver
+    if of_scan.status.converged and isinstance(solver, ReducedSpace):
+        limited = replace(solver, largest_loss=max(of_scan.history[-1].loss, LEAST_GAIN))
+        method = until_known(limited, [of_scan])
+    try:
+        best = _better_of(method, of_scan, watch, choose=lambda _: stated)
+    except KnownMinimum:
+        best = of_scan
+    return (start.scan if best.z is of_scan.z else None), best
 
 
 def _solve_from_scan(

@@ -25,6 +25,7 @@ from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.starts.continuation import Continuation, first_samples, first_share
+from collocation_sysid.methods.starts.motion_share import motion_shares, rows_of_share
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem
@@ -78,7 +79,8 @@ def test_a_part_has_the_layout_of_the_whole():
         huber=3.0,
     )
     part = first_share(whole, 0.5)
-    assert [transcription.grid_times for transcription in part.transcriptions] == [19, 31]
+    for each, motion in zip(part.transcriptions, motion_shares(whole), strict=True):
+        assert each.grid_times == 1 + 2 * ((rows_of_share(motion, 0.5) - 1) // 2)
     assert (part.scheme, part.substeps, part.huber) == ("bdf2", 2, 3.0)
     assert all(transcription.has_grasp_constraints for transcription in part.transcriptions)
 

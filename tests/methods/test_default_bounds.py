@@ -182,8 +182,7 @@ def test_a_scan_continues_where_stiffer_bodies_fit_ever_better(misfit, least, mo
         def evaluate_at(self, young_pa, _):
             return (misfit(young_pa), []) if young_pa < 2e11 else (np.nan, None)
 
-        def parameter_key(self, young_pa):
-            return (young_pa,)
+        bounds_pa = (0.0, np.inf)
 
     state = ScanState(Trial())  # pyright: ignore[reportArgumentType]
     for young_pa in (2.5e6, 5e6, 1e7):

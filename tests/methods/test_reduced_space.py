@@ -29,6 +29,7 @@ from collocation_sysid.errors import SimulationError
 from collocation_sysid.methods.horizon import Horizon, Iterate
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
+from collocation_sysid.methods.options import SHARES
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.starts.initial_trajectories import (
@@ -36,6 +37,7 @@ from collocation_sysid.methods.starts.initial_trajectories import (
     rigid_trajectory,
     simulate_trajectories,
 )
+from collocation_sysid.methods.starts.motion_share import motion_shares, rows_of_share
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.least_squares import SquareRootInformation
@@ -303,7 +305,8 @@ def test_rows_not_reached_are_carried_by_the_grasp():
     (transcription,) = solution.collocation.transcriptions
     (found,), expected = (solution.positions_m, rigid_trajectory(transcription, as_theta(GUESS)))
     away_m = np.abs(found - expected.reshape(found.shape)).max(axis=(1, 2))
-    reached = 10  # a quarter of 41 rows
+    (motion,) = motion_shares(solution.collocation)
+    reached = rows_of_share(motion, SHARES[0])
     assert (away_m[1:reached] > 1e-5).all()
     np.testing.assert_allclose(away_m[reached:], 0, atol=1e-12)
 

@@ -15,6 +15,7 @@ from collocation_sysid.common.time_limit import (
     unlimited,
 )
 from collocation_sysid.methods.solution import Status
+from collocation_sysid.methods.starts.stiffness_scan import TrialSimulation
 from collocation_sysid.runs import solving
 
 SOON = cs.ReducedSpace(max_time_s=1e-9)
@@ -48,6 +49,24 @@ def test_a_run_states_what_the_limit_left_out(monkeypatch):
     (reason,) = (each.message for each in answer.trust.concerns)
     assert reason.startswith("interrupted: at the limit of 100 s")
     assert "no error bars" in reason
+
+
+def test_the_best_start_is_kept_if_the_limit_ends_the_scan(monkeypatch):
+    evaluate_at = TrialSimulation.evaluate_at
+    tried = []
+
+    def limited(self, young_pa, guess):
+        tried.append(young_pa)
+        with time_limit(-1.0 if len(tried) > 6 else 1e3):
+            require_time()
+            return evaluate_at(self, young_pa, guess)
+
+    monkeypatch.setattr(TrialSimulation, "evaluate_at", limited)
+    unguessed = cs.Problem([measured(hung_cube())], TRUTH | {"mu_pa": cs.Unknown()})
+    solution = cs.solve(unguessed, cs.ReducedSpace(max_time_s=100.0))
+    assert solution.status is Status.TIME_LIMIT
+    assert solution.parameters["mu_pa"] < tried[0]
+    assert np.isfinite(solution.z).all()
 
 
 @pytest.mark.parametrize("method", [SOON, cs.ReducedSpace()])

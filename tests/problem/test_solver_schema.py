@@ -133,7 +133,7 @@ def test_a_method_lists_its_options(method: str):
 
 def test_an_option_is_described_with_default_and_choices():
     told = " ".join(run_command("methods", "reduced-space").out.split())
-    assert "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the recording" in told
+    assert "ladder [0.25, 0.5, 1] list, each a number above 0; Shares of the motion" in told
     assert (
         "hessian gauss-newton gauss-newton, exact; Second derivatives that Gauss–Newton neglects"
         in told

@@ -197,7 +197,6 @@ class OutlinesResidual(CameraImagesResidual):
     correspondences: OutlinePairs
 
     sigma_key = "sigma_px of outlines"
-    has_offsets = False
     has_noise_floor = True
 
     @cached_property

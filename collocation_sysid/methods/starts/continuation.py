@@ -25,11 +25,12 @@ from ..comparison.casadi_nlp import Sleqp, SqpMethod
 from ..comparison.penalty import AugmentedLagrangian, Penalty
 from ..comparison.shooting import Shooting
 from ..interior_point import InteriorPoint
-from ..options import SHARES, MethodOptions, Shares, method_from_options, samples_in_share
+from ..options import SHARES, MethodOptions, Shares, method_from_options
 from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Method, Solution, Status, Watch
 from ..solve_recorder import Recorder
 from .initial_trajectories import complete_variables, simulate_trajectories
+from .motion_share import motion_shares, rows_of_share
 
 _ONE_HORIZON = (
     InteriorPoint,
@@ -51,7 +52,7 @@ class Continuation(MethodOptions):
     Attributes
     ----------
     shares : tuple of float
-        Shares of the samples solved one after another, ending with 1.
+        Shares of the motion solved one after another, ending with 1.
     stage : mapping or Method
         Method that solves each part: its `method`, "interior-point" by default, and options of that
         method by name, as in the problem file; from Python any method.
@@ -116,11 +117,14 @@ def first_samples(experiment: Experiment, count: int) -> Experiment:
 
 
 def first_share(collocation: Collocation, share: float) -> Collocation:
-    """Return the problem with the first share, from 0 to 1, of every fitted experiment's samples,
-    at least `FEWEST` where there are as many; validation recordings are left out.
+    """Return the problem with the first share, from 0 to 1, of the motion in every fitted experiment,
+    see `motion_shares`; validation recordings are left out.
     """
-    fitted = [transcription.experiment for transcription in collocation.transcriptions]
-    shorter = [first_samples(e, samples_in_share(len(e.t_s), share)) for e in fitted]
+    pairs = zip(collocation.transcriptions, motion_shares(collocation), strict=True)
+    shorter = [
+        first_samples(each.experiment, (rows_of_share(motion, share) - 1) // each.substeps + 1)
+        for each, motion in pairs
+    ]
     return replace(collocation, experiments=shorter)
 
 

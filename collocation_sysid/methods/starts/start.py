@@ -14,6 +14,8 @@ from ...model.parameters import Parameters
 from ...program.collocation import Collocation
 from ..options import SHARES
 
+NO_GUESS = "no guess"
+
 
 @dataclass(frozen=True, eq=False)
 class ScanSummary:
@@ -59,7 +61,7 @@ class Scan(ScanSummary):
     # Indices of other moduli that may lead to a better solution where there are local minima: those
     # next to the best, and other minima of the misfit, in ascending order of the misfit.
     others: tuple[int, ...] = ()
-    share: float = SHARES[0]  # share of the samples that were compared
+    share: float = SHARES[0]  # share of the motion that was compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,3 +75,5 @@ class Start:
     multipliers: Array | None = None
     note: str = ""  # what a person should know of the start; may be empty
     scan: Scan | None = None  # the scan that found the guesses
+    # Program with the stated guesses, where the scan fits better; both are searched.
+    stated: Collocation | None = None

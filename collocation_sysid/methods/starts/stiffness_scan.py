@@ -1,12 +1,12 @@
 """Start without a guess: a scan of the stiffness from stiff to soft.
 
 At each stiffness the free moduli have values that are typical in relation to each other, and other
-parameters without a guess have typical values. The first part of every recording is simulated and
-compared with all measurements; if that part is alike at every stiffness, as in free fall, a longer
-one is. A stiff body can always be simulated and moves rigidly with the
-grasp; a softer one sags more, follows later and needs less force, until it fits, and finally the
-simulation fails. So the best start is found by cheap simulations, and the search begins on the side
-where simulations succeed.
+parameters without a guess have typical values. The first part of the motion of every recording is
+simulated and compared with all measurements, with the nuisance parameters that fit best; if that
+part is alike at every stiffness, as in free fall, a longer one is. A stiff body can always be
+simulated and moves rigidly with the grasp; a softer one sags more, follows later and needs less
+force, until it fits, and finally the simulation fails. So the best start is found by cheap
+simulations, and the search begins on the side where simulations succeed.
 
 The same scan is used if a guess cannot be simulated, or fits worse than a rigid body. Use
 `start_problem` before a method is called.
@@ -14,31 +14,33 @@ The same scan is used if a guess cannot be simulated, or fits worse than a rigid
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import groupby
 
 import numpy as np
 
-from ...common.array_types import Array, root_mean
+from ...common.array_types import Array
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...errors import InputError, SimulationError
 from ...fem.laws.constants import YOUNG, is_modulus, usual_value
 from ...model.parameters import Parameter, Parameters, with_widest_bounds
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.forward.newton_solver import NewtonOptions
-from ...program.transcription import Transcription
+from ...program.least_squares import SquareRootInformation
+from ...program.measurement_residual import huber_as_least_squares
 from ..best_iterate import keep
-from ..options import SHARES, samples_in_share
+from ..options import SHARES
 from ..reduced_space import ReducedSpace
 from ..solution import Solution
 from ..solve_recorder import interrupted_solution
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .memory import memory_start
+from .motion_share import motion_shares, rows_of_share
 from .power_law import power_law_start
-from .start import Scan, Start
+from .start import NO_GUESS, Scan, Start
 
 # Largest Young's modulus of the scan [Pa].
 STIFFEST_PA = 1e7
@@ -66,10 +68,16 @@ EXPLAINED = 1.5
 MORE_STARTS = 2
 # Largest misfit of another start over the best one.
 EQUIVALENT_LOSS_RATIO = 4.0
-# Misfit at a guess over that at the best start of a scan, up to which the guess is kept: smaller
-# differences come from tares, clocks and poses, which are not estimated in a scan.
+# Misfit at a guess over that at the best start of a scan, up to which only the guess is searched: the
+# damping, which is usual in a scan, and the distance of its stiffnesses make smaller differences.
 CLEARLY_BETTER = 1.2
-NO_GUESS = "no guess"
+# Largest error of a pose, clock or place in a scan, in standard deviations of its prior: larger ones
+# would fit wrong stiffnesses.
+LARGEST_ERROR = 3.0
+# Change of the errors, in the same unit, that ends the steps to those that fit best.
+SMALL_ERROR = 1e-3
+# Most steps to the errors that fit best: a turned camera takes about six.
+NUISANCE_STEPS = 10
 
 
 def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
@@ -79,9 +87,10 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
     note states which constants their measurements do not determine, which are then fixed. Tables of
     moduli over frequency or time start from `memory_start`, unless the guesses are as good.
 
-    Given guesses are kept, unless the body cannot be simulated with them, or it fits worse than an
-    undeformed one and the scan finds initial values that fit clearly better (`CLEARLY_BETTER`).
-    The given problem is not modified; it is returned itself if nothing changes.
+    Given guesses are kept, unless the body cannot be simulated with them. If it fits worse than an
+    undeformed one, and the scan finds initial values that fit clearly better (`CLEARLY_BETTER`), the
+    start has those, and the problem with the guesses is `Start.stated`, to be searched too. The given
+    problem is not modified; it is returned itself if nothing changes.
 
     Parameters
     ----------
@@ -114,30 +123,24 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
     misfit, failure = trial.evaluate_guess(is_complete)
     if failure is None and misfit <= trial.rigid_misfit:
         return Start(collocation)
-    reason = f"the body cannot be simulated at the guess ({failure})"
-    if failure is None:
-        reason = (
-            "at the guess, the simulation is farther from the measurements than a body that moves "
-            "rigidly with its grasps"
-        )
-    result = rescue(collocation, reason, is_complete=is_complete)
+    result = rescue(collocation, "", is_complete=is_complete)
     if result is None:
         return Start(collocation)  # the method reports what it needs
     if result.share != trial.share and failure is None:
         misfit, failure = TrialSimulation(collocation, result.share).evaluate_guess(is_complete)
-        if failure is not None:
-            reason = f"the body cannot be simulated at the guess ({failure})"
+    found = collocation.with_parameters(result.parameters)
+    if failure is not None:
+        reason = f"the body cannot be simulated at the guess ({failure})"
+        return Start(found, scan=replace(result, reason=reason))
     best = float(result.misfit[result.best])
-    if failure is None and misfit <= CLEARLY_BETTER * best:
+    if misfit <= CLEARLY_BETTER * best:
         return Start(collocation)
-    result = replace(result, reason=reason)
-    if failure is None:
-        result = replace(
-            result,
-            reason=f"{reason} (misfit {misfit:.3g} standard deviations at the guess, {best:.3g} at "
-            "the initial values of the scan, which replace all guesses)",
-        )
-    return Start(collocation.with_parameters(result.parameters), scan=result)
+    reason = (
+        "the stated guess and the best stiffness of a scan were both searched, because at the guess "
+        f"the misfit is {misfit:.3g} standard deviations, larger than that of a rigid body, and "
+        f"{best:.3g} there"
+    )
+    return Start(found, scan=replace(result, reason=reason), stated=collocation)
 
 
 def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:
@@ -234,8 +237,11 @@ def _tried(trial: TrialSimulation) -> ScanState:
     """Return the misfits from stiff to soft, continued beyond an end that fits best."""
     trials = ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
-    with counted_phase(StepUnit.STIFFNESS, STEPS):
-        trials.try_sequence([STIFFEST_PA * step**k for k in range(STEPS)])
+    young_pa = [STIFFEST_PA * step**k for k in range(STEPS)]
+    low, high = trial.bounds_pa
+    within = [young for young in young_pa if low <= young <= high] or [math.sqrt(abs(low * high))]
+    with counted_phase(StepUnit.STIFFNESS, len(within)):
+        trials.try_sequence(within)
     if trials.depends_on_stiffness and trials.is_best_at_end(softest=True):
         trials.extend_range(min(trials.misfits), step)
     if trials.is_best_at_end(softest=False):
@@ -272,30 +278,30 @@ def other_starts(misfit: Array, best: int) -> tuple[int, ...]:
 
 def typical_parameters(parameters: Parameters, young_pa: float) -> Parameters:
     """Return parameters in which missing guesses are replaced by typical values at a Young's
-    modulus [Pa], within their bounds.
+    modulus [Pa], within their bounds, see `Parameter.within_bounds`.
 
     Parameters with a prior get its mean instead. Fixed parameters and those with a guess are kept;
     units that are missing are added, see `_with_units`. Every free parameter without a guess must
     have a prior or a typical value, which parameters are required to have where they are made.
     """
+    usual = _usual_values(parameters, young_pa)
+    guesses = {item.name: item.within_bounds(usual[item.name]) for item in parameters.free}
+    return _with_units(parameters, young_pa).with_guess(guesses)
+
+
+def _usual_values(parameters: Parameters, young_pa: float) -> dict[str, float]:
+    """Return the guess of each free parameter, its prior mean, or a typical value."""
     guesses = {
         i.name: i.guess for i in parameters.components if i.tied is None and i.guess is not None
     }
-
-    def initial_value(item: Parameter) -> float:
-        """Return the guess of a parameter, its prior mean, or a typical value within its bounds."""
-        if item.guess is not None:
-            return item.guess
+    values = {}
+    for item in parameters.free:
         region, dot, _ = item.name.rpartition(".")
         poisson = guesses.get(f"{region}{dot}poisson", guesses.get("poisson", 0.3))
-        usual = usual_value(item.name, young_pa, poisson=poisson)
-        if item.prior is not None:
-            usual = item.prior[0]
-        assert usual is not None  # by `parameter`
-        return float(np.clip(usual, item.lower, item.upper))
-
-    sized = _with_units(parameters, young_pa)
-    return sized.with_guess({item.name: initial_value(item) for item in parameters.free})
+        usual = item.prior[0] if item.prior else usual_value(item.name, young_pa, poisson=poisson)
+        values[item.name] = guesses.get(item.name, usual)
+        assert values[item.name] is not None  # by `parameter`
+    return values
 
 
 def typical_constants(parameters: Parameters) -> dict[str, float]:
@@ -346,40 +352,83 @@ def without_guesses(collocation: Collocation) -> Collocation:
 
 
 def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> float:
-    """Return the RMS of all residuals on the first rows, in standard deviations."""
-    # Cameras are compared by `rough_residuals`, which need no correspondences.
+    """Return the root mean square of all residuals on the first rows, in standard deviations, with the
+    nuisance parameters that fit best, at most `LARGEST_ERROR`, and their priors.
+    """
+    # Otherwise an error of the pose of a camera or of a clock would be fitted by the stiffness.
     collocation, p = collocation.place_unknown_markers(p, positions, only_poses=True)
-    parts = collocation.iterates_at(p, positions)
-    return root_mean(np.concatenate([_residuals(part) for part in parts]) ** 2)
+    phi = p[collocation.nq :]
+    fit = _nuisance_fit(collocation, p, positions)
+    loss, reach = fit.loss(phi), np.inf
+    low, high = np.minimum(phi, -LARGEST_ERROR), np.maximum(phi, LARGEST_ERROR)
+    # What has no effect at a fixed motion, such as a tilt of gravity, keeps its value.
+    is_moved = np.diag(fit.information) > 1
+    for _ in range(NUISANCE_STEPS):
+        if not (np.isfinite(loss) and is_moved.any()):
+            break
+        fitted = fit.minimiser(np.maximum(low, phi - reach), np.minimum(high, phi + reach))
+        other_phi = np.where(is_moved, fitted, phi)
+        step = np.abs(other_phi - phi).max()
+        other = _nuisance_fit(
+            collocation, np.concatenate([p[: collocation.nq], other_phi]), positions
+        )
+        gain = loss - other.loss(other_phi)
+        if gain > 0:
+            fit, phi, loss = other, other_phi, loss - gain
+        if step < SMALL_ERROR or 0 <= gain < BETTER * loss:
+            break
+        if not gain > 0:
+            reach = step / 4
+    return math.sqrt(loss / max(fit.row_count - len(phi), 1)) if np.isfinite(loss) else np.nan
 
 
-def _residuals(iterate: ExperimentIterate) -> Array:
-    """Return the residuals (m,) of all measurements, in standard deviations."""
-    # Offsets, clocks and tool parameters have the values that fit best, because nothing else
-    # determines them beforehand; their m − M priors follow the M measurements.
-    residuals = []
-    slopes = []
-    predictions = iterate.linearise_fixed_motion()
-    for kind, (residual, slope) in zip(iterate.transcription.residuals, predictions, strict=True):
-        rough = kind.rough_residuals(iterate.x, iterate.phi)
+def _nuisance_fit(
+    collocation: Collocation, p: Array, positions: Sequence[Array]
+) -> SquareRootInformation:
+    """Return residuals and priors of φ, linearised at a motion of φ = 0 that changes only with the
+    pose of the body in its grasp.
+    """
+    count = collocation.nphi
+    fit = SquareRootInformation.empty(count).with_rows(np.zeros(count), np.eye(count))
+    for part in collocation.iterates_at(p, positions):
+        own = SquareRootInformation.empty(len(part.phi))
+        for residuals, slopes in _residuals(part):
+            own = own.with_rows(residuals, slopes, part.phi)
+        indices = part.transcription.nuisance_indices.indices - collocation.nq
+        fit = fit.with_problem(own, indices)
+    return fit
+
+
+def _residuals(iterate: ExperimentIterate) -> Iterator[tuple[Array, Array]]:
+    """Yield the residuals (m,) of each measurement, and their derivatives (m, k) by φ."""
+    phi, grasp = iterate.phi, iterate.transcription.nuisance.grasp_indices
+    moved = _moved_in_grasp(iterate, phi)
+    others = [_moved_in_grasp(iterate, phi + one) for one in np.eye(len(phi))[grasp]]
+    for k, (residual, slope) in enumerate(moved.linearise_fixed_motion()):
+        kind = iterate.transcription.residuals[k]
+        # Cameras are compared by `rough_residuals`, which need no correspondences.
+        rough = kind.rough_residuals(moved.x, phi)
         if rough is not None:
-            residuals.append(rough)
-            slopes.append(np.zeros((len(rough), slope.shape[-1])))
+            yield rough, np.zeros((len(rough), len(phi)))
             continue
-        is_compared = kind.compared_with(len(iterate.observables[len(residuals)]))[: len(residual)]
-        residuals.append(residual[is_compared])
-        slopes.append(slope[is_compared] * kind.has_offsets)
-    residual = np.concatenate(residuals)
-    slope = np.concatenate(slopes)
-    offset_slopes = slope[:, slope.any(axis=0)]
-    priors = np.eye(offset_slopes.shape[1])
-    residual = np.append(residual, np.zeros(len(priors)))
-    offset_slopes = np.concatenate([offset_slopes, priors])
-    return (
-        residual - offset_slopes @ np.linalg.lstsq(offset_slopes, residual, rcond=None)[0]
-        if offset_slopes.size
-        else residual
-    )
+        for place, other in zip(grasp, others, strict=True):
+            slope[..., place] += kind.residuals(other.observables[k], phi) - residual
+        is_compared = kind.compared_with(len(moved.observables[k]))[: len(residual)]
+        residual, slope = huber_as_least_squares(residual, slope, kind.huber)
+        yield residual[is_compared], slope[is_compared]
+
+
+def _moved_in_grasp(iterate: ExperimentIterate, phi: Array) -> ExperimentIterate:
+    """Return a motion rigidly moved by the errors in φ (k,) of the pose in its grasp."""
+    transcription, nuisance = iterate.transcription, iterate.transcription.nuisance
+    if not phi[nuisance.grasp_indices].any():
+        return iterate
+    t_s = transcription.dynamics.t_s[: len(iterate.x)]
+    rotations, translations = transcription.experiment.rigid_motion(t_s)
+    held = (iterate.x.reshape(len(t_s), -1, 3) - translations[:, None]) @ rotations
+    error = nuisance.grasp_motion_matrix(phi)
+    moved = (held @ error[:3, :3].T + error[:3, 3]) @ rotations.transpose(0, 2, 1)
+    return replace(iterate, x=(moved + translations[:, None]).reshape(len(t_s), -1))
 
 
 def _answer(collocation: Collocation, p: Array, positions: Sequence[Array]) -> Solution:
@@ -393,27 +442,15 @@ def _answer(collocation: Collocation, p: Array, positions: Sequence[Array]) -> S
     return interrupted_solution(ReducedSpace.name, collocation, z)
 
 
-def _compared_samples(transcription: Transcription, share: float) -> int:
-    """Return a share of the samples, at least one of each measurement; at most all."""
-    t_s = transcription.experiment.t_s
-    first_samples = [transcription.experiment.markers.first_visible_sample]
-    first_samples += [
-        int(np.searchsorted(t_s, residual.first_needed_s)) + residual.observable.delay_steps
-        for residual in transcription.residuals
-        if residual is not transcription.markers
-    ]
-    return min(len(t_s), max(samples_in_share(len(t_s), share), max(first_samples) + 1))
-
-
 class TrialSimulation:
-    """Simulation of the first part of every recording, and its misfit.
+    """Simulation of the first part of the motion of every recording, and its misfit.
 
     Parameters
     ----------
     collocation : Collocation
         Problem with units of all parameters.
     share : float
-        Share of the samples that are compared; also an attribute.
+        Share of the motion that is compared, see `motion_shares`; also an attribute.
 
     Attributes
     ----------
@@ -430,13 +467,13 @@ class TrialSimulation:
     def __init__(self, collocation: Collocation, share: float = SHARES[0]) -> None:
         self.collocation = collocation
         self.share = share
-        self.samples = []
-        self.rows = []
-        self.all_rows = []
-        for transcription in collocation.transcriptions:
-            self.samples.append(_compared_samples(transcription, share))
-            self.rows.append((self.samples[-1] - 1) * transcription.substeps + 1)
-            self.all_rows.append(transcription.grid_times)
+        usual = collocation.with_parameters(typical_parameters(collocation.parameters, SOFT_PA))
+        self.rows = [rows_of_share(motion, share) for motion in motion_shares(usual)]
+        self.all_rows = [each.grid_times for each in collocation.transcriptions]
+        self.samples = [
+            (rows - 1) // each.substeps + 1
+            for rows, each in zip(self.rows, collocation.transcriptions, strict=True)
+        ]
         self.failure: SimulationError | None = None
 
     @cached_property
@@ -499,11 +536,17 @@ class TrialSimulation:
         self.failure = failure or self.failure
         return failure is None
 
-    def parameter_key(self, young_pa: float) -> tuple[float, ...]:
-        """Return the parameters p, in the solver's coordinates, at a Young's modulus [Pa] as a
-        tuple, by which trials are compared; moduli beyond all bounds have the same key.
-        """
-        return tuple(self._p(young_pa).tolist())
+    @cached_property
+    def bounds_pa(self) -> tuple[float, float]:
+        """Young's moduli [Pa] between which the moduli without a guess are within their bounds."""
+        usual = _usual_values(self.collocation.parameters, 1.0)
+        scaled = [
+            item
+            for item in self.collocation.parameters.free
+            if is_modulus(item.name) and item.guess is item.prior is None and usual[item.name] > 0
+        ]
+        low = max((item.lower / usual[item.name] for item in scaled), default=0.0)
+        return low, min((item.upper / usual[item.name] for item in scaled), default=math.inf)
 
     def _p(self, young_pa: float) -> Array:
         """Return p (np,) with typical values for missing guesses, and φ zero."""
@@ -548,12 +591,10 @@ class ScanState:
         """Try Young's moduli in the given order [Pa], at least one, until `CONSECUTIVE_FAILURES` in
         a row fail or fit badly; then `is_ended_early` is set. Their misfits are stored.
 
-        Failures before the first simulation that succeeds do not count. Of neighbours that give the
-        same parameters only one is tried.
+        Failures before the first simulation that succeeds do not count.
         """
         failures = 0
-        first, *others = ([*same] for _, same in groupby(young_pa, self.trial.parameter_key))
-        for young in (first[-1], *(same[0] for same in others)):
+        for young in young_pa:
             misfit = self._try(young)
             finite_misfits = [m for m in self.misfits.values() if np.isfinite(m)]
             is_failure = bool(finite_misfits) and not misfit <= WORSE * min(finite_misfits)
@@ -567,8 +608,8 @@ class ScanState:
         the share `BETTER`, or by more than the modulus before, within `LIMITS_PA`; their misfits
         are stored, also that of the last one.
 
-        It also ends where a simulation fails, where the measurements are `EXPLAINED`, or where the
-        parameters are at their bounds and no longer change.
+        It also ends where a simulation fails, where the measurements are `EXPLAINED`, or where moduli
+        leave their bounds.
 
         Parameters
         ----------
@@ -581,9 +622,9 @@ class ScanState:
         inside = min(self.misfits, key=lambda each: abs(np.log(each * factor / young_pa)))
         decrease = self.misfits[inside] - best
         beyond = young_pa * factor
-        while LIMITS_PA[1] < beyond < LIMITS_PA[0] and best > EXPLAINED:
-            if self.trial.parameter_key(beyond) == self.trial.parameter_key(beyond / factor):
-                return
+        softest = max(LIMITS_PA[1], self.trial.bounds_pa[0])
+        stiffest = min(LIMITS_PA[0], self.trial.bounds_pa[1])
+        while softest < beyond < stiffest and best > EXPLAINED:
             misfit = self._try(beyond)
             gain = best - misfit
             if not (gain > BETTER * best or gain > max(decrease, 0.0)):

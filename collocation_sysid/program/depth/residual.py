@@ -84,7 +84,6 @@ class DepthResidual(CorrespondenceResidual):
     observable_s: Array  # (n,): times of the observable [s]
 
     group_size = 1
-    has_offsets = True
     sigma_key = "sigma_m of depth"
     is_compiled = True
 
@@ -215,11 +214,6 @@ class DepthResidual(CorrespondenceResidual):
         return SurfaceCorrespondences.from_alignment(
             correspondences.camera, correspondences.body, shapes_m=all_shapes, phi=phi
         )
-
-    @property
-    def first_needed_s(self) -> float:
-        first = int(self.is_compared.any(axis=(1, 2)).argmax())
-        return float(self.observable_s[self._neighbour_times[first, -1]])
 
     def expression(self, values_in: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the distance (1,) of a point behind the surface [m], positive inside the body."""
