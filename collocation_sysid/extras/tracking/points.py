@@ -66,7 +66,7 @@ class Tracks:
         lost that the last image does not have.
         """
         t_s = np.array(times) - times[0]
-        is_seen = np.isfinite(pixels).all(axis=2)
+        is_seen = np.asarray(np.isfinite(pixels).all(axis=2))
         steps_px = np.linalg.norm(np.diff(pixels, axis=0, prepend=pixels[:1]), axis=2)
         losses = []
         for k in np.flatnonzero(~is_seen[-1]):
@@ -78,7 +78,7 @@ class Tracks:
             u, v = pixels[last, k].tolist()
             has_left = min(u, v, *(size - 1 - pixels[last, k])) < WINDOW_PX / 2 + step_px
             at_s = float(t_s[last + 1])
-            losses.append(Loss(names[k], last + 2, at_s, (u, v), step_px, bool(has_left)))
+            losses.append(Loss(names[int(k)], last + 2, at_s, (u, v), step_px, bool(has_left)))
         return cls(names, t_s, pixels, trust, sorted(losses, key=lambda each: each.image))
 
 

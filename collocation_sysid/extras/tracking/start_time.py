@@ -6,7 +6,7 @@ the time is that at which poses explain the motion of the points best.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -89,7 +89,7 @@ def start_time(t_s: Array, pixels: Array, names: list[str], poses: PoseSequence)
     curve = np.where(np.isfinite(total[:, 0]), total[:, 0] / total[:, 1], np.inf)
     k = int(np.argmin(curve))
     step_s = frame_s / PER_IMAGE
-    found = minimize_scalar(
+    found: Any = minimize_scalar(
         rest, bounds=(grid_s[k] - step_s, grid_s[k] + step_s), method="bounded",
         options={"xatol": 1e-3 * step_s},
     )  # fmt: skip
