@@ -59,7 +59,7 @@ class _StatedClass(type(BaseModel)):
     @property
     def __signature__(cls: Any) -> Signature:
         annotations = get_annotations(cls)
-        return Signature(
+        parameters = [
             Parameter(
                 name,
                 Parameter.KEYWORD_ONLY,
@@ -69,7 +69,8 @@ class _StatedClass(type(BaseModel)):
                 annotation=annotations.get(name, Parameter.empty),
             )
             for name, field in cls.model_fields.items()
-        )
+        ]
+        return Signature(parameters)
 
     @__signature__.setter
     def __signature__(cls, value: object) -> None:

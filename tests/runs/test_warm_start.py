@@ -94,6 +94,7 @@ def test_limited_memory_has_the_same_answer_and_starts_warm():
 )
 def test_other_starts_are_refused(start: Any, found: str, tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    given = start(cold().z) if callable(start) else start
+    if callable(start):
+        start = start(cold().z)
     with pytest.raises(cs.InputError, match=found):
-        cs.solve(problem(), start=given)
+        cs.solve(problem(), start=start)
