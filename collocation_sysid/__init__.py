@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .fem.node_force import NodeForce
     from .fem.regions import Region
     from .fem.rest_shape import UnderGravity
+    from .fem.rods import CrossSection, RodMesh, rod_mesh
     from .fem.schemes import Scheme, Stencil
     from .fem.spatial_field import Field
     from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
@@ -101,6 +102,7 @@ __all__ = [
     "Collocation",
     "Constant",
     "Continuation",
+    "CrossSection",
     "Cuboid",
     "CustomSensor",
     "Cylinder",
@@ -148,6 +150,7 @@ __all__ = [
     "Prony",
     "ReducedSpace",
     "Region",
+    "RodMesh",
     "RolloutOptions",
     "Run",
     "Scheme",
@@ -178,6 +181,7 @@ __all__ = [
     "place_markers",
     "plan_motion",
     "refine",
+    "rod_mesh",
     "run",
     "simulate",
     "solve",

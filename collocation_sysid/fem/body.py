@@ -34,6 +34,7 @@ from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .air import placed_unit_drag
 from .discretisation import Discretisation
+from .elements import ROD, element_named
 from .laws.constants import DENSITY, Constant
 from .laws.fibres import Fibres
 from .laws.materials import DampingLaw, Energy, Material, Prony
@@ -45,6 +46,7 @@ from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
+from .rods import RodMaterial, RodMesh, rod_law, rod_material
 from .schemes import Scheme, as_scheme
 from .spatial_field import Field
 from .step_function import element_forces, step_function
@@ -109,15 +111,44 @@ def _require_origin(made: object, mesh_from: object, rest_shape: object) -> None
         )
 
 
+def _require_rod(
+    regions: Sequence[Region],
+    prony: Sequence[object],
+    field: object,
+    fibres: object,
+    rest_shape: object,
+    damping: object,
+) -> None:
+    """Raise an `InputError` for what a rod does not have."""
+    found = {
+        "prony": bool(prony) or any(region.prony for region in regions),
+        "field": field is not None or any(region.field is not None for region in regions),
+        "fibres": fibres is not None or any(region.fibres is not None for region in regions),
+        "rest_shape": rest_shape not in (None, "stress_free"),
+        "damping": any(
+            getattr(law, "name", law) not in (None, "kelvin-voigt", "rayleigh")
+            for law in (damping, *(region.damping for region in regions))
+        ),
+    }
+    for key, is_found in found.items():
+        if is_found:
+            raise InputError(
+                "found for a rod; expected an elastic rod with the damping 'kelvin-voigt' or "
+                "'rayleigh', whose centreline is its stress-free shape",
+                where=key,
+            )
+
+
 class Body(Discretisation):
-    """Deformable body of tetrahedral finite elements.
+    """Deformable body of tetrahedral finite elements, or of elements of a rod.
 
     Parameters
     ----------
     mesh : TetMesh
+        Or a `RodMesh`, of a slender body.
     material : str, Material or callable, default "neo-hookean"
         Name in `materials.MATERIALS`, or energy function ``(F, **constants) -> ψ`` in CasADi SX,
-        see `Material.from_energy`.
+        see `Material.from_energy`. Of a rod "rod" (the default) or "cable", see `rods`.
     density_kg_m3 : float, optional
         Density of all regions without a density. Give either this or `mass_kg`.
     element : str, default "tet4"
@@ -154,6 +185,8 @@ class Body(Discretisation):
     material_density_kg_m3 : float, optional
         Known density of the material of a body with `mass_kg`, with which the mass over the volume
         of the mesh is compared.
+    natural_curvature : bool
+        Whether natural curvature and twist of a rod are constants.
     evaluator : {"auto", "simd", "casadi"}
         Evaluator of the element kernels, see `kernels`. "auto" uses CasADi's map, with a note, for
         a material that vector code cannot evaluate.
@@ -206,9 +239,19 @@ class Body(Discretisation):
         made: Made | None = None,
         mesh_from: MeshOrigin | None = None,
         material_density_kg_m3: Positive | None = None,
+        natural_curvature: bool = False,
         evaluator: str = "auto",
         threads: AtLeastOne | None = None,
     ) -> None:
+        kind = ROD if isinstance(mesh, RodMesh) else element_named(element)
+        if isinstance(mesh, RodMesh):
+            material = rod_law(material, mesh.section, natural_curvature)
+            _require_rod(regions, prony, field, fibres, rest_shape, damping)
+        elif natural_curvature:
+            raise InputError(
+                "found natural_curvature for a body of tetrahedra; expected a mesh by cs.rod_mesh",
+                where="natural_curvature",
+            )
         parts = parts_from_regions(
             mesh,
             material,
@@ -220,6 +263,9 @@ class Body(Discretisation):
             field=field,
             fibres=fibres,
         )
+        parts = tuple(
+            replace(part, cells=np.unique(mesh.cell_of_tetrahedra[part.cells])) for part in parts
+        )
         _require_origin(made, mesh_from, rest_shape=rest_shape)
         self.made: Made | None = made
         self.mesh_from: MeshOrigin | None = mesh_from
@@ -230,7 +276,8 @@ class Body(Discretisation):
                 "compared with this density, or density_kg_m3 instead",
                 where="material_density_kg_m3",
             )
-        is_drawn = mesh.is_generated or mesh_from == "cad"
+        # A rod is generated, but a real cable is seldom straight by itself.
+        is_drawn = (mesh.is_generated and not isinstance(mesh, RodMesh)) or mesh_from == "cad"
         generated: Literal["stress_free"] | None = "stress_free" if is_drawn else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
@@ -245,7 +292,7 @@ class Body(Discretisation):
         if self.scan_conditions is not None:
             require_supported(parts)
         super().__init__(
-            parts, tuple(forces), mesh=mesh, element=element, evaluator=evaluator, threads=threads
+            parts, tuple(forces), mesh=mesh, element=kind, evaluator=evaluator, threads=threads
         )
         # Lumped volume of every dof (3n,) for each part.
         self._lumped_m3 = [np.repeat(self._lumped_volume(part), 3) for part in self.parts]
@@ -322,6 +369,34 @@ class Body(Discretisation):
         geometry[..., -1] *= factors[:, None]
         return self._with_geometry(geometry)
 
+    def with_section_scale(self, factor: float) -> Body:
+        """Return a copy of this rod with the same masses and a section that is larger by a factor."""
+        parts = [
+            replace(
+                part,
+                material=rod_material(
+                    part.material.name,
+                    part.material.section.scaled(factor),
+                    part.material.has_natural_curvature,
+                ),
+            )
+            for part in self.parts
+            if isinstance(part.material, RodMaterial)
+        ]
+        geometry = self.geometry.copy()
+        geometry[..., -1] *= factor**2
+        return self.with_parts(tuple(parts))._with_geometry(geometry)
+
+    def with_natural_curvature(self, strains_1_m: Array) -> Body | None:
+        """Return a copy of this rod whose stress-free shape has a further natural curvature and
+        twist (3,) [1/m]; None if they are constants of the body.
+        """
+        if any(getattr(p.material, "has_natural_curvature", False) for p in self.parts):
+            return None
+        geometry = self.geometry.copy()
+        geometry[..., -4:-1] += strains_1_m
+        return self._with_geometry(geometry)
+
     def _with_geometry(self, geometry: Array) -> Body:
         """Return a copy of this body with the same masses and another geometry (E, q, 3·nodes + 1)."""
         other = copy(self)
@@ -334,6 +409,8 @@ class Body(Discretisation):
 
     def _geometry_at(self, positions_m: Array) -> Array:
         """Shape gradients and volumes (E, q, 3·nodes + 1) with nodes at other positions (n, 3)."""
+        if isinstance(self.mesh, RodMesh):
+            return self.mesh.geometry_at(positions_m, self.cells)
         count, points = self.geometry.shape[:2]
         slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
         G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
@@ -382,7 +459,7 @@ class Body(Discretisation):
 
     def _lumped_volume(self, part: BodyPart, shares: ArrayLike = 1.0) -> Array:
         """Lumped volume (n,) of a part [m³], in the mesh; zero at nodes outside the part."""
-        volumes_m3 = self.mesh.volumes_m3[part.cells] * shares
+        volumes_m3 = self.cell_volumes_m3[part.cells] * np.asarray(shares)
         volume = np.zeros(len(self.nodes_m))
         np.add.at(volume, self.cells[part.cells], volumes_m3[:, None] * self.element.mass_shares)
         return volume

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
 from ..errors import InputError
-from .elements import Element, element_named, reference_geometry
+from .elements import ELEMENTS, Element
 from .expressions import KERNELS, PointLaw, energy_kernel
 from .kernel import ElementKernel
 from .kernels import COMPILING, Evaluator, EvaluatorChoice, KernelBatch, available_threads
 from .laws.memory import MemoryInput, MemoryLayout
-from .meshes.mesh import ElementNodes, TetMesh
+from .meshes.mesh import TetMesh
 from .meshes.selection import Selection
 from .node_force import NodeForce
 from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascending_nodes
@@ -53,12 +53,12 @@ class Discretisation(ConstantsModel):
     cells : (E, nodes per element)
         Node indices of each element.
     geometry : (E, q, 3·nodes + 1)
-        Shape gradients and volumes, see `elements.reference_geometry`.
+        Shape gradients and volumes, see `elements.reference_geometry`, or `rods.rod_geometry`.
 
     Raises
     ------
     InputError
-        For an unknown element or evaluator, memory in an element with mean dilatation, constants of
+        For an unknown evaluator, memory in an element with mean dilatation, constants of
         equal names, or a material that the evaluator "simd" cannot evaluate.
     """
 
@@ -67,27 +67,28 @@ class Discretisation(ConstantsModel):
         parts: tuple[BodyPart, ...],
         forces: tuple[NodeForce, ...],
         mesh: TetMesh,
-        element: str,
+        element: Element,
         evaluator: str,
         threads: int | None,
     ) -> None:
         super().__init__(parts, forces)
         self.mesh = mesh
-        self.element: Element = element_named(element)
+        self.element: Element = element
         if self.has_memory and self.element.mean_dilatation:
             raise InputError(
-                f"element '{element}' averages the volume change over each element and does not "
+                f"element '{element.name}' averages the volume change over each element and does not "
                 "support materials with memory (prony); expected element 'tet10' or 'tet4', or a "
                 "material without prony"
             )
-        self.nodes = ElementNodes.for_element(mesh, self.element)
+        self.nodes = mesh.nodes_of(self.element)
         self.nodes_m: Array = self.nodes.points_m
         self.frames: Index = np.zeros((0, 4), dtype=np.int64)
         self.has_skew_frame_forces = False
         self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
-        self.geometry = reference_geometry(self.nodes_m, self.cells, element=self.element)
+        self.geometry = mesh.geometry(self.nodes, self.element)
+        self.cell_volumes_m3: Array = self.geometry[..., -1].sum(axis=1)
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)
         # Derivatives need no operations but those of the energy and the ones every evaluator has.
@@ -346,7 +347,7 @@ class Discretisation(ConstantsModel):
         the elements at positions (3n,) [m] and stresses σ_e (E,) [Pa] that do not change.
         """
         count, points = self.geometry.shape[:2]
-        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
+        gradients = self.gradients
         at_nodes = positions.reshape(-1, 3)[self.cells]
         F = np.einsum("eai,eqaj->eqij", at_nodes, gradients, optimize=True)
         spatial = gradients @ np.linalg.inv(F)
@@ -367,6 +368,35 @@ class Discretisation(ConstantsModel):
         """Positions in `pattern` of the lower triangles of the cells (E, any)."""
         return element_destinations(self.pattern, self.cells)[1]
 
+    @property
+    def is_slender(self) -> bool:
+        """Whether the body is a rod."""
+        return self.element.columns > 3
+
+    @property
+    def place_element(self) -> Element:
+        """Element that interpolates positions at places on the body: that of the body itself, or of
+        a rod the linear tetrahedron.
+        """
+        return ELEMENTS["tet4"] if self.is_slender else self.element
+
+    @property
+    def place_cells(self) -> Index:
+        """Nodes (k, any) of the elements that interpolate positions, see `place_element`."""
+        return self.mesh.tetrahedra if self.is_slender else self.cells
+
+    @property
+    def part_of_place_cells(self) -> Index:
+        """Index of the part to which each of `place_cells` belongs."""
+        return self.part_of_cells[self.mesh.cell_of_tetrahedra]
+
+    @property
+    def gradients(self) -> Array:
+        """Derivatives of the shape functions by position (E, q, nodes, 3) [1/m]."""
+        nodes, columns = self.element.nodes, self.element.columns
+        values = self.geometry[..., : nodes * columns]
+        return values.reshape(*values.shape[:2], nodes, columns)[..., :3]
+
     @cached_property
     def shape_gradients(self) -> sp.csr_array:
         """Derivatives of the shape functions by position [1/m], sparse (3 E q, n): all quadrature
@@ -374,8 +404,7 @@ class Discretisation(ConstantsModel):
         columns.
         """
         count, points = self.geometry.shape[:2]
-        gradients = self.geometry[..., :-1].reshape(count, points, self.element.nodes, 3)
-        values = np.moveaxis(gradients, 3, 0)
+        values = np.moveaxis(self.gradients, 3, 0)
         columns = np.broadcast_to(self.cells[:, None], values.shape)
         starts = np.arange(0, values.size + 1, self.element.nodes)
         shape = (3 * count * points, len(self.nodes_m))

@@ -74,14 +74,19 @@ class Element:
     # (nodes,): fraction of the element's mass lumped at each node: all positive, sum one.
     mass_shares: Array
     meshio_type: str  # cell name for writing files
+    # Number of columns c of the gradient (3, c) at a point: 3 for the deformation gradient; more if
+    # further derivatives of the positions, such as those of directors, follow it.
+    columns: int = 3
+    # Number of values of the rest shape, which a point has beside shape gradients and volume.
+    rest_values: int = 0
     # For each node after the corners, the two corners between which it lies halfway.
     edges: tuple[tuple[int, int], ...] = ()
     # Whether the material is evaluated at the mean dilatation of the element, see
     # `mean_dilatation`.
     mean_dilatation: bool = False
 
-    def __reduce__(self) -> tuple[Callable[[str], Element], tuple[str]]:
-        return element_named, (self.name,)
+    def __reduce__(self) -> str | tuple[Callable[[str], Element], tuple[str]]:
+        return "ROD" if self.name == "rod" else (element_named, (self.name,))
 
 
 _TET10 = Element(
@@ -113,6 +118,19 @@ ELEMENTS: dict[str, Element] = {
     # One pressure for its ten nodes: keeps its volume without locking, however incompressible.
     "tet10-p0": replace(_TET10, name="tet10-p0", mean_dilatation=True),
 }
+# Part of a slender body between two cross-sections, see `rods`; it has no barycentric coordinates.
+ROD = Element(
+    name="rod",
+    nodes=6,
+    shape_functions=lambda L: np.zeros((len(L), 6)),
+    shape_gradients=lambda L: np.zeros((len(L), 6, 4)),
+    points=np.full((1, 4), 0.25),
+    weights=np.ones(1),
+    mass_shares=np.full(6, 1 / 6),
+    meshio_type="wedge",
+    columns=5,
+    rest_values=6,
+)
 
 
 def face_shape_functions(places: Array, nodes: int) -> tuple[Array, Array]:

@@ -37,6 +37,7 @@ from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
 from .laws.materials import DampingLaw, Material, damped_psi
 from .laws.mean_dilatation import averaging_kernel
 from .rest_point_layout import RestPointLayout
+from .rods import RodMaterial
 
 # Number of kernels of each kind kept in memory, shared by bodies of the same law and element.
 CACHED_KERNELS = 64
@@ -88,19 +89,31 @@ class PointLaw:
         potential = self.damping.potential
         return potential(psi, F, rate, **self._damping_constants(theta)) if potential else ca.SX(0)
 
-    def damping_stress(self, F: ca.SX, rate: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX] | None:
-        """Return P_v (9,) and ∂P_v/∂F (9, 9) of the damping law.
+    def damping_stress(
+        self, F: ca.SX, rate: ca.SX, theta: ca.SX, rest_values: ca.SX
+    ) -> tuple[ca.SX, ca.SX] | None:
+        """Return P_v (g,) and ∂P_v/∂F (g, g) of the damping law.
 
         None if it has a potential instead.
 
         Parameters
         ----------
-        F, rate : (9,) SX
+        F, rate : (g,) SX
             Stacked deformation gradient and its rate.
         theta : (k,) SX
+        rest_values : SX
+            See `QuadraturePoint.rest_values`.
         """
         if not self.damping.stress:
             return None
+        if isinstance(self.material, RodMaterial):
+            values = ca.vertcat(theta[: len(self.material.constants)], rest_values)
+            gradient = ca.SX.sym("G", F.numel())
+            stress, slope = self.material.viscous_stress(
+                gradient, rate, values, **self._damping_constants(theta)
+            )
+            stress, slope = ca.substitute([stress, slope], [gradient], [F])
+            return stress, slope
         F_symbol = ca.SX.sym("F", 9)
         rate_symbol = ca.SX.sym("rate", 9)
         psi = damped_psi(self.damping, self.material, ca.reshape(F_symbol, 3, 3), theta)
@@ -183,7 +196,7 @@ def _energy_density(point: QuadraturePoint, law: PointLaw) -> ca.SX:
 
 
 def _material_constants(point: QuadraturePoint, law: PointLaw) -> ca.SX:
-    return point.scale_constants()[: len(law.material.constants)]
+    return ca.vertcat(point.scale_constants()[: len(law.material.constants)], point.rest_values)
 
 
 def _potential(point: QuadraturePoint, law: PointLaw) -> ca.SX:
@@ -255,6 +268,7 @@ def _damping(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX] | Non
         ca.vec(point.compute_material_gradient()),
         point.compute_material_gradient_rate(),
         theta=point.scale_constants(),
+        rest_values=point.rest_values,
     )
     return (
         None

@@ -1,7 +1,8 @@
 """Kernels: contributions of the quadrature points of an element, as CasADi functions.
 
 Before the product with the shape gradients a kernel depends only on F, Ḟ and similar gradients, the
-symbols of a `QuadraturePoint`: 9 or 9 × 9 numbers for any element, called its *pieces*. A
+symbols of a `QuadraturePoint`: g or g × g numbers, called its *pieces*, with g = 9 for the
+deformation gradient of solids, and g = 3 c for elements whose gradient has c columns. A
 `Contraction` states how pieces are multiplied with the shape gradients. Evaluators do this in
 loops: written out for ten nodes it would be most of the instructions.
 
@@ -23,8 +24,8 @@ from .chain_rule import ChainRule
 from .elements import Element
 from .rest_point_layout import RestPointLayout
 
-# Product of a piece with the shape gradients. "none": no product; "nodes": from (9, k), conjugate
-# to F, to (3·nodes, k); "pairs": from a symmetric (9, 9) to the lower triangle of
+# Product of a piece with the shape gradients. "none": no product; "nodes": from (g, k), conjugate
+# to F, to (3·nodes, k); "pairs": from a symmetric (g, g) to the lower triangle of
 # (3·nodes, 3·nodes).
 Contraction = Literal["none", "nodes", "pairs"]
 # Inputs that differ between the points of an element.
@@ -46,6 +47,16 @@ class Phase:
         """Number of nodes per element."""
         return self.pieces.nnz_in(0) // 3
 
+    @property
+    def gradient_size(self) -> int:
+        """Number g of entries of the gradient of a field at a point."""
+        sizes = (
+            self.pieces.size1_out(k)
+            for k, how in enumerate(self.contractions.values())
+            if how != "none"
+        )
+        return next(sizes, 9)
+
     @cached_property
     def function(self) -> ca.Function:
         """Function of the contribution of one point, with the contractions written out: inputs of
@@ -54,7 +65,8 @@ class Phase:
         sx = self.pieces
         names = sx.name_in()
         inputs = [ca.SX.sym(name, sx.size1_in(k)) for k, name in enumerate(names)]
-        gradients = node_gradients(inputs[names.index("geometry")], self.node_count)
+        geometry = inputs[names.index("geometry")]
+        gradients = node_gradients(geometry, self.node_count, self.gradient_size // 3)
         outputs = [
             _contracted(piece, how, gradients=gradients)
             for piece, how in zip(sx.call(inputs), self.contractions.values(), strict=True)
@@ -154,9 +166,9 @@ class ElementKernel:
         return ca.Function(self.pieces.name(), inputs, outputs, names, list(self.contractions))
 
 
-def node_gradients(geometry: ca.SX, nodes: int) -> ca.SX:
-    """Return the shape gradients (nodes, 3) from the geometry of a point."""
-    return ca.reshape(geometry[: 3 * nodes], 3, nodes).T
+def node_gradients(geometry: ca.SX, nodes: int, columns: int) -> ca.SX:
+    """Return the shape gradients (nodes, `columns`) from the geometry of a point."""
+    return ca.reshape(geometry[: columns * nodes], columns, nodes).T
 
 
 def from_lower_triangle(matrix: ca.SX) -> ca.SX:
@@ -176,14 +188,14 @@ def _coupled(output: ca.MX, coupling: ca.MX, how: Contraction, vectors: ca.MX) -
 
 
 def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
-    """Return a piece multiplied with the shape gradients (nodes, 3) by its contraction."""
+    """Return a piece multiplied with the shape gradients (nodes, c) by its contraction."""
     if how == "none":
         return piece
     nodes = gradients.shape[0]
     half = ca.vertcat(*[_at_node(piece, gradients[a, :]) for a in range(nodes)])
     if how == "nodes":
         return half
-    # By symmetry the (3·nodes, 9) just found, read along its rows, has the columns contracted.
+    # By symmetry the (3·nodes, g) just found, read along its rows, has the columns contracted.
     columns = []
     for b in range(nodes):
         rows = half[3 * b : 3 * b + 3, :].T
@@ -194,8 +206,8 @@ def _contracted(piece: ca.SX, how: Contraction, gradients: ca.SX) -> ca.SX:
 
 
 def _at_node(stress: ca.SX, gradient: ca.SX) -> ca.SX:
-    """Return `stress` (9, k), conjugate to F, times the shape gradient (1, 3): (3, k)."""
-    columns = [ca.reshape(stress[:, k], 3, 3) @ gradient.T for k in range(stress.shape[1])]
+    """Return `stress` (g, k), conjugate to F, times the shape gradient (1, c): (3, k)."""
+    columns = [ca.reshape(stress[:, k], 3, -1) @ gradient.T for k in range(stress.shape[1])]
     return ca.horzcat(*columns)
 
 
@@ -221,7 +233,7 @@ class Derivative:
         return contractions[len(self.by) - self.by.count("theta")]
 
     def select_part(self, piece: ca.SX) -> ca.SX:
-        """Return the part (symmetric, skew or whole) that `part` states of the piece (9, 9) of a
+        """Return the part (symmetric, skew or whole) that `part` states of the piece (g, g) of a
         second derivative by two fields; the pieces of other derivatives are returned unchanged.
         """
         if self.choose_contraction() != "pairs":
@@ -250,7 +262,7 @@ class QuadraturePoint:
     geometry: ca.SX
     theta: ca.SX
     # dict of str to SX: gradients of the fields, Σ_a field_a ⊗ ∇N_a stacked column after column
-    # (9,): F, Ḟ and W.
+    # (g,): F, Ḟ and W.
     gradients: dict[str, ca.SX]
     # If the element averages the dilatation: the logarithm m of the stretch that does so and, with
     # v, its derivative along v, and with w, those of both along w; see `mean_dilatation`.
@@ -295,9 +307,11 @@ class QuadraturePoint:
         return cls(
             element.nodes,
             {name: ca.SX.sym(name, 3 * element.nodes) for name in fields},
-            geometry=ca.SX.sym("geometry", 3 * element.nodes + 1),
+            geometry=ca.SX.sym(
+                "geometry", element.columns * element.nodes + element.rest_values + 1
+            ),
             theta=ca.SX.sym("theta", constants),
-            gradients={name: ca.SX.sym(f"gradient_{name}", 9) for name in fields},
+            gradients={name: ca.SX.sym(f"gradient_{name}", 3 * element.columns) for name in fields},
             stretches=tuple(ca.SX.sym(f"stretch_{k}") for k in range(stretches)),
             point_data=ca.SX.sym(
                 "carried",
@@ -327,9 +341,20 @@ class QuadraturePoint:
         return self.point_data[:-1] if self.scaled_indices else self.point_data
 
     @property
+    def column_count(self) -> int:
+        """Number of columns of the gradients."""
+        return next(iter(self.gradients.values())).numel() // 3
+
+    @property
+    def rest_values(self) -> ca.SX:
+        """Values of the rest shape of elements that have some, and the volume; else empty."""
+        data = self.geometry[self.column_count * self.nodes :]
+        return data if data.numel() > 1 else ca.SX(0, 1)
+
+    @property
     def mesh_volume(self) -> ca.SX:
         """Volume assigned to the point in the mesh [m³]."""
-        return self.geometry[3 * self.nodes]
+        return self.geometry[-1]
 
     def compute_volume(self) -> ca.SX:
         """Return the volume assigned to the point in the stress-free shape [m³]."""
@@ -345,11 +370,11 @@ class QuadraturePoint:
         return self.rest.expand(data, changes)
 
     def compute_material_gradient(self) -> ca.SX:
-        """Return the deformation gradient at which the material is evaluated (3, 3).
+        """Return the gradient (3, c) at which the material is evaluated: that of the deformation.
 
         It includes the averaged dilatation and the stress-free shape.
         """
-        F = ca.reshape(self.gradients["x"], 3, 3)
+        F = ca.reshape(self.gradients["x"], 3, -1)
         stretch = self.stretches[0] if self.stretches else None
         if self.rest is not None:
             values = self._expand_rest_values()
@@ -379,7 +404,7 @@ class QuadraturePoint:
         return self.rule.directional_derivative(expression, by, direction=direction)
 
     def compute_material_gradient_rate(self) -> ca.SX:
-        """Return the derivative of `compute_material_gradient` along v, stacked (9,)."""
+        """Return the derivative of `compute_material_gradient` along v, stacked (g,)."""
         return ca.jtimes(
             ca.vec(self.compute_material_gradient()),
             self.stack_strain_symbols(),
@@ -387,7 +412,7 @@ class QuadraturePoint:
         )
 
     def weigh_material_gradient(self) -> ca.SX:
-        """Return the derivative of `compute_material_gradient` along w, stacked (9,)."""
+        """Return the derivative of `compute_material_gradient` along w, stacked (g,)."""
         weights = ca.vertcat(self.gradients["w"], *self.stretches[2:3])
         return ca.jtimes(
             ca.vec(self.compute_material_gradient()), self.stack_strain_symbols(), weights
@@ -403,7 +428,7 @@ class QuadraturePoint:
 
     def derivative(self, scalar: ca.SX, by: By) -> ca.SX:
         """Return a derivative of a scalar by zero, one or two variables; x, v and w stand for their
-        gradients (9,), "theta" for the differentiated constants.
+        gradients (g,), "theta" for the differentiated constants.
 
         Averaged stretches and other symbols are constant. The result is the scalar itself, a
         gradient as a column (k,), or the matrix (k, l) of second derivatives by the first and the
@@ -436,7 +461,7 @@ class QuadraturePoint:
             inputs["carried"] = self.point_data
         if sums is not None:
             inputs["sums"] = sums
-        shape_gradients = node_gradients(self.geometry, self.nodes)
+        shape_gradients = node_gradients(self.geometry, self.nodes, self.column_count)
         gradients = [
             ca.vec(ca.reshape(field, 3, self.nodes) @ shape_gradients)
             for field in self.fields.values()

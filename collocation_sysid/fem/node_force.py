@@ -392,7 +392,7 @@ def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
     """
     faces = mesh.nodes_of_faces(mesh.mesh.surface)
     a, b, c = np.moveaxis(mesh.points_m[faces[:, :3]], 1, 0)
-    share = np.cross(b - a, c - a) / 6
+    share = np.cross(b - a, c - a) / 6 * mesh.mesh.surface_factor
     normal = np.zeros((len(mesh.points_m), 3))
     area = np.zeros(len(normal))
     for node in faces[:, -3:].T:

@@ -36,6 +36,7 @@ from .laws.time_shift import TimeShift
 from .meshes.mesh import TetMesh
 from .meshes.selection import Selection
 from .node_force import NodeForce
+from .rods import RodMaterial
 from .spatial_field import Field, FieldModes
 
 
@@ -201,7 +202,7 @@ def parts_from_regions(
         density_kg_m3=densities[0],
         prony=branches,
     )
-    require_admissible_damping(remainder.damping, remainder.material)
+    _require_damping(remainder.damping, remainder.material)
     for given, name in ((field, "a field"), (fibres, "fibres")):
         if given is not None and not rest.size:
             raise InputError(
@@ -218,7 +219,7 @@ def parts_from_regions(
                 remainder.damping if region.damping is None else as_damping(region.damping)
             )
             memory = branches if region.prony is None else as_branches(region.prony)
-            require_admissible_damping(region_damping, law)
+            _require_damping(region_damping, law)
             has_own = region.density_kg_m3 is not None
             part = BodyPart(
                 region.name,
@@ -235,6 +236,11 @@ def parts_from_regions(
             raise error.located(None, f"region '{region.name}'") from error
     mass = sum(part.density_kg_m3 * float(mesh.volumes_m3[part.cells].sum()) for part in parts)
     return tuple(replace(part, per_mass_1_m3=part.density_kg_m3 / mass) for part in parts)
+
+
+def _require_damping(damping: DampingLaw, material: Material) -> None:
+    if not isinstance(material, RodMaterial):
+        require_admissible_damping(damping, material)
 
 
 def _with_fibres(part: BodyPart, fibres: Fibres | None, mesh: TetMesh) -> BodyPart:

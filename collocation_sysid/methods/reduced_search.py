@@ -95,6 +95,10 @@ ACCURACY_SHARE = 0.01
 FINAL_ACCURACY_SHARE = 0.1
 # Largest number of new associations of the measurements.
 REREADINGS = 40
+# Largest number of feasibility steps after a step of a slender body, which end at a share of an edge.
+CORRECTIONS = 8
+CORRECTED = 1e-8
+DIVERGENCE = 4.0
 # Larger than any loss.
 UNLIMITED = 1e100
 
@@ -246,6 +250,7 @@ class ReducedSearch:
             not transcription.experiment.is_static and transcription.experiment.obstacles
             for transcription in collocation.transcriptions
         )
+        self.is_slender = any(each.body.is_slender for each in collocation.transcriptions)
         self.largest_trust = SEEING if self.has_unlabelled else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
@@ -539,6 +544,7 @@ class ReducedSearch:
             with suppress(SimulationError):
                 accuracy = self._accuracy_after(length)
                 trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
+                trial = self._corrected(horizon, trial) if self.is_slender else trial
         if self.has_impacts:
             limit_m = SMALL_IMPACT_STRAIN * self.edge_m
             if trial is not None and not trial.feasibility_m <= limit_m:
@@ -548,6 +554,21 @@ class ReducedSearch:
                 trial = None
             trial = trial or self._simulated(horizon, p, point)
         return trial if trial is not None and trial.is_finite else None
+
+    def _corrected(self, horizon: Horizon, trial: Iterate) -> Iterate:
+        """Return a trial after further feasibility steps, at most `CORRECTIONS`.
+
+        A slender body hardly stretches, so that what is linear in the step stretches it.
+        """
+        for _ in range(CORRECTIONS):
+            if not trial.feasibility_m > CORRECTED * self.size_m:
+                break
+            self.sweeps += 1
+            corrected = horizon.evaluate_step(trial.p, trial, step=np.zeros(len(trial.p)))
+            if not corrected.feasibility_m <= DIVERGENCE * trial.feasibility_m:
+                break
+            trial = corrected
+        return trial
 
     def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:
         """Return the point with a simulated trajectory, one sweep; None if that fails."""

@@ -610,7 +610,8 @@ def _component_axes(
     names = row.axes.split() or [""]
     if row == PLACE:
         sigma = float(experiment.place_sigma_m[number])
-        names = ["first", "second"] if experiment.markers.on_surface else names
+        count = experiment.markers.place_dimension(experiment.body)
+        names = (["along"], ["first", "second"], names)[count - 1]
     if not sigma:
         return []
     if row == TARE:

@@ -203,6 +203,12 @@ class Markers(Measurement):
         gaps = f", {missing} missing" if missing else ""
         return f"Markers({', '.join(shown)}: {self.sample_count} samples{gaps})"
 
+    def place_dimension(self, body: Body) -> int:
+        """Return the number of coordinates of an estimated place: 1 along the centreline of a rod,
+        2 on a surface, else 3.
+        """
+        return 1 if body.is_slender else 2 if self.on_surface else 3
+
     def on_body(self, body: Body, undeformed_places: UndeformedPlaces | None = None) -> Markers:
         """Return the markers with their placement on a body, without `places_m`; self if they have
         a placement already.

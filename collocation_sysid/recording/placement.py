@@ -134,7 +134,7 @@ def place_markers(
     ]
     limit_m = shape.mean_edge_m if max_distance_m is None else max_distance_m
 
-    nodes = np.empty((len(points), body.cells.shape[1]), dtype=np.int64)
+    nodes = np.empty((len(points), body.place_cells.shape[1]), dtype=np.int64)
     weights = np.empty(nodes.shape)
     distance = np.empty(len(points))
     for k, point in enumerate(points):
@@ -187,7 +187,7 @@ class LocatedBody:
     def __init__(self, nodes_m: Array, body: Body) -> None:
         self.nodes_m = nodes_m
         self.body = body
-        corners = body.cells[:, :4]
+        corners = body.place_cells[:, :4]
         ends = nodes_m[body.mesh.edges]
         self.mean_edge_m = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.origin = nodes_m[corners[:, 0]]
@@ -199,7 +199,7 @@ class LocatedBody:
         """Return nodes (npe,) and weights (npe,) of a marker on a node, by its index: nodes of the
         first element that has the node, whose weight is 1 and all others 0.
         """
-        cell = self.body.cells[np.argmax((self.body.cells == node).any(axis=1))]
+        cell = self.body.place_cells[np.argmax((self.body.place_cells == node).any(axis=1))]
         return cell, (cell == node).astype(np.float64)
 
     def weights_at_point(self, point: Array) -> tuple[Index, Array, float]:
@@ -210,7 +210,7 @@ class LocatedBody:
         A point outside the body is an extrapolation from the nearest element.
         """
         cell, distance = self.nearest_cell(point)
-        return self.body.cells[cell], self._shape_functions_at(point, cell), distance
+        return self.body.place_cells[cell], self._shape_functions_at(point, cell), distance
 
     def nearest_cell(self, point: Array) -> tuple[int, float]:
         """Return the index of the element that contains a point (3,), or is nearest to it, and its
@@ -256,12 +256,24 @@ class LocatedBody:
 
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
         """Return the nearest point (3,) [m] of the surface of straight triangles, and two
-        orthogonal unit tangents of its face as columns (3, 2).
+        orthogonal unit tangents of its face as columns (3, 2); of a rod the nearest point of the
+        centreline, and its tangent (3, 1).
         """
+        if self.body.is_slender:
+            return self._nearest_point_of_centreline(point)
         nearest = nearest_points_of_triangles(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
         return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
+
+    def _nearest_point_of_centreline(self, point: Array) -> tuple[Array, Array]:
+        centres = self.nodes_m.reshape(-1, 3, 3).mean(axis=1)
+        steps = np.diff(centres, axis=0)
+        squares = np.sum(steps**2, axis=1)
+        shares = np.sum((point - centres[:-1]) * steps, axis=1) / squares
+        nearest = centres[:-1] + np.clip(shares, 0.0, 1.0)[:, None] * steps
+        k = int(np.linalg.norm(nearest - point, axis=1).argmin())
+        return nearest[k], (steps[k] / np.sqrt(squares[k]))[:, None]
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
         """Return barycentric coordinates (k, 4) of points (k, 3), or of one point (3,), in the
@@ -282,11 +294,11 @@ class LocatedBody:
         # Barycentric coordinates are exact for straight edges, and corrected for curved ones.
         one = np.array([cell])
         local = self.barycentric(point, one)
-        best = self.body.element.shape_functions(local)[0]
+        best = self.body.place_element.shape_functions(local)[0]
         best_miss = np.inf
         for _ in range(_EMBEDDING_ITERATIONS):
-            weights = self.body.element.shape_functions(local)[0]
-            miss = point - weights @ self.nodes_m[self.body.cells[cell]]
+            weights = self.body.place_element.shape_functions(local)[0]
+            miss = point - weights @ self.nodes_m[self.body.place_cells[cell]]
             if not np.linalg.norm(miss) < best_miss:
                 break
             best = weights

@@ -218,11 +218,33 @@ def check_internal_forces(
     body = Body(
         uneven_box(1), material, density_kg_m3=DENSITY_KG_M3, element=element, damping=damping
     )
+    check_forces_of_body(
+        check, body, values, is_objective=is_objective, is_dissipative=is_dissipative
+    )
+
+
+def check_forces_of_body(
+    check: PropertyCheck,
+    body: Body,
+    values: dict[str, float],
+    displacement_m: float = DISPLACEMENT_M,
+    *,
+    is_objective: bool = False,
+    is_dissipative: bool = False,
+) -> None:
+    """Check the forces of a body of one part as `check_internal_forces` does.
+
+    Parameters
+    ----------
+    displacement_m : float
+        Size of random displacements of nodes [m].
+    """
     theta = np.array([*usual_constants(tuple(body.constants.values()), values).values()])
-    x = body.nodes_m.ravel() + check.rng.uniform(-DISPLACEMENT_M, DISPLACEMENT_M, body.nodes_m.size)
+    x = body.nodes_m.ravel() + check.rng.uniform(-displacement_m, displacement_m, body.nodes_m.size)
     v = VELOCITY_M_S * check.rng.standard_normal(x.size)
     w = check.rng.standard_normal(x.size)
-    plain = None if body.element.mean_dilatation else PlainInternalForce(body)
+    has_plain_formula = body.element.columns == 3 and not body.element.mean_dilatation
+    plain = PlainInternalForce(body) if has_plain_formula else None
     first = _check_derivatives(check, body, state=[x, v, w], theta=theta, plain=plain, where="")
     at_rest = [body.nodes_m.ravel(), np.zeros_like(v), w]
     _check_derivatives(check, body, state=at_rest, theta=theta, plain=plain, where=" undeformed")

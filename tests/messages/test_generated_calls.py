@@ -46,7 +46,7 @@ NOT_CALLED = {
         "Trajectory",
     ),
     *("live.Frame", "live.LiveUpdate", "InputError", "SimulationError"),
-    *("Assumptions.exact", "DepthCamera.of_images"),
+    *("Assumptions.exact", "DepthCamera.of_images", "CrossSection", "RodMesh"),
 }
 
 
@@ -75,6 +75,8 @@ def valid(name: str) -> dict[str, Any]:
         "Capsule": {"radius_m": 0.1, "ends_m": LINE_M},
         "Constant": {"name": "c_pa"},
         "Continuation": {},
+        "CrossSection.round": {"diameter_m": 0.01},
+        "CrossSection.rectangle": {"width_m": 0.01, "height_m": 0.01},
         "Cuboid": {"corners_m": [(0, 0, 0), (1, 1, 1)]},
         "Cylinder": {"radius_m": 0.1, "ends_m": LINE_M},
         "DampingLaw": {
@@ -129,6 +131,7 @@ def valid(name: str) -> dict[str, Any]:
         },
         "Material.from_energy": {"energy": lambda F, mu_pa: mu_pa * (F[0, 0] - 1) ** 2},
         "Named": {"name": "x"},
+        "rod_mesh": {"centreline_m": LINE_M, "section": cs.CrossSection.round(0.01)},
         "NodeForce": {"name": "f", "law": lambda x, v, c: c * x, "constants": (constant,)},
         "NodeForce.from_law": {"law": lambda x, v, at, c_pa: -c_pa * (x - at.rest_m)},
         "Nuisance": {},

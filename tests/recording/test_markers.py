@@ -30,15 +30,17 @@ def box_body(divisions=(2, 2, 3), edge_m=0.1) -> Any:
     element = SimpleNamespace(shape_functions=lambda barycentric: barycentric)
     tetrahedra = np.concatenate(cells)
     mesh = TetMesh(nodes, tetrahedra)
-    return SimpleNamespace(nodes_m=nodes, cells=tetrahedra, element=element, mesh=mesh)
+    return SimpleNamespace(
+        nodes_m=nodes, place_cells=tetrahedra, place_element=element, is_slender=False, mesh=mesh
+    )
 
 
 def quadratic(body) -> Any:
     """The same body with a node on each edge."""
     pairs = list(combinations(range(4), 2))
-    edges = np.sort(body.cells[:, pairs], axis=2)
+    edges = np.sort(body.place_cells[:, pairs], axis=2)
     unique, number = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
-    cells = np.hstack([body.cells, len(body.nodes_m) + number.reshape(-1, 6)])
+    cells = np.hstack([body.place_cells, len(body.nodes_m) + number.reshape(-1, 6)])
     nodes = np.vstack([body.nodes_m, body.nodes_m[unique].mean(axis=1)])
 
     def shape_functions(local):
@@ -46,7 +48,9 @@ def quadratic(body) -> Any:
         return np.column_stack([local * (2 * local - 1), *mid])
 
     element = SimpleNamespace(shape_functions=shape_functions)
-    return SimpleNamespace(nodes_m=nodes, cells=cells, element=element, mesh=body.mesh)
+    return SimpleNamespace(
+        nodes_m=nodes, place_cells=cells, place_element=element, is_slender=False, mesh=body.mesh
+    )
 
 
 def bend(nodes_m):
@@ -91,7 +95,7 @@ def test_an_embedded_point_lies_within_its_tetrahedron():
     points = np.random.default_rng(3).uniform([0, 0, 0], [0.2, 0.2, 0.3], (50, 3))
     placement = place_markers(points, body.nodes_m, body, attach="embedded")
     assert placement.weights.min() > -1e-9
-    cells = {tuple(cell) for cell in body.cells}
+    cells = {tuple(cell) for cell in body.place_cells}
     assert all(tuple(nodes) in cells for nodes in placement.nodes)
 
 

@@ -145,9 +145,14 @@ class _PhaseLayout:
         self.sx = phase.pieces
         self.contractions = list(phase.contractions.values())
         size = 3 * phase.node_count
+        entries = phase.gradient_size
         self.lengths = [self.sx.nnz_out(k) for k in range(self.sx.n_out())]
         self.pieces = np.cumsum([0, *self.lengths]).tolist()
-        contracted = {"none": 1, "nodes": size / 9, "pairs": size * (size + 1) / 2 / 81}
+        contracted = {
+            "none": 1,
+            "nodes": size / entries,
+            "pairs": size * (size + 1) / 2 / entries**2,
+        }
         outputs = [
             round(contracted[how] * length)
             for how, length in zip(self.contractions, self.lengths, strict=True)
@@ -186,6 +191,7 @@ class _KernelEmitter:
         self.vector = ir.VectorType(DOUBLE, lanes)
         self.nodes = kernel.phases[0].node_count
         self.size = 3 * self.nodes
+        self.gradient_size = kernel.phases[0].gradient_size
         # The kernel's own outputs come first among the totals.
         self.last = _PhaseLayout(kernel.phases[-1], 0)
         self.previous_phases: list[_PhaseLayout] = []
@@ -225,7 +231,7 @@ class _KernelEmitter:
         total = max(phase.outputs[-1] for phase in phases)
         totals = self._buffer(total, "totals")
         pieces = self._buffer(max(phase.pieces[-1] for phase in phases), "pieces")
-        half = self._buffer(27, "half")
+        half = self._buffer(3 * self.gradient_size, "half")
         combined = self._buffer(len(self.vectors) * self.size, "combined")
         geometry_size, theta_size = (self.last.sx.nnz_in(self.fields + k) for k in range(2))
         parameters = [self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(theta_size)]
@@ -374,7 +380,9 @@ class _KernelEmitter:
                     self._accumulate(self._load(piece_base, entry), output_base, entry=entry)
             elif how == "nodes":
                 with for_range(b, I64(0), stop=I64(self.nodes), name="node") as node:
-                    values = self._at_node(piece_base, length // 9, self._gradient(geometry, node))
+                    values = self._at_node(
+                        piece_base, length // self.gradient_size, self._gradient(geometry, node)
+                    )
                     for column, row, value in values:
                         first = I64(column * self.size + row)
                         self._accumulate(
@@ -383,8 +391,9 @@ class _KernelEmitter:
             else:
                 with for_range(b, I64(0), stop=I64(self.nodes), name="column") as node:
                     gradient = self._gradient(geometry, node)
-                    for column, row, value in self._at_node(piece_base, 9, gradient):
-                        self._store(value, half, I64(column + 9 * row))
+                    size = self.gradient_size
+                    for column, row, value in self._at_node(piece_base, size, gradient):
+                        self._store(value, half, I64(column + size * row))
                     self._add_node_block(half, gradient, a=node, node=node, outputs=output_base)
                     with for_range(
                         b, b.add(node, I64(1)), stop=I64(self.nodes), name="row"
@@ -477,19 +486,20 @@ class _KernelEmitter:
             for row in range(3):
                 terms = [
                     self.builder.fmul(
-                        self._load(stress, I64(9 * column + row + 3 * axis)),
+                        self._load(stress, I64(self.gradient_size * column + row + 3 * axis)),
                         gradient[axis],
                         flags=FUSE,
                     )
-                    for axis in range(3)
+                    for axis in range(len(gradient))
                 ]
-                value = self.builder.fadd(terms[0], terms[1], flags=FUSE)
-                yield (column, row, self.builder.fadd(value, terms[2], flags=FUSE))
+                value = reduce(lambda x, y: self.builder.fadd(x, y, flags=FUSE), terms)
+                yield (column, row, value)
 
     def _gradient(self, geometry: Value, node: Value) -> list:
-        """Load the shape gradient of a node, a list of 3 vectors, from the geometry of a point."""
-        first = self.builder.mul(node, I64(3))
-        return [self._load(geometry, self.builder.add(first, I64(axis))) for axis in range(3)]
+        """Load the shape gradient of a node, a list of c vectors, from the geometry of a point."""
+        columns = self.gradient_size // 3
+        first = self.builder.mul(node, I64(columns))
+        return [self._load(geometry, self.builder.add(first, I64(axis))) for axis in range(columns)]
 
     def _offset_pointer(self, base: Value, entry: int) -> Value:
         """Return the pointer to the vector with the constant index `entry`."""

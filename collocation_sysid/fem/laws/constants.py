@@ -23,6 +23,9 @@ Scale = Literal["log", "linear"]
 # Unit by the suffix of a name, longest suffix first.
 _UNITS = {
     "_kg_m3": "kg/m³",
+    "_n_m2": "N m²",
+    "_1_m": "1/m",
+    "_n": "N",
     "_m_s2": "m/s²",
     "_pa_s": "Pa s",
     "_1_s": "1/s",
@@ -331,6 +334,18 @@ FIBRE_ANGLE = Constant(
     scale="linear",
     typical=0.1,
 )
+# Stiffnesses of the section of a slender body, see `fem.rods`.
+BENDING = Constant("bending_n_m2", "EI", "bending stiffness", bounds=(1e-7, 1e4), usual=1e-3)
+TORSION = Constant("torsion_n_m2", "GJ", "torsional stiffness", bounds=(1e-7, 1e4), usual=1e-3)
+AXIAL = Constant("axial_n", "EA", "axial stiffness", bounds=(1e-1, 1e8), usual=1e3)
+NATURAL_STRAINS = tuple(
+    Constant(name, symbol, meaning, bounds=(-1e3, 1e3), scale="linear", typical=0.5, usual=0.0)
+    for name, symbol, meaning in (
+        ("curvature_1_1_m", "κ₁", "natural curvature about the first director"),
+        ("curvature_2_1_m", "κ₂", "natural curvature about the second director"),
+        ("twist_1_m", "τ", "natural twist"),
+    )
+)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", meaning="instantaneous Young's modulus, before relaxation"
 )
@@ -367,6 +382,10 @@ KNOWN: Mapping[str, Constant] = {
         FIBRE_EXPONENT,
         FIBRE_DISPERSION,
         FIBRE_ANGLE,
+        BENDING,
+        TORSION,
+        AXIAL,
+        *NATURAL_STRAINS,
         INSTANTANEOUS,
     )
 }

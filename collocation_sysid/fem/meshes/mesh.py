@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ...common.array_types import Array, Index
 from ...common.validated_classes import validated
 from ...errors import InputError
-from ..elements import Element
+from ..elements import Element, reference_geometry
 from .checks import (
     MeshQuality,
     boundary_of,
@@ -298,6 +298,29 @@ class TetMesh:
         sorted.
         """
         return _read_only(unique_edges(self.tetrahedra))
+
+    def nodes_of(self, element: Element) -> ElementNodes:
+        """Return the nodes of the elements of a kind: corners, and mid nodes if it has any."""
+        return ElementNodes.for_element(self, element)
+
+    def geometry(self, nodes: ElementNodes, element: Element) -> Array:
+        """Return shape gradients and volumes, see `elements.reference_geometry`."""
+        return reference_geometry(nodes.points_m, nodes.cells, element=element)
+
+    @property
+    def surface_factor(self) -> float:
+        """Area of the surface of the body over that of the mesh."""
+        return 1.0
+
+    @property
+    def arc_lengths_m(self) -> Array | None:
+        """Arc length of each node along a rod (n,) [m]; None for other bodies."""
+        return None
+
+    @property
+    def cell_of_tetrahedra(self) -> Index:
+        """Index of the element of a body to which each tetrahedron belongs."""
+        return np.arange(len(self.tetrahedra))
 
     def mid_node_indices(self, pairs: np.ndarray) -> np.ndarray:
         """Return the indices (…) of the mid nodes between pairs (…, 2) of corners, in either order.

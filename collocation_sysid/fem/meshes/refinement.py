@@ -17,9 +17,10 @@ from ..elements import ELEMENTS
 from ..node_force import LocatedForce, NodeForce
 from ..regions import Region
 from ..rest_shape import UnderGravity
+from ..rods import RodMesh
 from .checks import orient_elements
 from .mesh import ElementNodes, TetMesh
-from .selection import Ball, Box, Indices, Selection
+from .selection import Along, Ball, Box, Indices, Selection
 
 if TYPE_CHECKING:
     from ..body import Body
@@ -102,7 +103,7 @@ def on_mesh(
         mesh,
         rest.material,
         rest.density_kg_m3,
-        body.element.name,
+        "tet4" if body.is_slender else body.element.name,
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,
@@ -110,6 +111,7 @@ def on_mesh(
         rest_shape=rest_shape,
         made=body.made,
         mesh_from=body.mesh_from,
+        natural_curvature=getattr(rest.material, "has_natural_curvature", False),
         evaluator=body.evaluator,
         threads=body.threads,
     )
@@ -124,6 +126,8 @@ def refine_body(body: Body) -> Body:
     shape and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
     not copied.
     """
+    if isinstance(body.mesh, RodMesh):
+        return _refined_rod(body, body.mesh)
     mesh = split_in_eight(body.mesh)
     finer = on_mesh(
         body,
@@ -147,6 +151,12 @@ def refine_body(body: Body) -> Body:
             for part, source in zip(finer.parts, body.parts, strict=True)
         )
     )
+
+
+def _refined_rod(body: Body, mesh: RodMesh) -> Body:
+    # Regions are tetrahedra, of which every element of a rod has three.
+    cells = [(6 * part.cells[:, None] + np.arange(6)).ravel() for part in body.parts]
+    return on_mesh(body, mesh.refined(), cells, (), _refined_rest_shape(body, mesh))
 
 
 def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
@@ -188,8 +198,14 @@ def refine_nodes(nodes: Index, selection: Selection | None, body: Body, finer: B
     InputError
         If a box or ball selects no node of the refined body.
     """
-    if isinstance(selection, (Box, Ball)):
+    if isinstance(selection, (Along, Box, Ball)):
         return finer.select(selection)
+    if isinstance(body.mesh, RodMesh):
+        held = np.isin(np.arange(len(body.nodes_m)), nodes).reshape(-1, 3)
+        fine = np.zeros((2 * len(held) - 1, 3), dtype=bool)
+        fine[::2] = held
+        fine[1::2] = held[1:] & held[:-1]
+        return np.flatnonzero(fine)
     chosen: NDArray[np.bool_] = np.isin(np.arange(len(body.nodes_m)), nodes)
     if not body.element.edges:
         chosen = np.concatenate([chosen, chosen[body.mesh.edges].all(axis=1)])

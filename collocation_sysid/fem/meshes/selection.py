@@ -182,6 +182,56 @@ class Face(_PositionSelection):
         return f"the face {self.name}"
 
 
+@validated
+@dataclass(frozen=True)
+class Along:
+    """Selection of the cross-sections of a rod between two arc lengths.
+
+    Parameters
+    ----------
+    first_m, last_m : float
+        Arc lengths from the beginning of the rod [m].
+    """
+
+    first_m: float
+    last_m: float
+
+    def __post_init__(self) -> None:
+        if not self.first_m <= self.last_m:
+            raise InputError(
+                f"found [{self.first_m:g}, {self.last_m:g}]; expected the first arc length, then the "
+                "last",
+                where="s_m",
+            )
+
+    def resolve(self, nodes: ElementNodes) -> np.ndarray:
+        """Return the indices of the nodes of all selected sections, sorted."""
+        return _indices_or_error(self._contains(nodes.mesh), nodes.mesh, what=str(self))
+
+    def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
+        """Return the indices of the cells between the selected sections, sorted."""
+        chosen = np.asarray(self._contains(mesh)[mesh.tetrahedra].all(axis=1))
+        return _indices_or_error(chosen, mesh, what=str(self), of=OF_CELLS)
+
+    def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
+        """Return the rows of `mesh.surface` between the selected sections, sorted."""
+        return _select_faces(self._contains(mesh), mesh, what=str(self))
+
+    def _contains(self, mesh: TetMesh) -> np.ndarray:
+        if mesh.arc_lengths_m is None:
+            raise InputError(
+                "found arc lengths for a body that is not a rod; expected a selection by position, "
+                "such as box_m",
+                where="s_m",
+            )
+        slack = _tolerance_m(mesh.points_m)
+        inside = mesh.arc_lengths_m >= self.first_m - slack
+        return np.asarray(inside & (mesh.arc_lengths_m <= self.last_m + slack))
+
+    def __str__(self) -> str:
+        return f"the part of the rod from {self.first_m:g} to {self.last_m:g} m"
+
+
 @dataclass(frozen=True)
 class Indices:
     """Selection of nodes or cells by index, counted from 0, as in the mesh file or the given array.
@@ -368,7 +418,7 @@ class Named:
         return values.astype(bool)
 
 
-Selection = Box | Ball | Face | Indices | Named
+Selection = Along | Box | Ball | Face | Indices | Named
 
 
 def rows_of_faces(faces: np.ndarray, surface: np.ndarray) -> np.ndarray:

@@ -46,7 +46,8 @@ class MarkerAssociation:
     body: Body
     sigma_m: Array  # (M,): prior standard deviation of each place [m], zero where it is exact
     prior_places_m: Array  # (M, 3): places at the centres of the priors [m]
-    # Whether places move in the plane of the nearest face (k = 2) or freely (k = 3).
+    # Whether places move in the plane of the nearest face (k = 2), of a rod along its centreline
+    # (k = 1), or freely (k = 3).
     on_surface: bool
     # (M, npe): nodes and shape functions of exact places.
     nodes: Index
@@ -72,12 +73,12 @@ class MarkerAssociation:
         placement = markers.placement
         sigma_m = experiment.place_sigma_m
         points = markers.predict_positions(body.nodes_m)
-        k = 2 if markers.on_surface else 3
+        k = markers.place_dimension(body)
         association = cls(
             body,
             sigma_m,
             prior_places_m=points,
-            on_surface=markers.on_surface,
+            on_surface=k < 3,
             nodes=placement.nodes,
             weights=placement.weights,
             cells=np.zeros(len(points), dtype=np.int64),
@@ -117,7 +118,7 @@ class MarkerAssociation:
         """
         return (
             self.body is experiment.body
-            and self.on_surface == experiment.markers.on_surface
+            and self.axes.shape[2] == experiment.markers.place_dimension(self.body)
             and np.array_equal(self.sigma_m, experiment.place_sigma_m)
         )
 
@@ -155,7 +156,7 @@ class MarkerAssociation:
         phi : (M, k) array
             Coordinates of the places, in prior standard deviations along `axes`.
         """
-        element = self.body.element
+        element = self.body.place_element
         k = self.axes.shape[2]
         nodes = self.nodes.copy()
         weights = self.weights.copy()
@@ -168,7 +169,7 @@ class MarkerAssociation:
             gradients = self._shape.barycentric_gradients(cells) @ (
                 self.sigma_m[estimated, None, None] * self.axes[estimated]
             )
-            nodes[estimated] = self.body.cells[cells]
+            nodes[estimated] = self.body.place_cells[cells]
             weights[estimated] = element.shape_functions(local)
             slopes[estimated] = element.shape_gradients(local) @ gradients
             curvatures[estimated] = np.einsum(
@@ -229,7 +230,7 @@ class MarkerAssociation:
         # Where a marker stands off an edge, the plane of each face may lead back to the other. A
         # place that has crossed the same edge `LARGEST_CROSSING_COUNT` times stays in its plane.
         centred = self.centred_at(points_m)
-        if not self.on_surface:
+        if centred.axes.shape[2] != 2:
             return centred
         points = centred.centre_places_m.copy()
         axes = centred.axes.copy()
