@@ -50,6 +50,7 @@ class NewProblemKind(StrEnum):
     TENSION = "tension"
     SWING = "swing"
     VIDEO = "video"
+    CABLE = "cable"
 
 
 @command(commands, "methods", "methods interior-point")

@@ -8,13 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from ..common.declarations import keys_of
 from ..common.schema_tables import Section, declared_in
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, located
 from ..fem.body import Body
-from ..fem.laws.constants import FRICTION, Constant, constant_named, with_undamped
+from ..fem.laws.constants import FRICTION, NATURAL_STRAINS, Constant, constant_named, with_undamped
 from ..fem.laws.fibres import Fibres
+from ..fem.meshes.files import length_in_metres
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.structured import (
     box_of_edge,
@@ -24,16 +27,18 @@ from ..fem.meshes.structured import (
 )
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
+from ..fem.rods import CrossSection, RodMesh, rod_mesh
 from ..fem.spatial_field import Field
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Specimen
 from ..recording.homogeneous_deformation import DEFORMATIONS
-from ..recording.node_selection import selection_from_section
+from ..recording.node_selection import NodesSection, selection_from_section
 from ..recording.specimen import cell_body, conditioned
 from ..recording.specimen_checks import require_equal_units
+from ..recording.time_tables import read_points
 from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
-from .density_guesses import with_declared_densities, with_guessed_densities
+from .density_guesses import Sections, with_declared_densities, with_guessed_densities
 from .named_files import existing_file
 from .options import Origin, RolloutOptions, UncertaintyOptions
 from .reading import read_problem_file
@@ -80,7 +85,7 @@ def problem_arguments(
             "every experiment has validation = true; expected at least one to fit", path
         )
     folder = path.parent if folder is None else Path(folder)
-    unknowns = file.parameters
+    unknowns = _with_natural_strains(file.parameters)
     code = CodeLoader(folder, allow_code)
     with located(path):
         code.require_harmless(file.solver.methods)
@@ -161,12 +166,21 @@ def _load_object(
             corners, elements = generated
             size = _smallest_size(file, corners=corners, elements=elements, simulation=simulation)
             require_feasible(replace(size, substeps=1))
-        mesh = _load_mesh(file.object, folder)
+        mesh = _load_mesh(file.object, folder, _stations_m(file))
     size = _smallest_size(
         file, corners=len(mesh.points_m), elements=len(mesh.tetrahedra), simulation=simulation
     )
     require_feasible(replace(size, substeps=1))
-    body = _load_body(with_guessed_densities(file.object, file.parameters), mesh, code=code)
+    section = file.object
+    if isinstance(mesh, RodMesh) and section.mass_per_length_kg_m is not None:
+        mass_kg = section.mass_per_length_kg_m * float(mesh.s_m[-1])
+        section = section.model_copy(update={"mass_kg": mass_kg})
+    body = _load_body(
+        with_guessed_densities(section, file.parameters),
+        mesh,
+        code=code,
+        natural_curvature=any(constant.name in file.parameters for constant in NATURAL_STRAINS),
+    )
     size = replace(size, nodes=len(body.nodes.points_m))
     require_feasible(replace(size, substeps=1), say)
     return body.with_free_densities(body.parts_with_free_density(file.parameters)), size
@@ -260,7 +274,7 @@ def _smallest_size(file: ProblemFile, corners: int, elements: int, *, simulation
 
 def _named_files(file: ProblemFile, folder: Path) -> tuple[Path, ...]:
     """Return the data files that a problem names, existing or not."""
-    names = [file.object.mesh, file.object.surface]
+    names = [file.object.mesh, file.object.surface, file.object.centreline]
     names += [section.file for section in file.specimens]
     for section in file.recordings:
         names += section.list_measurement_files()
@@ -289,8 +303,53 @@ def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterato
         raise InputError("; ".join([*odd, error.message]), source, where=where) from error
 
 
-def _load_mesh(section: ObjectSection, folder: Path) -> TetMesh:
+def _with_natural_strains(parameters: Sections) -> Sections:
+    """Return parameters in which natural curvatures and twist are zero beside a stated one."""
+    names = [constant.name for constant in NATURAL_STRAINS]
+    if not any(name in parameters for name in names):
+        return parameters
+    return dict.fromkeys(names, 0.0) | dict(parameters)
+
+
+def _stations_m(file: ProblemFile) -> list[float]:
+    """Return the arc lengths that a problem names, where a rod must have sections."""
+    stations: list[float] = []
+    for experiment in file.recordings:
+        stations += experiment.markers.s_m.values()
+        for held in (*experiment.grasp_list, *experiment.mass, *experiment.force):
+            nodes = getattr(held, "nodes", None)
+            if isinstance(nodes, NodesSection) and nodes.s_m is not None:
+                stations += nodes.s_m
+    return stations
+
+
+def _load_rod(section: ObjectSection, folder: Path, stations_m: Sequence[float]) -> RodMesh:
+    shape = section.section
+    assert shape is not None  # by the schema
+    if shape.diameter_m is not None:
+        with located(where="section"):
+            cross = CrossSection.round(shape.diameter_m, shape.inner_m)
+    else:
+        cross = CrossSection.rectangle(shape.width_m or 0.0, shape.height_m or 0.0)
+    if section.centreline is not None:
+        points = read_points(existing_file(folder, section.centreline, key="centreline"))
+        points = points * length_in_metres(section.length_unit)
+    else:
+        points = np.array([[0.0, 0.0, 0.0], [section.length_m or 0.0, 0.0, 0.0]])
+    return rod_mesh(
+        points,
+        cross,
+        sections=section.sections,
+        stations_m=stations_m,
+        first_director=section.first_director,
+        is_straight_at_rest=section.rest_shape == "straight",
+    )
+
+
+def _load_mesh(section: ObjectSection, folder: Path, stations_m: Sequence[float]) -> TetMesh:
     """Return the mesh of [object]; meshes of surfaces are cached in ``.meshes``."""
+    if section.is_rod:
+        return _load_rod(section, folder, stations_m)
     if section.mesh is not None:
         file = existing_file(folder, section.mesh, key="mesh")
         return TetMesh.read(file, section.length_unit)
@@ -339,7 +398,9 @@ def fibres_of(section: ObjectSection | RegionSection, where: str) -> Fibres | No
         return Fibres(**declared_in(section.fibres, where=where))
 
 
-def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
+def _load_body(
+    section: ObjectSection, mesh: TetMesh, code: CodeLoader, natural_curvature: bool
+) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 
     def material(law: str | CodeSection | None, key: str) -> Any:
@@ -380,6 +441,7 @@ def _load_body(section: ObjectSection, mesh: TetMesh, code: CodeLoader) -> Body:
         made=section.made,
         mesh_from=section.mesh_from,
         material_density_kg_m3=section.material_density_kg_m3,
+        natural_curvature=natural_curvature,
     )
 
 

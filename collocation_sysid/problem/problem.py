@@ -238,12 +238,19 @@ class Problem:
 
     def choose_first_substeps(self) -> int:
         """Return the grid steps between samples in the first solve, and where nothing is solved:
-        for "auto" those of `impact_steps`, 1 without obstacles.
+        for "auto" those of `impact_steps`, 1 without obstacles, at least 2 in motions of slender
+        bodies, because steps of 10 ms leave stiff motions along them undamped.
         """
         if self.substeps != "auto":
             return self.substeps
         fitted = (each for each in self.experiments if not each.validation)
-        return max(map(impact_steps, fitted), default=1)
+        return max(
+            (
+                max(impact_steps(e), 2 if e.body.is_slender and not e.is_static else 1)
+                for e in fitted
+            ),
+            default=1,
+        )
 
     def collocation(self, lifted: bool = False) -> Collocation:
         """Return a new nonlinear program of the problem, with `choose_first_substeps`.

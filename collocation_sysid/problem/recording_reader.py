@@ -18,6 +18,7 @@ from ..common.declarations import keys_of
 from ..common.schema_tables import declared_in
 from ..errors import ImplausibleMarkersError, InputError, hint_at, listed, located
 from ..fem.body import Body
+from ..fem.rods import RodMesh
 from ..methods.starts.stiffness_scan import typical_constants
 from ..model.parameters import Parameters
 from ..recording import (
@@ -81,6 +82,20 @@ LARGEST_MISS = 3.0
 LARGEST_INTERPOLATION_SIGMAS = 0.3
 
 
+def _with_places_on_rod(section: ExperimentSection, body: Body) -> ExperimentSection:
+    """Return the table with positions of markers that are stated by arc length."""
+    if not isinstance(body.mesh, RodMesh):
+        raise InputError(
+            "found arc lengths for a body that is not a rod; expected reference_m",
+            where="markers.s_m",
+        )
+    with located(where="markers"):
+        known = {name: body.mesh.place_m(s).tolist() for name, s in section.markers.s_m.items()}
+    reference_m = {**known, **section.markers.reference_m}
+    markers = section.markers.model_copy(update={"reference_m": reference_m})
+    return section.model_copy(update={"markers": markers})
+
+
 @dataclass
 class RecordingReader:
     """Reader of one experiment's files."""
@@ -96,6 +111,10 @@ class RecordingReader:
     notes: list[str] = field(default_factory=list)
     size: Size | None = None  # size of the problem with one sample; None skips the check of memory
     say: Say | None = None  # function that is called with a sentence before long work
+
+    def __post_init__(self) -> None:
+        if self.section.markers.s_m:
+            self.section = _with_places_on_rod(self.section, self.body)
 
     def read(self) -> Experiment:
         """Read all files of the experiment and return it; notes are added to `notes`.

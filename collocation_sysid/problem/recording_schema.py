@@ -349,6 +349,8 @@ class MarkersSection(Section, of=Markers):
     template_window_s : list, optional
         First and last time [start, end] of the window in which the markers are at the positions in
         template_m; their tracks are averaged over it.
+    s_m : mapping of name to float
+        Arc length of each marker on the centreline of a rod [m], by name, in place of reference_m.
     reference_m : mapping of name to (3,) array
         Position [x, y, z] of each marker on the undeformed body, by name; the positions of other
         markers are estimated.
@@ -369,6 +371,7 @@ class MarkersSection(Section, of=Markers):
     rate_hz: Positive | None = None
     template_m: dict[str, Vector] | None = None
     template_window_s: tuple[Finite, Finite] | None = None
+    s_m: dict[str, NotNegative] = Field(default_factory=dict)
     reference_m: dict[str, Vector] = Field(default_factory=dict)
     reference_sigma_m: ReferenceSigma | None = None
 

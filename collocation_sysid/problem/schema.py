@@ -23,6 +23,7 @@ from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
 from ..fem.laws.fibres import Fibres
 from ..fem.laws.materials import DAMPINGS, MATERIALS
+from ..fem.rods import LAWS as ROD_LAWS
 from ..fem.schemes import MOST_STEPS, SCHEMES
 from ..fem.spatial_field import Field as SpatialField
 from ..model.parameters import Unknown
@@ -34,7 +35,7 @@ from .recording_schema import ExperimentSection
 from .solver_schema import SolverSection
 from .specimen_schema import SpecimenSection
 
-MaterialName = Annotated[str, Among(tuple(MATERIALS))]
+MaterialName = Annotated[str, Among((*MATERIALS, *ROD_LAWS))]
 DampingName = Annotated[str, Among(tuple(DAMPINGS))]
 ElementName = Annotated[str, Among(tuple(ELEMENTS))]
 SchemeName = Annotated[str, Among(tuple(SCHEMES))]
@@ -163,8 +164,38 @@ class ScanSection(Section):
     gravity_m_s2: Vector = (0.0, 0.0, -9.81)
 
 
+class RodSection(Section):
+    """The cross-section of a rod: a circle, a ring, or a rectangle.
+
+    Attributes
+    ----------
+    diameter_m : float, optional
+        Outer diameter [m].
+    inner_m : float
+        Inner diameter [m], with diameter_m.
+    width_m, height_m : float, optional
+        Lengths of the sides [m]; the width is along first_director.
+    """
+
+    diameter_m: Positive | None = None
+    inner_m: NotNegative = 0.0
+    width_m: Positive | None = None
+    height_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _require_one_form(self) -> RodSection:
+        if sorted(used_keys(self, "diameter_m", "width_m", "height_m")) not in (
+            ["diameter_m"],
+            ["height_m", "width_m"],
+        ):
+            raise ValueError("expected diameter_m, or width_m and height_m")
+        return self
+
+
 # Keys of the object that state its shape.
-SHAPES = ("mesh", "surface", "cylinder", "box_m")
+SHAPES = ("mesh", "surface", "cylinder", "box_m", "centreline", "length_m")
+# Keys that belong to a rod.
+ROD_KEYS = ("section", "sections", "mass_per_length_kg_m", "first_director")
 
 
 class ObjectSection(Section):
@@ -180,6 +211,18 @@ class ObjectSection(Section):
         A cylinder to mesh: diameter_m, height_m, quarter.
     box_m : list, optional
         Lengths [x, y, z] of a box to mesh, with a corner at the origin.
+    centreline : str, optional
+        Table of points x_m, y_m, z_m along the centreline of a rod, cable or hose.
+    length_m : float, optional
+        Length of a rod that is straight, from the origin along x [m].
+    section : RodSection, optional
+        Cross-section of a rod: diameter_m and inner_m, or width_m and height_m.
+    sections : int
+        Number of cross-sections of a rod, at which it has nodes.
+    mass_per_length_kg_m : float, optional
+        Mass per length of a rod [kg/m], instead of the mass.
+    first_director : list, optional
+        Direction [x, y, z] of the section's width at the beginning of a rod.
     edge_length_m : float, optional
         Target edge length of the mesh of a surface, cylinder or box [m].
     length_unit : {"m", "cm", "mm", "in"}
@@ -213,10 +256,11 @@ class ObjectSection(Section):
         Fibres beside the material, outside all regions: direction or axis, families, law. Of a
         specimen without a mesh the direction is in the plane of its axes z (of the first strain)
         and x, see cut_angle_deg.
-    rest_shape : {"stress_free", "under_gravity"}, optional
+    rest_shape : {"stress_free", "under_gravity", "straight"}, optional
         "stress_free": the mesh has the shape without stress. "under_gravity": the mesh has the
-        shape in which the object hung or stood under its own weight while it was scanned. By
-        default the mesh counts as stress-free, and the result states how much the estimates would
+        shape in which the object hung or stood under its own weight while it was scanned.
+        "straight": the centreline of a rod is a shape under load, and the rod is straight without
+        stress. By default the mesh counts as stress-free, and the result states how much the estimates would
         change if it is not.
     made : Made, optional
         How the object was made, which selects default deviations of [uncertainty.assumptions] and
@@ -233,6 +277,12 @@ class ObjectSection(Section):
     surface: Text | None = None
     cylinder: CylinderSection | None = None
     box_m: tuple[Positive, Positive, Positive] | None = None
+    centreline: Text | None = None
+    length_m: Positive | None = None
+    section: RodSection | None = None
+    sections: Count = 31
+    mass_per_length_kg_m: Positive | None = None
+    first_director: Vector | None = None
     edge_length_m: Positive | None = None
     length_unit: Unit = "m"
     mass_kg: Positive | None = None
@@ -246,7 +296,7 @@ class ObjectSection(Section):
     force: list[NodeForceSection] = Field(default_factory=list)
     field: FieldSection | None = None
     fibres: FibresSection | None = None
-    rest_shape: Literal["stress_free", "under_gravity"] | None = None
+    rest_shape: Literal["stress_free", "under_gravity", "straight"] | None = None
     made: Made | None = None
     mesh_from: MeshOrigin | None = None
     scan: ScanSection | None = None
@@ -256,10 +306,39 @@ class ObjectSection(Section):
         """Whether the table states a mesh, a surface, a cylinder, a box, or an edge length."""
         return bool(used_keys(self, *SHAPES)) or self.edge_length_m is not None
 
+    @property
+    def is_rod(self) -> bool:
+        """Whether the table describes a slender body."""
+        return bool(used_keys(self, "centreline", "length_m"))
+
+    def _require_rod_keys(self) -> None:
+        rod_only = [key for key in ROD_KEYS if key in self.model_fields_set]
+        if not self.is_rod:
+            if rod_only or self.rest_shape == "straight":
+                key = rod_only[0] if rod_only else 'rest_shape = "straight"'
+                raise ValueError(
+                    f"found {key} without centreline or length_m; expected one of them"
+                )
+            return
+        if self.section is None:
+            raise ValueError(
+                "section is missing; expected the cross-section of the rod, such as "
+                "section = { diameter_m = 0.006 }"
+            )
+        if len(used_keys(self, "mass_kg", "density_kg_m3", "mass_per_length_kg_m")) > 1:
+            require_one(self, "mass_kg", "density_kg_m3", "mass_per_length_kg_m")
+        if solid := [
+            key for key in ("edge_length_m", "scan", "element") if key in self.model_fields_set
+        ]:
+            raise ValueError(f"found {solid[0]} for a rod; expected none")
+
     @model_validator(mode="after")
     def _require_consistent(self) -> ObjectSection:
         if self.has_shape:
             require_one(self, *SHAPES)
+        self._require_rod_keys()
+        if self.is_rod:
+            return self
         if self.has_shape and self.mesh is None and self.edge_length_m is None:
             raise ValueError(
                 "edge_length_m is missing; expected the length of the elements' edges "

@@ -12,9 +12,9 @@ from pydantic import model_validator
 from ..common.array_types import Index
 from ..common.checked_arrays import read_only_nodes
 from ..common.schema_tables import ByForm, Corner, Section, Vector, require_one
-from ..common.validated_types import Positive, StrictInteger, Text
+from ..common.validated_types import NotNegative, Positive, StrictInteger, Text
 from ..errors import InputError
-from ..fem.meshes.selection import Ball, Box, Face, FaceName, Indices, Named, Selection
+from ..fem.meshes.selection import Along, Ball, Box, Face, FaceName, Indices, Named, Selection
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -25,6 +25,8 @@ class NodesSection(Section):
 
     Attributes
     ----------
+    s_m : list, optional
+        First and last arc length [first, last] along a rod: the cross-sections between them.
     box_m : list, optional
         Lowest and highest corner [[x, y, z], [x, y, z]].
     ball_m : list, optional
@@ -39,6 +41,7 @@ class NodesSection(Section):
         elements of any dimension.
     """
 
+    s_m: tuple[NotNegative, NotNegative] | None = None
     box_m: tuple[Corner, Corner] | None = None
     ball_m: tuple[Vector, Positive] | None = None
     face: FaceName | None = None
@@ -56,6 +59,7 @@ Nodes = Annotated[Text | NodesSection, ByForm(str)]
 
 
 KINDS: dict[str, Any] = {
+    "s_m": Along,
     "box_m": Box,
     "ball_m": Ball,
     "face": Face,
@@ -71,7 +75,7 @@ def selection_from_section(section: NodesSection | str) -> Selection:
     if isinstance(section, str):
         return Named(section)
     ((kind, value),) = ((KINDS[key], value) for key, value in section if value is not None)
-    return kind(*value) if kind in (Box, Ball) else kind(value)
+    return kind(*value) if kind in (Along, Box, Ball) else kind(value)
 
 
 def node_converter(what: str) -> Callable[[ArrayLike | Selection], Index]:

@@ -262,6 +262,29 @@ def without_rounding(t_s: Array) -> Array:
     return unrounded_s(t_s) if len(t_s) > 2 else t_s
 
 
+@names_file_in_errors
+def read_points(path: str | Path) -> Array:
+    """Read points (k, 3) [m] from columns x_m, y_m and z_m; a missing column is zero.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two of these columns, or a cell is not a number; the line is named.
+    """
+    grid = read_table(path)
+    found = [name for name in ("x_m", "y_m", "z_m") if grid.columns.count(name) == 1]
+    if len(found) < 2:
+        raise grid.error_at(
+            f"found the columns {', '.join(grid.columns)}; expected x_m, y_m and z_m, of which one "
+            "may be missing in a plane"
+        )
+    columns = [grid.columns.index(name) for name in found]
+    values = numeric_cells(grid, columns, blank_allowed=False)
+    points = np.zeros((len(values), 3))
+    points[:, [("x_m", "y_m", "z_m").index(name) for name in found]] = values
+    return points
+
+
 # Custom sensors -----------------------------------------------------------------------------------
 
 

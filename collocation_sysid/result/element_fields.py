@@ -41,10 +41,10 @@ class ElementFields:
     @classmethod
     def from_body(cls, body: Body, theta: Array) -> ElementFields:
         """Return the evaluator of a body with the constants `theta` (k,); compiles its materials'
-        kernels.
+        kernels. A rod has none of these fields.
         """
         evaluators = []
-        for number, part in enumerate(body.parts):
+        for number, part in enumerate(() if body.is_slender else body.parts):
             kernel = field_kernel(body.element, body.law(number))
             # Every element has a place of its own, where its points add up.
             places = len(FIELD_NAMES) * part.cells[:, None] + np.arange(len(FIELD_NAMES))
@@ -84,6 +84,8 @@ class ElementFields:
             where ln J does not exist, the values that need it are NaN.
         """
         body = self.body
+        if body.is_slender:
+            return {}
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
         sums = np.empty((len(x), len(FIELD_NAMES) * len(self._volumes)))
         shares = body.split_theta(self.theta)

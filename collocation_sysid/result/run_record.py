@@ -195,7 +195,7 @@ def write_pictures(
 
 
 def _constant_cell_data(finished: SolvedProblem, body: Body) -> dict[str, Any]:
-    data: dict[str, Any] = {"region": body.part_of_cells} if len(body.parts) > 1 else {}
+    data: dict[str, Any] = {"region": body.part_of_place_cells} if len(body.parts) > 1 else {}
     for name, values in _field_estimates(finished, body).items():
         heads = (name, f"{name}_lower", f"{name}_upper", f"{name}_over_prior")
         data |= dict(zip(heads, values.T, strict=True))
@@ -234,8 +234,8 @@ def write_all_frames(finished: SolvedProblem, place: Path) -> None:
             here,
             transcription.dynamics.t_s,
             positions_m=positions,
-            cells=body.cells,
-            element=body.element,
+            cells=body.place_cells,
+            element=body.place_element,
             undeformed_m=body.nodes_m,
             point_series={"residual_force_n": residual.reshape(positions.shape)},
             fields=ElementFields.from_body(

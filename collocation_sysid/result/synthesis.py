@@ -216,8 +216,8 @@ def write_data(
                     stack.enter_context(subfolder),
                     trajectory.t_s,
                     positions_m=trajectory.positions_m,
-                    cells=body.cells,
-                    element=body.element,
+                    cells=body.place_cells,
+                    element=body.place_element,
                     undeformed_m=body.nodes_m,
                 )
                 written.append(folder / FRAMES_FILE)

@@ -27,6 +27,7 @@ from collocation_sysid.recording import (
     write_markers_csv,
     write_poses_csv,
 )
+from collocation_sysid.recording.writers import write_columns_csv
 
 # True Young's modulus of the bench tests, and shear modulus of the specimen [Pa].
 YOUNG_PA = 8e4
@@ -35,6 +36,9 @@ SHEAR_MODULUS_PA = 1e5
 STRESS_NOISE_PA = 1e3
 # True constants of the swung cylinder.
 SWUNG = {"young_pa": 8000.0, "poisson": 0.3, "gamma_r_s": 0.005, "gamma_m_1_s": 1.0}
+# True constants of the cable, and the seed of its noise.
+CABLE = {"bending_n_m2": 1e-3, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
+CABLE_SEED = 1
 # Seeds of the noise. With seed 1, an estimate of the swing is 2.6 standard errors from the truth,
 # which is rare. With ten other seeds, the root mean square of errors over standard errors is 0.85
 # to 1.1, and the combined intervals contain the truth. The example for new users is one of these
@@ -153,9 +157,30 @@ def add_noise(file: Path) -> None:
     write_text_file(file, "\n".join([*map(",".join, [head, *rows]), ""]))
 
 
+def cable(folder: Path) -> None:
+    """Write the recording of a cable that hangs from a gripper and is moved to and fro."""
+    t_s = np.arange(151) * np.float64(0.01)
+    grown = np.minimum(1.0, t_s / 0.5)
+    shift_m = np.outer(0.1 * grown * (1 - np.cos(7 * t_s)), [0, 0, 1])
+    shift_m += np.outer(0.06 * grown * np.sin(5 * t_s), [0, 1, 0])
+    poses = PoseSequence(t_s, shift_m, np.tile([0.0, 0, 0, 1], (len(t_s), 1)))
+    write_poses_csv(folder / "poses.csv", poses)
+    stated = {**CABLE, "torsion_n_m2": 3e-4, "axial_n": 200.0}
+    problem = Problem.read(folder / "problem.toml", simulation=True)
+    motion = simulate(problem.experiments[0], stated)
+    rng = np.random.default_rng(CABLE_SEED)
+    tracks_m = motion.markers_m + rng.normal(scale=5e-4, size=motion.markers_m.shape)
+    write_markers_csv(folder / "markers.csv", t_s, ["middle", "tip"], tracks_m)
+    (wrench,) = motion.wrenches
+    noise = np.repeat([0.01, 0.001], 3) * rng.normal(size=(len(t_s), 6))
+    names = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+    columns = dict(zip(names, (wrench + noise).T, strict=True))
+    write_columns_csv(folder / "wrench.csv", {"t_s": t_s, **columns})
+
+
 KINDS = {"swing": swing, "compression": compression, "tension": tension, "specimen": specimen}
 
 if __name__ == "__main__":
     require_no_arguments(__doc__)
-    for kind, write in (KINDS | {"video": video}).items():
+    for kind, write in (KINDS | {"video": video, "cable": cable}).items():
         write(TEMPLATES / kind)

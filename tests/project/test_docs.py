@@ -17,7 +17,7 @@ from kit.problem_files import EXPERIMENT, PROBLEM, run_command
 from pydantic import ValidationError
 
 import collocation_sysid as cs
-from collocation_sysid.problem.schema import ProblemFile
+from collocation_sysid.problem.schema import SHAPES, ProblemFile
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
@@ -105,7 +105,7 @@ def in_a_problem(code: str) -> dict[str, Any]:
     experiment = block.pop("experiment", {})
     if isinstance(experiment, dict):
         experiment = [whole["experiment"][0] | experiment]
-    if not {"mesh", "surface", "cylinder", "box_m"} & set(block.get("object", ["mesh"])):
+    if not {*SHAPES} & set(block.get("object", ["mesh"])):
         block["object"] |= whole["object"]
     return whole | block | {"experiment": experiment}
 

@@ -43,6 +43,7 @@ from ...fem.schemes import Scheme
 from ...model.dynamics import Dynamics
 from ...model.forces import Forces
 from ...program.collocation import Collocation
+from ...program.forward.scheme_simulation import simulate_scheme
 from ...program.linear_algebra.factorisation import NONE, Factoriser
 from ...program.linear_algebra.reused_factor import (
     FactorSequence,
@@ -54,7 +55,7 @@ from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.experiment_refinement import refined_experiment
 from .consider_analysis import changed_residuals
-from .systematic_effects import Effect, ExperimentAtAnswer
+from .systematic_effects import SMALL, Effect, ExperimentAtAnswer
 
 # Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
 # the search starts on a coarser mesh, and a note compares both meshes.
@@ -116,6 +117,8 @@ def _effect(
         transcription.corrected_experiment(iterate.phi), finer[id(transcription.body)]
     )
     dynamics = Dynamics.from_experiment(fine, scheme, transcription.substeps).with_theta(at.theta)
+    if transcription.body.is_slender:
+        return _effect_on_rod(at, fine, dynamics)
     interpolation = _interpolation(transcription.body, fine.body)
     by_dof = sp.csr_array(sp.kron(interpolation, sp.eye_array(3)))
     held = np.zeros(iterate.x.shape[1], dtype=bool)
@@ -124,6 +127,22 @@ def _effect(
     moving = np.flatnonzero((abs(by_dof) @ ~held > 0) & (at.dynamics.is_static | ~is_given))
     forces_n = _equivalent_forces(at, dynamics, by_dof, moving, given)
     return Effect(force_n=at.pad_rows(forces_n - _forces_less_inertia(at.dynamics, iterate.x)))
+
+
+def _effect_on_rod(at: ExperimentAtAnswer, fine: Experiment, dynamics: Dynamics) -> Effect:
+    """Return the change of the forces that moves the sections of a rod as a rod with twice as many
+    elements moves, which is simulated: a slender body hardly stretches, so that a motion between
+    the given sections cannot be condensed at those where they are.
+    """
+    x = at.iterate.x
+    finer = simulate_scheme(fine, dynamics).reshape(len(x), -1, 3, 3)
+    own = len(at.body.nodes.points_m) // 3
+    moved = x.copy().reshape(len(x), -1, 3)
+    moved[:, : 3 * own] = finer[:, : 2 * own - 1 : 2].reshape(len(x), -1, 3)
+    change = moved.reshape(x.shape) - x
+    before = _forces_less_inertia(at.dynamics, x)
+    after = _forces_less_inertia(at.dynamics, x + SMALL * change)
+    return Effect(force_n=at.pad_rows((before - after) / SMALL))
 
 
 def _forces_less_inertia(dynamics: Dynamics, x: Array) -> Array:

@@ -29,6 +29,7 @@ from ...fem.laws.constants import GAMMA_M, GAMMA_R, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import boundary_of
+from ...fem.rods import RodMesh
 from ...model.contact.summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
@@ -85,6 +86,8 @@ INCOMPRESSIBLE_POISSON = 0.5
 UNKNOWN_ORIENTATION = 0.58
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
+# Angle by which a rod that was not stated to be straight may be bent by itself [rad].
+ROD_CURVATURE = 0.5
 # Differences by a displacement: its largest entry over the length of an edge.
 SMALL_STRAIN = 1e-4
 _MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
@@ -340,6 +343,9 @@ class ExperimentAtAnswer:
             return None
         body = self.body
         is_held = np.isin(np.arange(len(body.nodes_m)), np.concatenate(gripped))
+        if isinstance(body.mesh, RodMesh):
+            outward = body.mesh.directions_beyond_clamps(is_held[: len(self.stress_free_m)])
+            return shape_effect(self, outward) if outward.any() else None
         cells = body.mesh.tetrahedra
         faces, _ = boundary_of(cells[~is_held[cells].all(axis=1)])
         faces = faces[is_held[faces].all(axis=1)]
@@ -391,7 +397,13 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
     the mass of the body is declared, when it stays. For a mesh made under gravity, the weight
     during the scan relative to the stiffness grows by s, or falls by s² if the mass is declared.
+
+    Of a rod the section is larger, not the length.
     """
+    if at.body.is_slender:
+        return Effect(
+            (at.internal_n(body=at.body.with_section_scale(1 + SMALL)) - at.internal_n()) / SMALL
+        )
     larger = 1 + SMALL
     smaller = 1 - SMALL
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
@@ -456,13 +468,15 @@ def _linear_shares(place_m: Array, weights: Array, extent_m: Array) -> Array:
     return (place_m - middle_m) / np.abs(extent_m - middle_m).max()
 
 
-def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
+def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     """Return the effect of a stiffness that is higher along one axis (index) by a share of E, the
     Young's modulus of the softest part: the energy ½ E e² of the strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative.
+    Rayleigh damping K(x) v follows by its time derivative. None for a rod.
     """
     body = at.body
+    if body.is_slender:
+        return None
     xi, nu = at.states
     count, points = body.geometry.shape[:2]
     geometry = body.stress_free_geometry(at.theta)
@@ -765,7 +779,8 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
     is_damped = any(
         constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
     )
-    if at.iterate.transcription.experiment.is_static or not is_damped:
+    is_same = body.is_slender and law == "material"  # "kelvin-voigt" of the strains of a rod
+    if at.iterate.transcription.experiment.is_static or not is_damped or is_same:
         return None
     parts = tuple(
         replace(part, damping=DAMPINGS[law])
@@ -795,9 +810,17 @@ def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
-    """Return None if the problem states the rest shape."""
+    """Return None if the problem states the rest shape.
+
+    Of a rod: natural curvature about d₁ and d₂, and natural twist, in units of `ROD_CURVATURE` over
+    the length of the rod.
+    """
     if at.body.rest_shape is not None:
         return None
+    if isinstance(at.body.mesh, RodMesh):
+        size = ROD_CURVATURE / float(at.body.mesh.s_m[-1])
+        curved = at.body.with_natural_curvature(np.eye(3)[axis] * size)
+        return None if curved is None else Effect(at.internal_n(body=curved) - at.internal_n())
     return Effect(
         at.force_change_by_reference(
             sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
@@ -820,8 +843,10 @@ def shape_effect(at: ExperimentAtAnswer, moved_m: Array) -> Effect:
     )
 
 
-def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
-    """Return the effect per thickness; grasped nodes move with the surface."""
+def _surface(at: ExperimentAtAnswer, mode: int) -> Effect | None:
+    """Return the effect per thickness; grasped nodes move with the surface. None for a rod."""
+    if at.body.is_slender:
+        return None
     return shape_effect(at, at.surface_modes_m[mode])
 
 
@@ -852,6 +877,7 @@ def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
     """Return None for a mesh from a file or of known origin, or in contact with obstacles."""
     body = at.body
     is_stated = body.mesh_from is not None or body.inverse_equilibrium is not None
+    is_stated = is_stated or body.is_slender
     if is_stated or not body.mesh.is_generated or at.iterate.transcription.experiment.obstacles:
         return None
     other = other_section(body.mesh, body.nodes.points_m)

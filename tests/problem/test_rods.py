@@ -1,0 +1,128 @@
+"""Problem files of slender bodies: keys, refusals, and the shipped example."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.errors import InputError
+from collocation_sysid.problem.new import create_problem
+
+TRUTH = {"bending_n_m2": 1e-3, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
+
+
+@pytest.fixture
+def problem(tmp_path):
+    create_problem(tmp_path / "hose", "cable")
+    return tmp_path / "hose" / "problem.toml"
+
+
+def changed(problem, old: str, new: str):
+    text = problem.read_text(encoding="utf-8")
+    assert old in text
+    problem.write_text(text.replace(old, new), encoding="utf-8")
+    return problem
+
+
+def test_sections_are_at_the_stated_arc_lengths(problem):
+    mesh = cs.Problem.read(problem).bodies[0].mesh
+    assert isinstance(mesh, cs.RodMesh)
+    for s_m in (0.0, 0.05, 0.3, 0.6):
+        assert np.abs(mesh.s_m - s_m).min() < 1e-12
+
+
+def test_a_grasp_holds_the_sections_between_two_arc_lengths(problem):
+    experiment = cs.Problem.read(problem).experiments[0]
+    mesh = experiment.body.mesh
+    held = np.unique(mesh.arc_lengths_m[experiment.grasps[0].nodes])
+    assert np.array_equal(held, mesh.s_m[mesh.s_m <= 0.05 + 1e-9])
+
+
+def test_the_mass_is_that_per_length(problem):
+    assert cs.Problem.read(problem).bodies[0].mass_kg == pytest.approx(0.034 * 0.6)
+
+
+def test_a_centreline_of_points_has_its_arc_length(problem):
+    angle = np.linspace(0.0, np.pi, 40)
+    rows = [f"{0.2 * np.sin(a):.9f},{0.2 * np.cos(a):.9f}" for a in angle]
+    (problem.parent / "arc.csv").write_text("\n".join(["x_m,z_m", *rows, ""]), encoding="utf-8")
+    changed(problem, "length_m = 0.6  ", 'centreline = "arc.csv"')
+    body = cs.Problem.read(problem).bodies[0]
+    assert body.mesh.s_m[-1] == pytest.approx(0.2 * np.pi, rel=1e-6)
+
+
+@pytest.mark.parametrize("rest_shape", ["straight", "stress_free"])
+def test_the_rest_shape_of_a_curved_centreline_is_as_stated(rest_shape, problem):
+    angle = np.linspace(0.0, np.pi / 2, 40)
+    rows = [f"{0.4 * np.sin(a):.9f},{0.4 * np.cos(a):.9f}" for a in angle]
+    (problem.parent / "arc.csv").write_text("\n".join(["x_m,z_m", *rows, ""]), encoding="utf-8")
+    changed(problem, "length_m = 0.6  ", 'centreline = "arc.csv"')
+    changed(problem, 'rest_shape = "straight"', f'rest_shape = "{rest_shape}"')
+    changed(problem, "s_m = { middle = 0.3, tip = 0.6 }", "")
+    body = cs.Problem.read(problem).bodies[0]
+    constants = TRUTH | {"torsion_n_m2": 3e-4, "axial_n": 200.0}
+    energy = body.energy(body.nodes_m, **constants)
+    length_m = 0.4 * np.pi / 2
+    bent = 0.5 * TRUTH["bending_n_m2"] * length_m / 0.4**2
+    assert energy == pytest.approx(bent if rest_shape == "straight" else 0.0, rel=5e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("section = { diameter_m = 0.006 }", "", "section is missing"),
+        ("diameter_m = 0.006", "diameter_m = 0.006, inner_m = 0.006", "below the diameter"),
+        ("diameter_m = 0.006", "width_m = 0.006", "width_m and height_m"),
+        ("length_m = 0.6  ", "box_m = [0.1, 0.1, 0.1]\nedge_length_m = 0.05", "without centreline"),
+        ('material = "cable"', 'material = "yeoh"', "'rod' (E and ν) or 'cable'"),
+        ('material = "cable"', 'material = "cable"\nelement = "tet10"', "element for a rod"),
+        ("tip = 0.6 }", "tip = 0.7 }", "0.7"),
+        ("s_m = [0.0, 0.05]", "s_m = [0.05, 0.0]", "the first arc length"),
+        ("mass_per_length_kg_m = 0.034", "mass_per_length_kg_m = 0.034\nmass_kg = 1.0", "mass_kg"),
+    ],
+)
+def test_a_wrong_description_is_refused_with_the_expected_one(old, new, message, problem):
+    with pytest.raises(InputError, match=message.replace("(", r"\(").replace(")", r"\)")):
+        cs.Problem.read(changed(problem, old, new))
+
+
+def test_arc_lengths_of_a_solid_body_are_refused(tmp_path):
+    create_problem(tmp_path / "foam", "swing")
+    problem = tmp_path / "foam" / "problem.toml"
+    changed(
+        problem, "nodes = { box_m = [[-1, -1, -0.001], [1, 1, 0.001]] }", "nodes = { s_m = [0, 1] }"
+    )
+    with pytest.raises(InputError, match="not a rod"):
+        cs.Problem.read(problem)
+
+
+@pytest.mark.long
+def test_the_example_gives_the_true_constants(problem):
+    run = cs.run(cs.Problem.read(problem))
+    assert run.result.quality.rating == "good"
+    for name, true in TRUTH.items():
+        low, high = run.interval(name)
+        assert low <= true <= high
+    assert run.parameters["bending_n_m2"] == pytest.approx(1e-3, rel=0.02)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("instrument", ["wrench", "markers"])
+def test_either_instrument_alone_is_sufficient(instrument, problem):
+    if instrument == "wrench":
+        text = problem.read_text(encoding="utf-8")
+        problem.write_text(text[: text.index("[experiment.markers]")], encoding="utf-8")
+    else:
+        changed(problem, "wrench = {", "# wrench = {")
+    solution = cs.solve(cs.Problem.read(problem))
+    assert solution.parameters["bending_n_m2"] == pytest.approx(1e-3, rel=0.02)
+    assert solution.parameters["gamma_r_s"] == pytest.approx(2e-3, rel=0.05)
+
+
+def test_a_place_that_is_estimated_moves_along_the_centreline(problem):
+    changed(problem, "s_m = { middle = 0.3, tip = 0.6 }", "s_m = { tip = 0.6 }")
+    collocation = cs.Problem.read(problem).collocation()
+    axes = collocation.transcriptions[0].association.markers.axes
+    assert axes.shape == (2, 3, 1)
+    assert np.allclose(np.abs(axes[0, :, 0]), [1, 0, 0])
