@@ -19,6 +19,7 @@ from ...model.forces import Forces
 from ...program.modes.natural import natural_modes
 from ...recording import Grasp, Solid
 from .identified import IdentifiedBody
+from .mujoco_cable import Chain, clamp_in_gripper, hinge_angles
 from .obstacle_shapes import Primitive, offset_solid
 from .target import (
     ExportedFiles,
@@ -79,6 +80,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
                 "throughout: export to calculix or json"
             )
+    if body.body.is_slender:
+        return _export_cable(body)
     limits = CAPABILITIES.limitations(body)
     if body.experiment.grasps:
         limits.append(
@@ -96,6 +99,64 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     x += f"<equality>\n{_weld_xml(body, step_s)}</equality>\n"
     x += f"<keyframe>\n{_keyframe_xml(body)}</keyframe>\n"
     return ExportedFiles({MODEL: f"{x}</mujoco>\n"}, tuple(limits))
+
+
+def _export_cable(body: IdentifiedBody) -> ExportedFiles:
+    chain = Chain.from_body(body)
+    interval_s = body.experiment.timestep_s
+    step_s = interval_s / int(np.ceil(interval_s / chain.stable_step_s))
+    limits = [
+        "the cable does not stretch; mass-proportional damping is the drag of a viscous medium, which "
+        "is the same for links of the same length"
+    ]
+    x = comment_lines(body, limits, start="<!-- ", end=" -->")
+    gravity = values_as_text(body.experiment.gravity_m_s2)
+    grasp = _grasp_xml(body).removesuffix("</body>\n")
+    (holding,) = body.experiment.grasps
+    clamp = clamp_in_gripper(body, holding, int(chain.sections[0]))
+    x += f"<mujoco model={xml_attribute(body.title or 'cable')}>\n"
+    x += f'<option timestep="{step_s!r}" gravity="{gravity}" integrator="implicitfast" '
+    x += f'viscosity="{chain.viscosity!r}"/>\n'
+    x += f"<worldbody>\n{grasp}{chain.xml(clamp)}</body>\n</worldbody>\n"
+    x += f"<equality>\n{_weld_xml(body, step_s)}</equality>\n"
+    shape = body.nodes_m if body.simulated_m is None else body.simulated_m[0]
+    start = np.concatenate(
+        [*_pose_at(holding, body.start_s), hinge_angles(shape, chain.sections).ravel()]
+    )
+    x += f'<keyframe>\n<key name="start" qpos="{values_as_text(start)}"/>\n</keyframe>\n'
+    return ExportedFiles({MODEL: f"{x}</mujoco>\n"}, tuple(limits))
+
+
+def _compare_tip(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> PredictionComparison:
+    """Compare the RMS motion of the free end against the gripper [m]."""
+    e = body.experiment
+    assert body.simulated_m is not None
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    steps = round(e.timestep_s / model.opt.timestep)
+    tips = []
+    for k in range(steps * (len(e.t_s) - 1) + 1):
+        at_s = min(body.start_s + k * model.opt.timestep, float(e.t_s[-1]))
+        data.mocap_pos[0], data.mocap_quat[0] = _pose_at(e.grasps[0], at_s)
+        if k % steps == 0:
+            mujoco.mj_forward(model, data)
+            tips.append(data.site("tip").xpos.copy())
+        mujoco.mj_step(model, data)
+    ours = body.simulated_m[:, -3:].mean(axis=1)
+    rigid_m = e.rigid_positions(e.t_s)[:, -3:].mean(axis=1)
+    moved, theirs = ours - rigid_m, np.array(tips) - rigid_m
+    moved, theirs = moved - moved[0], theirs - theirs[0]
+    difference_m = _rms_length(theirs - moved)
+    remark = (
+        f"the tips differ by {difference_m:.3g} m (RMS), {difference_m / _rms_length(moved):.2%}"
+    )
+    return PredictionComparison(
+        "RMS motion of the free end against the gripper",
+        _rms_length(theirs),
+        ours=_rms_length(moved),
+        unit="m",
+        remark=remark,
+    )
 
 
 def _grasp_xml(body: IdentifiedBody) -> str:
@@ -253,6 +314,8 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
             "calculix or json",
             folder / MODEL,
         ) from error
+    if body.body.is_slender:
+        return [_compare_tip(body, mujoco, model)] if body.simulated_m is not None else []
     compared = [_compare_first_frequency(body, mujoco, model=model)]
     if not body.experiment.is_static and body.simulated_m is not None:
         compared.append(_compare_motion(body, mujoco, model=model))

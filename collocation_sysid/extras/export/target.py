@@ -28,7 +28,7 @@ _CALCULIX = (
 # Laws that each target has, by the names of `IdentifiedBody.laws`; the json file has all. Newton has
 # that of its `SolverVBD`, with which it also reads a stage.
 LAWS: Mapping[str, tuple[str, ...]] = {
-    "mujoco": ("st-venant-kirchhoff",),
+    "mujoco": ("st-venant-kirchhoff", "rod", "cable"),
     "newton": ("stable-neo-hookean",),
     "usd": ("stable-neo-hookean",),
     "calculix": _CALCULIX,
