@@ -151,6 +151,19 @@ def test_an_error_of_the_pose_is_not_fitted_by_a_soft_body():
     assert found.misfit[found.best] < 2.0
 
 
+def test_two_cameras_may_have_different_points():
+    rng = np.random.default_rng(1)
+    films = []
+    for name, seen in (("front", slice(4)), ("top", slice(4, None))):
+        tracks = tracks_of(name, rng, known=False)
+        assert tracks.pixels is not None
+        pixels = np.array(tracks.pixels)[:, seen]
+        films.append(replace(tracks, names=tracks.names[seen], pixels=pixels, places_m=None))
+    guessed_at = Problem([swung(films)], {**FILMED, "young_pa": Unknown(1.5e5)}).collocation()
+    (placed,) = associated_at_guess(guessed_at).transcriptions
+    assert [len(each.names) for each in placed.residuals if each.names] == [4, 3]
+
+
 @pytest.mark.long
 def test_the_scan_of_the_video_example_finds_its_stiffness(tmp_path):
     file, *_ = create_problem(tmp_path / "bar", "video")

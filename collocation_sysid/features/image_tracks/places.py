@@ -551,6 +551,8 @@ def _enterable_faces(
         camera = replace(tracks.camera, pose=poses[tracks.name])
         firsts = dict(zip(tracks.names, tracks.is_seen.argmax(axis=0).tolist(), strict=True))
         samples = sorted({firsts[name] for name in names if name in firsts})
+        if not samples:  # another camera may have other points
+            continue
         t_s = tracks.sample_times_s[samples]
         corners = shapes_at(t_s)[:, surface]
         eyes = camera.pose_at(t_s)[1]
