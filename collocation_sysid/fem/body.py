@@ -35,7 +35,7 @@ from ..errors import InputError
 from .air import placed_unit_drag
 from .discretisation import Discretisation
 from .elements import ROD, element_named
-from .laws.constants import DENSITY, Constant
+from .laws.constants import DENSITY, NATURAL_STRAINS, Constant
 from .laws.fibres import Fibres
 from .laws.materials import DampingLaw, Energy, Material, Prony
 from .laws.memory import MemoryInput
@@ -386,6 +386,12 @@ class Body(Discretisation):
         geometry = self.geometry.copy()
         geometry[..., -1] *= factor**2
         return self.with_parts(tuple(parts))._with_geometry(geometry)
+
+    @cached_property
+    def natural_strain_indices(self) -> list[int]:
+        """Indices in θ of the natural curvatures and twists."""
+        names = {constant.name for constant in NATURAL_STRAINS}
+        return [k for k, name in enumerate(self.constants) if name.split(".")[-1] in names]
 
     def with_natural_curvature(self, strains_1_m: Array) -> Body | None:
         """Return a copy of this rod whose stress-free shape has a further natural curvature and

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
-from ..common.time_dependence import PARTS_OVER_TIME
+from ..common.time_dependence import PARTS_OVER_TIME, scale_loads
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.laws.memory import MemoryInput
 from ..fem.pattern import JointPattern, SymmetricPattern
@@ -116,6 +116,16 @@ class Forces:
         """
         known = np.array(theta, dtype=float)
         return replace(self, theta=known, weight=self.weight.with_theta(known))
+
+    def at_share(self, share: float) -> Forces:
+        """Return these forces with the loads and natural strains multiplied by a share."""
+        loaded = scale_loads(self, share)
+        places = self.body.natural_strain_indices
+        if not places:
+            return loaded
+        theta = self.theta.copy()
+        theta[places] *= share
+        return replace(loaded, theta=theta)
 
     @property
     def body(self) -> Body:

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...common.step_counting import report_state
-from ...common.time_dependence import scale_loads
 from ...model.forces import Forces
 from ...model.viscoelasticity import with_start_memory
 from ...recording.experiment import Experiment
@@ -41,10 +40,10 @@ def equilibrium(
     prescribed.
 
     Newton's method starts from the undeformed body in its grasps, or from `start`; in a body of
-    elements with mean dilatation its steps follow the loads, see `load_steps`. If it fails, load
-    and relative displacements of the grasps are applied in increments, and obstacles approach from
-    where they do not touch the body. A body with memory has relaxed, or has been loaded for as long
-    as the experiment states.
+    elements with mean dilatation its steps follow the loads, see `load_steps`. If it fails, load,
+    natural strains and relative displacements of the grasps are applied in increments, and
+    obstacles approach from where they do not touch the body. A body with memory has relaxed, or has
+    been loaded for as long as the experiment states.
 
     Parameters
     ----------
@@ -88,7 +87,7 @@ def _solve_equilibrium(
     separate = _with_separate_obstacles(forces, shape)
 
     def equations(share: float) -> tuple[Residual, Linearise]:
-        return static_equations(scale_loads(forces, share), share, free=solver.free)
+        return static_equations(forces.at_share(share), share, free=solver.free)
 
     guess = start
     if start is None and experiment.obstacles:

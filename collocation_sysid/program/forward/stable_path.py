@@ -16,7 +16,6 @@ import numpy as np
 from scipy.sparse.linalg import ArpackError
 
 from ...common.array_types import Array
-from ...common.time_dependence import scale_loads
 from ...model.dynamics import Dynamics
 from ...model.forces import Forces
 from ...model.internal_variables import advance_states
@@ -128,8 +127,7 @@ def _first_equations(
     shape = experiment.rigid_positions([time_s])[0]
 
     def at(share: float) -> tuple[Residual, Linearise, Array]:
-        scaled = scale_loads(forces, share)
-        residual, linearise = static_equations(scaled, share, free=solver.free)
+        residual, linearise = static_equations(forces.at_share(share), share, free=solver.free)
         goal = (
             goal_m
             if share == 1
