@@ -115,8 +115,7 @@ def clamped(body: Body, *tip_force_n: float, **changes) -> Experiment:
     first, last = ends(body)
     settings = {"gravity_m_s2": NO_GRAVITY, "nuisance": IDEAL} | changes
     forces = (Force(last, np.array(tip_force_n)),) if tip_force_n else ()
-    middle = centres(body.nodes_m)[len(body.nodes_m) // 6]
-    markers = point_markers(body, middle[None], t_s)
+    markers = point_markers(body, body.nodes_m[-1:], t_s)
     grasps = settings.pop("grasps", [Grasp(first, PoseSequence.fixed())])
     return Experiment(body, t_s, grasps, markers, forces=forces, **settings)
 
@@ -128,21 +127,21 @@ def rest_shape_under(experiment: Experiment, **constants: float) -> Array:
 
 
 def relaxed(
-    body: Body, x: Array, free: NDArray[np.int64], **constants: float
+    body: Body, x: Array, free: NDArray[np.int64], neutral_n_m: float = 0.0, **constants: float
 ) -> tuple[Array, Array]:
     """Equilibrium without loads (n, 3) near x, stable or not, and the eigenvalues of its stiffness.
 
-    Neutral directions are left out of the steps.
+    Directions with an eigenvalue up to `neutral_n_m` are left out of the steps.
     """
     place = x.ravel().copy()
     for _ in range(30):
         force = body.elastic_force(place.reshape(-1, 3), **constants).ravel()[free]
         stiffness = body.stiffness(place.reshape(-1, 3), **constants).toarray()[np.ix_(free, free)]
         values, vectors = np.linalg.eigh(stiffness)
-        moving = np.abs(values) > 1e-10 * values[-1]
+        moving = np.abs(values) > neutral_n_m
         step = vectors[:, moving] @ ((vectors.T @ force)[moving] / values[moving])
         place[free] += step
-        if np.abs(step).max() < 1e-11:
+        if np.abs(step).max() < 1e-9:
             return place.reshape(-1, 3), values
     raise AssertionError("Newton's method did not converge")
 
