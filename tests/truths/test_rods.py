@@ -28,8 +28,11 @@ from kit.rods import (
 )
 from scipy.spatial.transform import Rotation
 
+import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.rods import CrossSection, rod_mesh
+from collocation_sysid.model.forces import Forces
+from collocation_sysid.program.modes.natural import natural_modes
 
 G_M_S2 = 9.81
 DOWN = (0.0, 0.0, -G_M_S2)
@@ -273,3 +276,25 @@ def test_a_discrete_elastic_rod_takes_the_same_shape_in_space(ratio):
     x = centres(rest_shape_under(hanging, **constants))
     assert np.abs(reference[-1] - [1.0, 0.0, 0.0]).min() > 0.05
     np.testing.assert_allclose(x[-1], reference[-1], atol=3e-3)
+
+
+@pytest.mark.parametrize("is_held", [True, False])
+def test_soft_modes_of_a_thin_rod_are_no_rigid_motions(is_held):
+    """The stiffness of the sections is 10¹³ times that of the first mode."""
+    mesh = rod_mesh([[0, 0, 0], [1.0, 0, 0]], THIN, 41)
+    body = cs.Body(mesh, "cable", density_kg_m3=1200.0)
+    t_s = np.linspace(0.0, 1.0, 11)
+    markers = cs.Markers(t_s, np.zeros((11, 1, 3)), 1e-3, places_m=[[1.0, 0, 0]])
+    grasps = [cs.Grasp(np.arange(3), cs.PoseSequence.fixed())] if is_held else []
+    experiment = cs.Experiment(
+        body, t_s, grasps, markers, start="undeformed", air_density_kg_m3="none"
+    )
+    constants = {"bending_n_m2": 0.02, "torsion_n_m2": 0.015, "axial_n": 5e4}
+    theta = body.theta_from_values(constants | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
+    forces = Forces.from_experiment(experiment, 0.0, theta=theta)
+    free = np.arange(9 if is_held else 0, body.nodes_m.size)
+    modes = natural_modes(forces, body.nodes_m, free_dofs=free, count=4)
+    roots = np.repeat([1.8751, 4.6941] if is_held else [4.7300, 7.8532], 2)
+    expected_hz = np.sqrt(0.02 / body.mass_kg) * roots**2 / (2 * np.pi)
+    assert np.allclose(modes.frequencies_hz, expected_hz, rtol=0.003)
+    assert modes.omitted_count == (0 if is_held else 6)

@@ -54,7 +54,9 @@ class LaggedStress:
     velocity_slope: float = 0.0  # derivative of ν by ξ [1/s]
 
     def at(self, x: Array) -> Array:
-        """Return the mean stresses (E,) [Pa] at x (3n,) [m]."""
+        """Return the mean stresses (E,) [Pa] at x (3n,) [m]; zero for a rod, which has no volume."""
+        if self.forces.body.is_slender:
+            return np.zeros(len(self.forces.body.cells))
         return self.forces.mean_stresses(*self.states(x), self.velocity_slope)
 
     def after(self, x: Array, step: Array) -> Array:
@@ -78,6 +80,8 @@ class LaggedStress:
         """Return the linearisation at x (3n,) [m] with the mean stresses `stress_pa` (E,) in place
         of those of x in its derivative.
         """
+        if self.forces.body.is_slender:
+            return at
         (xi,), _ = self.states(x)
         change = self.weight * self.forces.body.volume_stiffness(xi, stress_pa - self.at(x))
         spread = self.forces.joint_pattern.expand(change[None])[0]
