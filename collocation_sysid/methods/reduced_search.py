@@ -97,7 +97,7 @@ FINAL_ACCURACY_SHARE = 0.1
 REREADINGS = 40
 # Largest number of feasibility steps after a step of a slender body, which end at a share of an edge.
 CORRECTIONS = 8
-CORRECTED = 1e-8
+CORRECTED = 1e-11
 DIVERGENCE = 4.0
 # Larger than any loss.
 UNLIMITED = 1e100
@@ -563,7 +563,6 @@ class ReducedSearch:
         for _ in range(CORRECTIONS):
             if not trial.feasibility_m > CORRECTED * self.size_m:
                 break
-            self.sweeps += 1
             corrected = horizon.evaluate_step(trial.p, trial, step=np.zeros(len(trial.p)))
             if not corrected.feasibility_m <= DIVERGENCE * trial.feasibility_m:
                 break

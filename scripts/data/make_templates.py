@@ -166,7 +166,8 @@ def cable(folder: Path) -> None:
     poses = PoseSequence(t_s, shift_m, np.tile([0.0, 0, 0, 1], (len(t_s), 1)))
     write_poses_csv(folder / "poses.csv", poses)
     stated = {**CABLE, "torsion_n_m2": 3e-4, "axial_n": 200.0}
-    problem = Problem.read(folder / "problem.toml", simulation=True)
+    finer = ["object.sections=81"]  # the data of a real cable have no error of a mesh
+    problem = Problem.read(folder / "problem.toml", finer, simulation=True)
     motion = simulate(problem.experiments[0], stated)
     rng = np.random.default_rng(CABLE_SEED)
     tracks_m = motion.markers_m + rng.normal(scale=5e-4, size=motion.markers_m.shape)
