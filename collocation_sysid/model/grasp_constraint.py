@@ -1,8 +1,8 @@
 """Prescribed displacements of grasped nodes, as a function of the nuisance parameters φ.
 
-A grasped node is at U_t H(φ) X, along the held axes, with the pose U_t of the gripper and the
-motion H of the body in its grasp (see `nuisance_map`). A node of an obstacle's frame is at U_t X,
-displaced to first order by the nuisance parameters of the obstacle.
+A grasped node is at U_t H(φ) C(φ) X, along the held axes, with the pose U_t of the gripper, the
+motion H of the body in its grasp, and the turn C of a clamp (see `nuisance_map`). A node of an
+obstacle's frame is at U_t X, displaced to first order by the nuisance parameters of the obstacle.
 """
 
 from __future__ import annotations
@@ -74,12 +74,12 @@ class GraspConstraint:
         """Return for each grasped dof the displaced place of its node (g, 3) [m], in the frame of
         its grasp, and the derivatives (g, 3, m) by the m φ of the motion.
 
-        It is H X with the hand–eye transform H for a node of the body. A node of an obstacle's
-        frame is at X, displaced to first order by offset and tilt of the obstacle; the delay of an
-        obstacle and the zeros of displacements are not included.
+        It is H C X with the hand–eye transform H and the turn C of its grasp for a node of the body.
+        A node of an obstacle's frame is at X, displaced to first order by offset and tilt of the
+        obstacle; the delay of an obstacle and the zeros of displacements are not included.
         """
         places, by_own = self.nuisance.grasp_motion.evaluate_with_jacobian(
-            self._phi_of_grasps(phi), self._find_points()
+            self._phi_of_grasps(phi), self._motion_data
         )
         places[:, ~self._is_body_node] = self._find_points()[:, ~self._is_body_node]
         by_own[..., ~self._is_body_node] = 0
@@ -111,7 +111,7 @@ class GraspConstraint:
         node_weights[~self._is_body_node] = 0.0
         hessian = np.zeros((len(self.nuisance.motion_indices),) * 2)
         second = self.nuisance.grasp_motion.weighted_hessian(
-            self._phi_of_grasps(phi), self._find_points(), weights=node_weights.T
+            self._phi_of_grasps(phi), self._motion_data, weights=node_weights.T
         )
         hessian[np.ix_(self._find_columns(), self._find_columns())] = second.sum(axis=2)
         return hessian
@@ -123,6 +123,17 @@ class GraspConstraint:
     def _find_points(self) -> Array:
         """Return the undeformed positions X (3, nodes) of the grasped nodes [m]."""
         return self.experiment.body.nodes_m[self._nodes[0]].T
+
+    @cached_property
+    def _motion_data(self) -> Array:
+        """Data (3 + G, nodes) of the motion of the grasped nodes, each of the first grasp with it."""
+        data = self.nuisance.grasp_motion_data(self._find_points())
+        is_other = np.ones(data.shape[1], dtype=bool)
+        for number, grasp in enumerate(self.experiment.body_grasps):
+            own = np.isin(self._nodes[0], grasp.nodes) & is_other
+            data[3 + number, own] = 1.0
+            is_other &= ~own
+        return data
 
     @cached_property
     def _direct_derivatives(self) -> Array:
@@ -192,7 +203,7 @@ class GraspConstraint:
     @cached_property
     def pose_rows(self) -> tuple[Array, Array]:
         """Row of the pose U_t for each of the g grasped dofs: rotation (N, g, 3) and shift (N, g)
-        [m], so that the position is rotation · H X + shift; NaN while the dof is free.
+        [m], so that the position is rotation · H C X + shift; NaN while the dof is free.
         """
         rotations, shifts_m = (
             np.full((len(self.t_s), len(self.dofs), *s), np.nan) for s in ((3,), ())

@@ -32,6 +32,7 @@ from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.loads import Force, LoadTime, PointMass
 from ..recording.nuisance import (
+    CLAMP_TURN,
     GRASP_SHIFT,
     GRASP_TURN,
     JOINING,
@@ -109,6 +110,7 @@ class NuisanceMap(RecordingQuantities):
     # linearly.
     step_limits: Array
     grasp_pivot_m: Array  # (3,): pivot c_h of the motion of the body in its grasp
+    grasp_middles_m: Array  # (G, 3): middle of the nodes of each grasp that is not an obstacle
     # (A, 3): factor f, loss b and logarithm of the lag over the stated lag of each tension and
     # pressure, as stated.
     declared_calibration: Array
@@ -157,6 +159,9 @@ class NuisanceMap(RecordingQuantities):
             grasp_pivot_m=body.nodes_m[grasped_nodes if len(grasped_nodes) else slice(None)].mean(
                 axis=0
             ),
+            grasp_middles_m=np.array(
+                [body.nodes_m[grasp.nodes].mean(axis=0) for grasp in experiment.body_grasps]
+            ).reshape(-1, 3),
             declared_calibration=np.array(
                 [a.make_calibration() for a in experiment.actuators]
             ).reshape(-1, 3),
@@ -368,12 +373,9 @@ class NuisanceMap(RecordingQuantities):
             In the order of the experiment's `grasps`; not modified.
         phi : (k,)
         """
-        motion = self.grasp_motion_matrix(phi)
-        return tuple(
-            self._with_grasp(k, grasp, motion=motion, phi=phi) for k, grasp in enumerate(grasps)
-        )
+        return tuple(self._with_grasp(k, grasp, phi=phi) for k, grasp in enumerate(grasps))
 
-    def _with_grasp(self, number: int, grasp: Grasp, motion: Array, phi: Array) -> Grasp:
+    def _with_grasp(self, number: int, grasp: Grasp, phi: Array) -> Grasp:
         """Return one grasp or obstacle at its pose at φ."""
         if isinstance(grasp, Obstacle):
             deviations: dict[Deviation, Array] = {}
@@ -389,6 +391,7 @@ class NuisanceMap(RecordingQuantities):
             zero_m[self.entries[place].axis] = phi[place] * self.scales[place]
         for place in self.strain_zero_indices:
             zero_m += phi[place] * self.scales[place] * self.strain_shifts_m[number]
+        motion = self.grasp_motion_matrix(phi, number)
         return replace(grasp, poses=grasp.poses.after(motion).with_shift(zero_m))
 
     def bounds(self, samples: int) -> tuple[Array, Array]:
@@ -460,17 +463,32 @@ class NuisanceMap(RecordingQuantities):
 
     @cached_property
     def grasp_indices(self) -> Index:
-        """Indices in φ of rotation and shift of the body in its grasp."""
-        return self.indices_of_rows(GRASP_TURN, GRASP_SHIFT)
+        """Indices in φ of rotation and shift of the body in its grasp, and of turned grasps."""
+        return self.indices_of_rows(GRASP_TURN, GRASP_SHIFT, CLAMP_TURN)
 
     @cached_property
     def grasp_motion(self) -> GeneratedFunction:
-        """Expression of H X for a point X, of the φ of `grasp_indices`."""
-        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), data_size=3)
+        """Expression of H C X for a point X, of the φ of `grasp_indices`; the data are X, then 1 for
+        the grasp that turns it by C, 0 for others.
+        """
+        size = 3 + len(self.grasp_middles_m)
+        return GeneratedFunction(self._displaced_point, len(self.grasp_indices), data_size=size)
 
-    def _displaced_point(self, phi: ca.SX, point: ca.SX) -> ca.SX:
-        """Return H X (3,) of a point X [m] as an expression of the φ of `grasp_indices`."""
+    def grasp_motion_data(self, points_m: Array, number: int | None = None) -> Array:
+        """Return the data of `grasp_motion` for points (3, n) of the grasp with an index."""
+        chosen = np.zeros((len(self.grasp_middles_m), points_m.shape[1]))
+        if number is not None:
+            chosen[number] = 1.0
+        return np.vstack([points_m, chosen])
+
+    def _displaced_point(self, phi: ca.SX, data: ca.SX) -> ca.SX:
+        """Return H C X (3,) of a point X [m] as an expression of the φ of `grasp_indices`."""
         values = self.values_by_row(phi, self.grasp_indices)
+        point, chosen = data[:3], data[3:]
+        if CLAMP_TURN in values:
+            middle = ca.DM(self.grasp_middles_m).T @ chosen
+            turn = ca.reshape(values[CLAMP_TURN], 3, -1) @ chosen
+            point = cayley_rotation(turn) @ (point - middle) + middle
         if GRASP_TURN in values:
             pivot = ca.DM(self.grasp_pivot_m)
             point = cayley_rotation(values[GRASP_TURN]) @ (point - pivot) + pivot
@@ -478,12 +496,14 @@ class NuisanceMap(RecordingQuantities):
             point = point + values[GRASP_SHIFT]
         return point
 
-    def grasp_motion_matrix(self, phi: Array) -> Array:
-        """Return the hand–eye transform H at φ (k,) as a matrix (4, 4), [[R, p], [0, 1]], with p in
-        metres; the identity if it is not estimated.
+    def grasp_motion_matrix(self, phi: Array, number: int | None = None) -> Array:
+        """Return the motion H C at φ (k,) of the grasp with an index, by default H alone, as a matrix
+        (4, 4), [[R, p], [0, 1]], with p in metres; the identity if it is not estimated.
         """
         points = np.hstack([np.zeros((3, 1)), np.eye(3)])
-        images = self.grasp_motion.evaluate(phi[self.grasp_indices], points)
+        images = self.grasp_motion.evaluate(
+            phi[self.grasp_indices], self.grasp_motion_data(points, number)
+        )
         matrix = np.eye(4)
         matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
         return matrix

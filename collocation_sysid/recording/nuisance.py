@@ -290,6 +290,21 @@ GRASP_SHIFT = Deviation(
     "markers",
     same=_hand_eye_sharing_key,
 )
+CLAMP_TURN = Deviation(
+    "clamp_turn_rad",
+    "rad",
+    sigma=None,
+    key="clamp_turn",
+    of="grasp",
+    axes="x y z",
+    changes=("grasps",),
+    by="worst",
+    label="turn of grasp {which}, {axis}",
+    sentence="rotation of a grasp: up to {size}",
+    description="a constant rotation of each grasp about the middle of its nodes, as of a clamp whose "
+    "direction was not measured",
+    same=_hand_eye_sharing_key,
+)
 STRAIN_ZERO = Deviation(
     "strain_zero",
     "1",

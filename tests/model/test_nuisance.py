@@ -12,6 +12,7 @@ from kit.problems import (
     GUESS,
     IDEAL,
     TRUTH,
+    bar_with_nuisance,
     cube_with_gaps,
     cube_with_nuisance,
     hung_cube,
@@ -44,6 +45,7 @@ ONE_OF_EACH = {
     "tilt": Nuisance.none(gravity_rad=0.05),
     "grasp-turn": Nuisance.none(hand_eye_rad=0.03),
     "grasp-shift": Nuisance.none(hand_eye_m=0.003),
+    "clamp-turn": Nuisance.none(clamp_turn_rad=0.03),
 }
 
 
@@ -81,6 +83,45 @@ def test_a_motion_in_the_grasp_is_a_body_held_elsewhere():
     expected = simulate(replace(plain, grasps=(moved,)), TRUTH, "midpoint", substeps=1).markers_m
     assert np.abs(expected - readings(cube, 0 * phi)).max() > 3e-3
     np.testing.assert_allclose(readings(cube, phi), expected, atol=1e-9)
+
+
+def test_each_clamp_turns_about_its_own_middle():
+    """The body of the estimate is that of grasps which are really turned, one about y, one about x."""
+    plain = bar_with_nuisance()
+    bar = replace(plain, nuisance=Nuisance.none(clamp_turn_rad=0.05))
+    turns = np.array([[0.0, 0.05, 0.0], [-0.1, 0.0, 0.0]])
+    nuisance = NuisanceMap.from_experiment(bar)
+    phi = np.zeros(nuisance.size)
+    phi[nuisance.grasp_indices] = np.ravel(turns) / nuisance.scales[nuisance.grasp_indices]
+    found = nuisance.with_grasps(bar.grasps, phi)
+    for grasp, moved, turn in zip(bar.grasps, found, turns, strict=True):
+        held_m = bar.body.nodes_m[grasp.nodes]
+        middle_m = held_m.mean(axis=0)
+        half = np.linalg.norm(turn) / 2  # Cayley: the tangent of half the angle
+        rotation = Rotation.from_rotvec(turn / (2 * half) * 2 * np.arctan(half))
+        expected_m = bar.body.nodes_m.copy()
+        expected_m[grasp.nodes] = middle_m + rotation.apply(held_m - middle_m)
+        np.testing.assert_allclose(
+            moved.positions_at(bar.body.nodes_m, bar.t_s),
+            grasp.positions_at(expected_m, bar.t_s),
+            atol=1e-12,
+        )
+
+
+def test_the_equations_have_the_derivatives_of_turned_clamps(rng):
+    bar = replace(
+        bar_with_nuisance(), nuisance=Nuisance.none(clamp_turn_rad=0.05, hand_eye_rad=0.02)
+    )
+    (transcription,) = alone(bar).transcriptions
+    constraint = transcription.prescribed_motion
+    phi = rng.uniform(-1, 1, transcription.nuisance.size)
+    slopes = constraint.evaluate_at(phi).by_phi
+    for column, k in enumerate(transcription.nuisance.motion_indices):
+        step = 1e-5 * np.eye(len(phi))[k]
+        up, down = (
+            np.nan_to_num(constraint.evaluate_at(phi + s).positions_m) for s in (step, -step)
+        )
+        np.testing.assert_allclose(slopes[:, :, column], (up - down) / 2e-5, atol=1e-8)
 
 
 def test_a_given_start_contains_the_place_in_the_grasp():
