@@ -129,7 +129,7 @@ ROD = Element(
     mass_shares=np.full(6, 1 / 6),
     meshio_type="wedge",
     columns=5,
-    rest_values=6,
+    rest_values=7,
 )
 
 

@@ -50,7 +50,8 @@ SECTION_STIFFNESS = 10.0
 _ANGLES = 2 * np.pi / 3 * np.arange(3)
 # Centre and directors of a section from its nodes: rows for r, h₁ d₁ and h₂ d₂.
 _DIRECTORS = np.stack([np.full(3, 1 / 3), 2 / 3 * np.cos(_ANGLES), 2 / 3 * np.sin(_ANGLES)])
-COLUMNS, STRAINS = ROD.columns, ROD.rest_values
+# Of the rest shape a point has half the length of its element, then the strains.
+COLUMNS, STRAINS = ROD.columns, ROD.rest_values - 1
 
 
 @dataclass(frozen=True)
@@ -300,8 +301,8 @@ def rod_mesh(
 def rod_geometry(
     points_m: Array, cells: Index, area_m2: float, straight_lengths_m: Array | None = None
 ) -> Array:
-    """Return the shape gradients of G, the strains at rest and the volume of each element
-    (E, 1, 6 · 5 + 6 + 1).
+    """Return the shape gradients of G, half the length, the strains at rest and the volume of each
+    element (E, 1, 6 · 5 + 1 + 6 + 1).
 
     Parameters
     ----------
@@ -331,7 +332,8 @@ def rod_geometry(
     if straight_lengths_m is not None:
         strains[:] = 0.0
     volumes = (area_m2 * lengths)[:, None]
-    return np.hstack([gradients.reshape(len(cells), -1), strains, volumes])[:, None]
+    halves = lengths[:, None] / 2
+    return np.hstack([gradients.reshape(len(cells), -1), halves, strains, volumes])[:, None]
 
 
 def midpoint_interpolation(s_m: Array) -> Array:
@@ -434,12 +436,12 @@ class RodMaterial(Material):
         return self.psi(F, values)
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
-        """Return the energy per volume [J/m³] at G (3, 5), from the constants, then the strains at
-        rest (6,) and the volume of the element.
+        """Return the energy per volume [J/m³] at G (3, 5), from the constants, then half the
+        length, the strains at rest (6,) and the volume of the element.
         """
         stiffness, strain = self._stiffness(values), self._strain(F, values)
         d1, d2, _, d1_slope, d2_slope = ca.horzsplit(F)
-        half = values[-1] / self.section.area_m2 / 2
+        half = values[len(self.constants)]  # not from the volume, by which stiffness is scaled
         energy = ca.dot(stiffness, strain**2) / 2
         for offset in (-half, half):
             first, second = d1 + offset * d1_slope, d2 + offset * d2_slope

@@ -1,0 +1,108 @@
+"""Loops of wire that hang between two clamps, drawn in a photograph.
+
+The drawn shapes are those of a plane chain of bars with springs between them: another model of the
+same wire, solved for the angles of the bars.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import collocation_sysid as cs
+from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.selection import Along
+
+BENDING_N_M2, MASS_PER_LENGTH_KG_M, LENGTH_M, BARS = 1e-3, 0.025, 1.2, 240
+GAP_M = np.array([-0.12, 0.0])
+OTHERS = {"torsion_n_m2": 1e-3, "axial_n": 100.0, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+
+
+def chain_loop(directions_rad: tuple[float, float], curvature_1_m: np.ndarray) -> np.ndarray:
+    """Ends of the bars (BARS + 1, 2) of a loop between clamps, in a plane with z up, with a natural
+    curvature (BARS + 1,) at the springs.
+    """
+    h = LENGTH_M / BARS
+    weight_n = MASS_PER_LENGTH_KG_M * 9.81 * h * (BARS - np.arange(BARS) - 0.5)
+    spring = np.full(BARS + 1, BENDING_N_M2 / h)
+    spring[[0, -1]] *= 2  # half a bar from the clamp
+    angles = np.linspace(*directions_rad, BARS + 2)[1:-1]
+    force_n = np.zeros(2)
+    for _ in range(400):
+        bend = np.diff(angles, prepend=directions_rad[0], append=directions_rad[1])
+        share = np.full(BARS + 1, h)
+        share[[0, -1]] /= 2
+        moment = spring * (bend - curvature_1_m * share)
+        c, s = np.cos(angles), np.sin(angles)
+        slope = moment[:-1] - moment[1:] + h * weight_n * c + h * (force_n @ [-s, c])
+        gap = h * np.array([c.sum(), s.sum()]) - GAP_M
+        matrix = np.diag(spring[:-1] + spring[1:] - h * weight_n * s - h * (force_n @ [c, s]))
+        matrix -= np.diag(spring[1:-1], 1) + np.diag(spring[1:-1], -1)
+        coupling = h * np.array([-s, c])
+        complete = np.block([[matrix, coupling.T], [coupling, np.zeros((2, 2))]])
+        step = np.linalg.solve(complete, -np.append(slope, gap))
+        share_of_step = min(1.0, 0.1 / np.abs(step[:BARS]).max())
+        angles, force_n = (
+            angles + share_of_step * step[:BARS],
+            force_n + share_of_step * step[BARS:],
+        )
+        if np.abs(step[:BARS]).max() < 1e-10:
+            break
+    bars = h * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.vstack([np.zeros(2), np.cumsum(bars, axis=0)])
+
+
+def in_space(plane_m: np.ndarray) -> np.ndarray:
+    return np.column_stack([plane_m[:, 0], np.zeros(len(plane_m)), plane_m[:, 1]])
+
+
+def drawn_problem(
+    loop_m: np.ndarray, parts: int, sigma_m: float, clamp_rad: float | None
+) -> cs.Problem:
+    """EI from the points (k, 3) of a drawing, without correspondence to places on the wire."""
+    mesh = cs.rod_mesh(
+        loop_m,
+        cs.CrossSection.round(0.003),
+        sections=61,
+        first_director=[0.0, 1.0, 0.0],
+        is_straight_at_rest=True,
+    )
+    cells = np.array_split(np.arange(len(mesh.tetrahedra)).reshape(-1, 3), parts) if parts else []
+    body = Body(
+        mesh,
+        "cable",
+        mass_kg=MASS_PER_LENGTH_KG_M * mesh.s_m[-1],
+        regions=[cs.Region(f"part{k}", each.ravel()) for k, each in enumerate(cells)],
+        natural_curvature=parts > 0,
+    )
+    still = np.eye(4)[None]
+    ends = (Along(0.0, 0.0), Along(mesh.s_m[-1], mesh.s_m[-1]))
+    drawn_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(loop_m, axis=0), axis=1)))
+    places = [mesh.place_m(s) for s in (drawn_m * mesh.s_m[-1] / drawn_m[-1])[1:-1]]
+    seen_m = loop_m[1:-1].copy()
+    seen_m[:, 1] = np.nan
+    markers = cs.Markers([0.0], seen_m[None], sigma_m, places_m=places, places_sigma_m=0.01)
+    experiment = cs.Experiment(
+        body,
+        [0.0],
+        [cs.Grasp(end, still) for end in ends],
+        markers,
+        kind="static",
+        name="loop",
+        nuisance=cs.Nuisance.none(clamp_turn_rad=clamp_rad),
+        air_density_kg_m3="none",
+    )
+    parameters = OTHERS | {"bending_n_m2": cs.Unknown(0.7e-3)}
+    for k in range(parts):
+        parameters |= {f"part{k}.curvature_2_1_m": 0.0, f"part{k}.twist_1_m": 0.0}
+        parameters[f"part{k}.curvature_1_1_m"] = cs.Unknown(0.0, prior=(0.0, 2.0))
+    return cs.Problem([experiment], parameters)
+
+
+def test_stiffness_factors_scale_the_energy_of_a_rod():
+    loop_m = in_space(chain_loop((-0.3, -6.0), np.zeros(BARS + 1)))[::6]
+    body = drawn_problem(loop_m, 0, 1e-3, None).bodies[0]
+    constants = OTHERS | {"bending_n_m2": BENDING_N_M2}
+    stiffer = body.with_stiffness_factors(np.full(len(body.cells), 1.3))
+    expected = 1.3 * body.energy(body.nodes_m, **constants)
+    assert stiffer.energy(body.nodes_m, **constants) == pytest.approx(expected, rel=1e-9)
