@@ -46,7 +46,7 @@ from .node_force import LocatedForce, NodeForce
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
-from .rods import RodMaterial, RodMesh, rod_law, rod_material
+from .rods import STRAINS, RodMaterial, RodMesh, rod_law, rod_material, strains_in_shape
 from .schemes import Scheme, as_scheme
 from .spatial_field import Field
 from .step_function import element_forces, step_function
@@ -401,6 +401,18 @@ class Body(Discretisation):
             return None
         geometry = self.geometry.copy()
         geometry[..., -4:-1] += strains_1_m
+        return self._with_geometry(geometry)
+
+    def partly_straightened(self, share: float) -> Body:
+        """Return a rod that is straight at rest with a share of the change of its rest shape from the
+        shape of its nodes, in which it has no stress at the share 0; other bodies as they are.
+        """
+        mesh = self.mesh
+        if share == 1 or not (isinstance(mesh, RodMesh) and mesh.is_straight_at_rest):
+            return self
+        geometry = self.geometry.copy()
+        strains = strains_in_shape(mesh.points_m, self.cells, geometry)
+        geometry[..., -1 - STRAINS : -1] += (1 - share) * strains
         return self._with_geometry(geometry)
 
     def _with_geometry(self, geometry: Array) -> Body:

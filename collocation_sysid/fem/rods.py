@@ -327,13 +327,25 @@ def rod_geometry(
         nodes = slice(3 * end, 3 * end + 3)
         gradients[:, nodes, :2] = own[:, end, 1:].swapaxes(1, 2) / 2
         gradients[:, nodes, 2:] = sign * own[:, end].swapaxes(1, 2) / lengths[:, None, None]
-    G = np.einsum("eai,eac->eic", points_m[cells], gradients)
-    strains = np.array([_STRAINS(each).full().ravel() for each in G]).reshape(-1, STRAINS)
-    if straight_lengths_m is not None:
-        strains[:] = 0.0
+    strains = np.zeros((len(cells), STRAINS))
+    if straight_lengths_m is None:
+        strains = _strains_of_shape(points_m[cells], gradients)
     volumes = (area_m2 * lengths)[:, None]
     halves = lengths[:, None] / 2
     return np.hstack([gradients.reshape(len(cells), -1), halves, strains, volumes])[:, None]
+
+
+def strains_in_shape(points_m: Array, cells: Index, geometry: Array) -> Array:
+    """Return the strains (E, 1, 6) of nodes at positions (n, 3) [m], from nothing, by the shape
+    gradients of a geometry, see `rod_geometry`.
+    """
+    gradients = geometry[..., : 6 * COLUMNS].reshape(len(cells), -1, COLUMNS)
+    return _strains_of_shape(points_m[cells], gradients)[:, None]
+
+
+def _strains_of_shape(ends_m: Array, gradients: Array) -> Array:
+    G = np.einsum("eai,eac->eic", ends_m, gradients)
+    return np.array([_STRAINS(each).full().ravel() for each in G]).reshape(-1, STRAINS)
 
 
 def midpoint_interpolation(s_m: Array) -> Array:

@@ -118,8 +118,11 @@ class Forces:
         return replace(self, theta=known, weight=self.weight.with_theta(known))
 
     def at_share(self, share: float) -> Forces:
-        """Return these forces with the loads and natural strains multiplied by a share."""
-        loaded = scale_loads(self, share)
+        """Return these forces with the loads and natural strains multiplied by a share, and a rod
+        straightened by this share.
+        """
+        body = self.body.partly_straightened(share)
+        loaded = scale_loads(replace(self, weight=replace(self.weight, body=body)), share)
         places = self.body.natural_strain_indices
         if not places:
             return loaded

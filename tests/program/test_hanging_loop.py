@@ -99,6 +99,18 @@ def drawn_problem(
     return cs.Problem([experiment], parameters)
 
 
+@pytest.mark.parametrize("stretch", [1.0, 1.3])
+def test_a_straight_wire_finds_its_equilibrium_from_a_drawn_loop(stretch):
+    """Also from a drawing that is far from the equilibrium."""
+    loop_m = in_space(chain_loop((-0.3, -6.0), np.zeros(BARS + 1)))[::6]
+    drawn_m = loop_m * [stretch, 1.0, 1 / stretch]
+    drawn_m[:, 0] += (loop_m[-1, 0] - drawn_m[-1, 0]) * np.linspace(0, 1, len(loop_m))
+    (experiment,) = drawn_problem(drawn_m, 0, 1e-3, None).experiments
+    shape_m = cs.simulate(experiment, OTHERS | {"bending_n_m2": BENDING_N_M2}).markers_m[0]
+    away_m = np.abs(shape_m - loop_m[1:-1]).max()
+    assert away_m < 2e-3 if stretch == 1 else np.abs(shape_m[:, 1]).max() < 1e-9
+
+
 def test_stiffness_factors_scale_the_energy_of_a_rod():
     loop_m = in_space(chain_loop((-0.3, -6.0), np.zeros(BARS + 1)))[::6]
     body = drawn_problem(loop_m, 0, 1e-3, None).bodies[0]
@@ -106,3 +118,8 @@ def test_stiffness_factors_scale_the_energy_of_a_rod():
     stiffer = body.with_stiffness_factors(np.full(len(body.cells), 1.3))
     expected = 1.3 * body.energy(body.nodes_m, **constants)
     assert stiffer.energy(body.nodes_m, **constants) == pytest.approx(expected, rel=1e-9)
+
+
+def test_uniform_natural_curvature_does_not_change_a_loop_between_clamps():
+    straight, curved = (chain_loop((-0.3, -6.0), np.full(BARS + 1, each)) for each in (0.0, -6.0))
+    np.testing.assert_allclose(curved, straight, atol=1e-8)
