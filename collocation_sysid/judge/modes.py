@@ -106,8 +106,8 @@ def _rigid_axes(experiment: Experiment) -> Iterator[Hypothesis]:
         distances_m = np.linalg.norm(tracks_m - places_m, axis=2)
         return float(np.hypot(np.nanmedian(distances_m), DEFORMED * size_m))
 
-    if markers.sample_count:
-        tracks_m = markers.positions_at_samples_m
+    tracks_m = markers.positions_at_samples_m if markers.sample_count else np.empty((0, 0, 3))
+    if np.isfinite(tracks_m).all(axis=2).any():  # not where one coordinate was never measured
         rows = _axes(f"'{experiment.name}'", tracks_m)
         yield from accepted(rows, tracks_m, remaining_misfit)
 

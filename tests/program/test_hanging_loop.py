@@ -12,6 +12,7 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.selection import Along
+from collocation_sysid.judge.modes import find_misspecifications_by_modes
 
 BENDING_N_M2, MASS_PER_LENGTH_KG_M, LENGTH_M, BARS = 1e-3, 0.025, 1.2, 240
 GAP_M = np.array([-0.12, 0.0])
@@ -120,6 +121,31 @@ def test_stiffness_factors_scale_the_energy_of_a_rod():
     assert stiffer.energy(body.nodes_m, **constants) == pytest.approx(expected, rel=1e-9)
 
 
+def test_a_photograph_without_depth_is_judged():
+    loop_m = in_space(chain_loop((-0.3, -6.0), np.zeros(BARS + 1)))[::6]
+    (experiment,) = drawn_problem(loop_m, 0, 1e-3, None).experiments
+    constants = OTHERS | {"bending_n_m2": BENDING_N_M2}
+    assert find_misspecifications_by_modes(experiment, constants) == ()
+
+
 def test_uniform_natural_curvature_does_not_change_a_loop_between_clamps():
     straight, curved = (chain_loop((-0.3, -6.0), np.full(BARS + 1, each)) for each in (0.0, -6.0))
     np.testing.assert_allclose(curved, straight, atol=1e-8)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_bending_stiffness_is_in_its_interval_with_unknown_curvature_and_clamps(seed):
+    rng = np.random.default_rng(seed)
+    s = np.linspace(0, 1, BARS + 1)
+    waves = np.array([np.cos(np.pi * k * s) for k in range(1, 6)])
+    curvature = -6.0 + rng.normal(0, 1.0, 5) @ waves
+    plane_m = chain_loop((-0.3 + rng.normal(0, 0.2), -6.0 + rng.normal(0, 0.2)), curvature)
+    places = np.clip(np.linspace(0, BARS, 41) + rng.normal(0, 1.0, 41), 0, BARS)
+    places[[0, -1]] = 0, BARS
+    drawn_m = np.array([np.interp(places, np.arange(BARS + 1), each) for each in plane_m.T]).T
+    drawn_m[1:-1] += rng.normal(0, 1e-3, (39, 2))
+    run = cs.run(drawn_problem(in_space(drawn_m), 10, 1e-3, 0.5))
+    low, high = run.interval("bending_n_m2")
+    assert low <= BENDING_N_M2 <= high
+    assert high < 10 * low
