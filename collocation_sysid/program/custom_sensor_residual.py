@@ -123,11 +123,16 @@ class CustomSensorResidual(MeasurementResidual):
         """Indices (S, P) or (1, P) of the observable's vectors on which each sample depends."""
         return np.arange(self.observable.vector_count)[None]
 
+    @property
+    def at_s(self) -> Array:
+        """Times (S,) [s] around which each sample is computed; here those of the samples."""
+        return self.t_s
+
     @cached_property
     def _times(self) -> NDArray[np.int64]:
         """Indices (S, k) of the observable's times from which each sample is computed."""
         used = min(STATIC_NEIGHBOURS if self.is_static else NEIGHBOURS, len(self.observable_s))
-        return neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used)
+        return neighbouring_times(self.observable_s, self.at_s + TIME_TOLERANCE_S, count=used)
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -176,7 +181,7 @@ class CustomSensorResidual(MeasurementResidual):
 
     def predict_motion(self, motion: ObservedMotion, phi: Array) -> Array:
         predicted = super().predict_motion(motion, phi)
-        return np.where(is_within(self.t_s, self.observable_s)[:, None, None], predicted, np.nan)
+        return np.where(is_within(self.at_s, self.observable_s)[:, None, None], predicted, np.nan)
 
     def numbers(self, predicted: Array) -> Array:
         return super().numbers(predicted)[:, : self.sensor.measured_values.shape[1]]
@@ -190,11 +195,15 @@ class CorrespondingSensorResidual(CustomSensorResidual, CorrespondenceResidual):
     def first_row(self) -> int:
         return int(self._times[0, -1])
 
-    def _shapes(self, x: Array) -> Array:
-        """Return the nodes (s, n, 3) [m] at those first samples that rows x (rows, 3n) reach."""
+    def _shapes(self, x: Array, at_s: Array | None = None) -> Array:
+        """Return the nodes (s, n, 3) [m] at those first samples that rows x (rows, 3n) reach, or at
+        times near `at_s`.
+        """
         known = int(np.count_nonzero(self._times[:, -1] < len(x)))
         nodes_m = x.reshape(len(x), -1, 3)
-        distances_s = self.observable_s[self._times] - self.t_s[:, None]
+        distances_s = (
+            self.observable_s[self._times] - (self.at_s if at_s is None else at_s)[:, None]
+        )
         shapes = [
             np.tensordot(lagrange_weights(0.0, late_s.tolist()), nodes_m[times], 1)
             for times, late_s in zip(self._times[:known], distances_s[:known], strict=True)

@@ -26,6 +26,7 @@ from kit.filmed import (
     tracks_of,
     unknown_young,
 )
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
@@ -176,8 +177,6 @@ def test_the_estimated_pose_shows_points_at_their_predictions() -> None:
 def test_a_late_clock_is_estimated() -> None:
     pixels = projected(filming("front"), motion_m())
     # The images of a camera that is 6 ms late show the motion 6 ms later.
-    from scipy.interpolate import CubicSpline
-
     late = CubicSpline(T_S, pixels)(T_S + 0.006)
     rng = np.random.default_rng(5)
     late = late + NOISE_PX * rng.normal(size=late.shape)
@@ -185,6 +184,27 @@ def test_a_late_clock_is_estimated() -> None:
     solution = solved(tracks)
     assert abs(solution.nuisance("delay_s") - 0.006) < 5e-4
     assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.01
+
+
+def test_a_delay_does_not_extrapolate_between_fine_time_steps() -> None:
+    delay_s = 0.02
+    tracks = replace(tracks_of(**EXACT), clock_sigma_s=delay_s)
+    program = cs.Problem([swung([tracks])], parameters=unknown_young(), substeps=8).collocation()
+    fine_s = np.linspace(T_S[0], T_S[-1], 8 * (len(T_S) - 1) + 1)
+    nodes_m = CubicSpline(T_S, simulated_m())(fine_s)
+    nodes_m += 1e-5 * np.random.default_rng(4).normal(size=nodes_m.shape)
+    p = program.guess_p
+    p[program.parameter_names.index("swing: delay of front [s]")] = 1.0
+    program, p = program.follow_estimates(p, [nodes_m])
+    part = program.transcriptions[0]
+    (residual,) = part.residuals_of(ImageTrackResidual)
+    phi = p[part.nuisance_indices.indices]
+    values = residual.observable.evaluate_positions(nodes_m, phi)
+    predicted = residual.numbers(residual.predict(values, phi)).reshape(-1, len(NAMES), 2)
+    expected = CubicSpline(T_S, projected(filming("front"), motion_m()))(T_S + delay_s)
+    within = T_S + delay_s <= T_S[-1]
+    assert np.isnan(predicted[~within]).all()
+    assert np.nanmax(np.abs(predicted - expected)[within]) < 0.1
 
 
 def test_a_clock_of_markers_needs_no_markers() -> None:

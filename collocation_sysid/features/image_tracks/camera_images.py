@@ -7,9 +7,9 @@ does so, and otherwise considered in the budget and tested, see the rows `IMAGE_
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -19,6 +19,8 @@ from ...common.checked_arrays import read_only_floats, unconverted
 from ...common.declarations import declaration, key
 from ...common.validated_types import NotNegative
 from ...errors import InputError
+from ...program.association import SAMPLES_OFF
+from ...program.correspondences import Correspondences
 from ...program.custom_sensor_residual import CorrespondingSensorResidual
 from ...program.measurement_residual import GROUP, lagrange_weights
 from ...recording.camera import Camera
@@ -174,6 +176,14 @@ class CameraImages(CustomSensor):
         row, axis = CAMERA_UNKNOWNS[name]
         return f"{row.label.format(which=self.camera_name, axis=axis)} [{row.unit}]"
 
+    def exposed_s(self, errors: Mapping[str, float]) -> Array:
+        """Return when the middle row of each image was exposed [s], with errors of the camera."""
+        row = self.camera.require_matrix()[1, 2]
+        line_s = self.line_delay_s + errors.get("line_delay_error_s", 0.0)
+        t_s = self.sample_times_s
+        late_s = errors.get("delay_s", 0.0) + errors.get("clock_rate", 0.0) * (t_s - t_s[0])
+        return t_s + late_s + line_s * row
+
     def camera_rows(
         self, experiment: Experiment, reach: float
     ) -> Iterator[tuple[Deviation, str, float]]:
@@ -184,12 +194,43 @@ class CameraImages(CustomSensor):
             yield replace(CAMERA_UNKNOWNS[name][0], reach=reach), self.unknown_label(name), sigma
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImageCorrespondences(Correspondences):
+    """Correspondences in the images of one camera."""
+
+    # Errors of the camera with which the grid times around each image were chosen: another delay
+    # would extrapolate the motion.
+    clock: Mapping[str, float] = field(default_factory=dict)
+
+
+C = TypeVar("C", bound=ImageCorrespondences)
+
+
 @dataclass(frozen=True, eq=False)
 class CameraImagesResidual(CorrespondingSensorResidual):
     """Residual of points in the images of one camera."""
 
     sensor: CameraImages
     experiment: Experiment
+    correspondences: ImageCorrespondences
+
+    @property
+    def at_s(self) -> Array:
+        return self.sensor.exposed_s(self.correspondences.clock)
+
+    def errors_at(self, phi: Array) -> dict[str, float]:
+        """Return the errors of the camera that are estimated at φ (k,), by name."""
+        values = (phi * self.nuisance.scales)[self.own_parameters[0]].tolist()
+        names = self.sensor.camera_unknowns(self.experiment)
+        return dict(zip(names, values, strict=False))
+
+    def with_clock(self, found: C, errors: dict[str, float]) -> C:
+        """Return correspondences with other errors of the camera if the images have left the grid
+        times around them.
+        """
+        off_s = np.abs(self.sensor.exposed_s(errors) - self.sensor.exposed_s(found.clock)).max()
+        is_near = off_s <= SAMPLES_OFF * np.diff(self.observable_s).max(initial=0.0)
+        return found if is_near else replace(found, clock=errors)
 
     def position_sigmas_m(self, points_m: Array, translations_m: Array, sigmas: Array) -> Array:
         """Return the standard deviations (3P,) of the positions of points (P, 3) as one pixel

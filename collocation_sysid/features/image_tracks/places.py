@@ -29,7 +29,7 @@ from ...recording.placement import (
     barycentric_in_triangles,
     nearest_points_of_triangles,
 )
-from .camera_images import POSE_UNKNOWNS
+from .camera_images import POSE_UNKNOWNS, ImageCorrespondences
 from .rays import (
     FEWEST_POINTS,
     cross,
@@ -303,7 +303,7 @@ class _FirstImages:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedPlaces(Correspondences):
+class TrackedPlaces(ImageCorrespondences):
     """Places of the points of one camera, its pose, and which points are compared."""
 
     is_labelled = True

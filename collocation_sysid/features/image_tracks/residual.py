@@ -103,11 +103,8 @@ class ImageTrackResidual(CameraImagesResidual):
         """Return the contour of the body in the image with index k, as pixels (P, 2) of pieces of
         lines with NaN after each, at rows x (rows, 3n) and φ (k,); hidden pieces are contained.
         """
-        names = list(self.sensor.camera_unknowns(self.experiment))
-        values = (phi * self.nuisance.scales)[self.own_parameters[0]].tolist()
-        errors = dict(zip(names, values, strict=False))
-        since_s = self.t_s[k] - self.t_s[0]
-        at_s = self.t_s[k] + errors.get("delay_s", 0.0) + errors.get("clock_rate", 0.0) * since_s
+        errors = self.errors_at(phi)
+        at_s = self.sensor.exposed_s(errors)[k]
         times = self.observable_s[: len(x)]
         after = int(np.clip(np.searchsorted(times, at_s), 1, max(len(times) - 1, 1)))
         before, after = after - 1, min(after, len(times) - 1)
@@ -150,7 +147,8 @@ class ImageTrackResidual(CameraImagesResidual):
     # Correspondences --------------------------------------------------------------------------
 
     def reassociated(self, x: Array, phi: Array) -> TrackedPlaces:
-        return self.correspondences.followed(phi, self._shapes(x))
+        found = self.correspondences.followed(phi, self._shapes(x))
+        return self.with_clock(found, self.errors_at(phi))
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
@@ -237,12 +235,11 @@ class ImageTracksModel(CorrespondenceModel):
             pose_parameters=self._pose_parameters,
         )
         count = len(tracks.names)
-        at_s = tracks.sample_times_s
-        measured = np.full((len(at_s), count, GROUP), np.nan)
+        measured = np.full((len(tracks.sample_times_s), count, GROUP), np.nan)
         if tracks.pixels is not None:
             measured[..., :2] = tracks.pixels
         seen = tracks.is_seen & places.is_visible & places.is_placed
-        seen &= is_within(at_s, grid.t_s)[:, None]
+        seen &= is_within(tracks.exposed_s(places.clock), grid.t_s)[:, None]
         return self.image_residual(
             ImageTrackResidual,
             observable=PointPositions(

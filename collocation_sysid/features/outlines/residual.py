@@ -28,10 +28,10 @@ from ...program.depth.outline import BODY, EMPTY, UNKNOWN, OutlineView, image_ed
 from ...program.depth.visible_surface import VisibleSurface
 from ...program.following_sensor import all_nodes
 from ...program.measurement_model import CorrespondenceModel
-from ...program.measurement_residual import RowStencil, SampledMotion, lagrange_weights
+from ...program.measurement_residual import RowStencil, SampledMotion
 from ...program.observables import PointPositions
 from ...recording.experiment import Experiment
-from ..image_tracks.camera_images import POSE_UNKNOWNS, CameraImagesResidual
+from ..image_tracks.camera_images import POSE_UNKNOWNS, CameraImagesResidual, ImageCorrespondences
 from ..image_tracks.places import obstacle_distance
 from ..image_tracks.rays import is_behind
 from .outlines import EDGE, Outlines
@@ -46,7 +46,7 @@ OCCLUSION_EDGES = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class OutlinePairs(Correspondences):
+class OutlinePairs(ImageCorrespondences):
     """Points of the body's outline in S images, E each at most, and edges of the masks."""
 
     outlines: Outlines
@@ -248,44 +248,22 @@ class OutlinesResidual(CameraImagesResidual):
 
     # Correspondences --------------------------------------------------------------------------
 
-    def _errors(self, phi: Array) -> dict[str, float]:
-        places = self.own_parameters[0]
-        values = (phi * self.nuisance.scales)[places].tolist()
-        return dict(
-            zip([*self.sensor.camera_unknowns(self.experiment), EDGE], values, strict=False)
-        )
-
-    def _late_shapes(self, x: Array, errors: Mapping[str, float]) -> Array:
-        """Return nodes (s, n, 3) [m] when the middle row of each image was exposed."""
-        sensor = self.sensor
-        known = int(np.count_nonzero(self._times[:, -1] < len(x)))
-        nodes_m = x.reshape(len(x), -1, 3)
-        row = self.sensor.camera.require_matrix()[1, 2]
-        line_s = sensor.line_delay_s + errors.get("line_delay_error_s", 0.0)
-        shapes = []
-        for k in range(known):
-            since_s = self.t_s[k] - self.t_s[0]
-            late_s = errors.get("delay_s", 0.0) + errors.get("clock_rate", 0.0) * since_s
-            offsets_s = (self.observable_s[self._times[k]] - self.t_s[k]).tolist()
-            weights = lagrange_weights(late_s + line_s * row, offsets_s)
-            shapes.append(np.tensordot(weights, nodes_m[self._times[k]], 1))
-        return np.reshape(shapes, (known, *nodes_m.shape[1:]))
-
     def contours_px(self, x: Array, phi: Array) -> list[Array]:
         """Return the compared points of the contour (P, 2) [pixels] in each image that rows x (rows,
         3n) reach, at φ (k,).
         """
-        pairs, errors = self.correspondences, self._errors(phi)
+        pairs, errors = self.correspondences, self.errors_at(phi)
         contours = []
-        for k, shape_m in enumerate(self._late_shapes(x, errors)):
+        for k, shape_m in enumerate(self._shapes(x, self.sensor.exposed_s(errors))):
             used, view = pairs.is_compared[k], pairs._view(k, errors)
             at_m = np.einsum("pa,pai->pi", pairs.weights[k, used], shape_m[pairs.nodes[k, used]])
             contours.append(view.camera.distorted_pixels(view.to_camera_m(at_m)))
         return contours
 
     def reassociated(self, x: Array, phi: Array) -> OutlinePairs:
-        errors = self._errors(phi)
-        return self.correspondences.in_shapes(self._late_shapes(x, errors), errors)
+        errors = self.errors_at(phi)
+        shapes_m = self._shapes(x, self.sensor.exposed_s(errors))
+        return self.with_clock(self.correspondences.in_shapes(shapes_m, errors), errors)
 
     def aligned_correspondences(
         self, x: Array, phi: Array, only_pose: bool = False
@@ -293,23 +271,23 @@ class OutlinesResidual(CameraImagesResidual):
         """Use the last row if the first reach none; the present pairs with `only_pose`."""
         if only_pose:
             return self.correspondences
-        errors = self._errors(phi)
-        shapes_m = self._late_shapes(x, errors)
+        errors = self.errors_at(phi)
+        shapes_m = self._shapes(x, self.sensor.exposed_s(errors))
         if not len(shapes_m):
             shapes_m = x[-1:].reshape(1, -1, 3)
         return self.correspondences.in_shapes(shapes_m, errors)
 
     def correspondences_of(self, measured: Outlines, x: Array, phi: Array) -> OutlinePairs:
-        errors = self._errors(phi)
+        errors = self.errors_at(phi)
         own = replace(self.correspondences, outlines=measured)
-        return own.in_shapes(self._late_shapes(x, errors), errors)
+        return own.in_shapes(self._shapes(x, self.sensor.exposed_s(errors)), errors)
 
 
 def compared(pairs: OutlinePairs, at_s: Array) -> NDArray[np.bool_]:
     """Return the mask (S, E, 3) of the distances from an edge, which are the first of three numbers,
     in images within the times `at_s`.
     """
-    within = is_within(pairs.outlines.sample_times_s, at_s)
+    within = is_within(pairs.outlines.exposed_s(pairs.clock), at_s)
     is_used = pairs.is_compared & within[:, None]
     return np.stack([is_used, *[np.zeros_like(is_used)] * 2], axis=2)
 
