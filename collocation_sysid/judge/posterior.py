@@ -564,7 +564,7 @@ class Posterior:
         out.
         """
         fit = self.fit
-        before = least_squares_of_fit(fit).loss(self.step)
+        before = least_squares_of_fit(fit).loss(gauss_newton_step(fit))
         found = []
         for name in dict.fromkeys(others.names):
             own = others.only(k for k, each in enumerate(others.names) if each == name)

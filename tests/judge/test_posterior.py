@@ -200,6 +200,16 @@ def test_data_do_not_learn_the_part_of_a_mesh_error_that_is_a_change_of_constant
     np.testing.assert_allclose(joint.covariance[:3, 3], 0.5 * change, atol=1e-9)
 
 
+def test_an_error_of_the_mesh_does_not_make_other_effects_suspect(rng):
+    """What the correction for the mesh changes in the constants is no misfit of the data."""
+    by_parameters = slopes(rng, 4)
+    fit = linear_fit(by_parameters, rng.normal(size=len(by_parameters)))
+    by_constants = by_parameters[:, :1] + 0.01 * slopes(rng, 1)
+    found = posterior(fit, by_constants, "mesh", means=5.0)
+    for suspect in found.suspected(effects(slopes(rng, 1), "mass"), GIVEN):
+        assert suspect.surprise < 4
+
+
 @pytest.mark.long
 def test_intervals_hold_and_surprises_are_standard_normal_if_all_is_drawn_from_its_prior():
     rng = np.random.default_rng(11)
