@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from .extras.planning.folder import write_plan
     from .extras.planning.hand_limits import Limits
     from .extras.planning.motion_plan import MotionPlan, plan_motion
+    from .extras.planning.path_terms import PathCost, PathLimit, PathQuantities
     from .extras.planning.task import Task
     from .extras.studies.model_comparison import ModelComparison, compare_models
     from .features.image_tracks.tracks import ImageTracks, PoseSigma
@@ -138,6 +139,9 @@ __all__ = [
     "Outlines",
     "Parameter",
     "Parameters",
+    "PathCost",
+    "PathLimit",
+    "PathQuantities",
     "Penalty",
     "Placement",
     "Plane",

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -1973,7 +1975,9 @@ def test_an_execution_is_checked_and_identified_in_the_folder_of_a_plan(tmp_path
     record()
     good = solved("check.toml", "good")
     assert good["trust"]["verdict"] == "good", good["trust"]
-    record(mu_pa=120.0)
+    # All constants are fixed: what counts is that the motion misses the prediction by more than the
+    # factor 1.5 of the noise. A body of 60 Pa hangs 3 mm lower.
+    record(mu_pa=60.0)
     assert solved("check.toml", "other")["trust"]["verdict"] != "good"
     # The first recording of write_problem has other constants than its guesses.
     record(**TRUTH_OF_FILES)
@@ -1989,3 +1993,169 @@ def test_tasks_and_limits_show_their_keys_alone():
     assert [name for name in dir(cs.Limits) if name[0] != "_"] == ["bounds_from", "read"]
     assert inspect.signature(cs.Task).parameters["shortest"].default is False
     assert not {"model_dump", "copy", "json", "model_fields"} & set(dir(cs.Task))
+
+
+# Costs and limits that are functions --------------------------------------------------------------
+
+
+def tilt(at) -> ca.SX:
+    """Horizontal components of the direction from the upper to the lower one of two points."""
+    along = at.position_m[:, 1] - at.position_m[:, 0]
+    return along[:2] / ca.norm_2(along)
+
+
+UPRIGHT = cs.PathCost(tilt, 0.02, points_m=((0.01, 0.01, 0.03), (0.01, 0.01, 0.0)))
+# Of a liquid on the tip: the square of its acceleration.
+CALM = cs.PathLimit(lambda at: ca.sumsqr(at.acceleration_m_s2), upper=1.2**2)
+CORRIDOR = cs.PathLimit(lambda at: at.position_m[1], upper=0.018, lower=0.0)
+
+
+def away(**changes) -> Task:
+    """The tip moves by 40 mm in 0.5 s."""
+    reference = {"point": "tip", "t_s": [0.5], "position_m": [(0.03, 0.02, np.nan)]}
+    usual = {"duration_s": 0.5, "sample_s": 0.02, "hand": {"intervals": 8, "jerk_weight": 0.01}}
+    return Task(**{"reference": [reference | {"relative": True}]} | usual | changes)
+
+
+def bound(**terms) -> PlannedProgram:
+    return PlannedProgram.from_task(PlannedBody.read(hung_bar()), away(**terms), LIMITS)
+
+
+def test_derivatives_of_functions_of_the_motion_are_their_differences():
+    moving = cs.PathCost(
+        lambda at: (
+            at.t_s * at.hand_velocity_m_s[0] * at.position_m[2],
+            1e-3 * at.hand_acceleration_m_s2[1],
+        )
+    )
+    planned = bound(costs=[UPRIGHT, moving], limits=[CALM, CORRIDOR])
+    c = 0.05 * np.random.default_rng(0).normal(size=planned.space.size)
+    x = planned.simulate(c)
+    require_exact_derivatives(FullProgram(planned), c, x)
+
+
+def test_motion_in_a_function_is_that_of_points_and_hand():
+    seen = cs.PathCost(
+        lambda at: ca.vertcat(
+            at.t_s, at.hand_m, at.position_m, at.velocity_m_s, at.acceleration_m_s2
+        ),
+        1.0,
+    )
+    planned = bound(costs=[seen])
+    c = 0.05 * np.random.default_rng(0).normal(size=planned.space.size)
+    x, rows = planned.simulate(c), planned.sample_rows
+    values = planned.path_costs.evaluate(x) * np.sqrt(len(rows))
+    t_s = planned.grid_since_s
+    tip_m = x @ planned.point_weights("tip").toarray().T
+    assert values[0] == pytest.approx(t_s[rows])
+    hand_m = planned.frame.position_m + planned.coordinates(c, t_s[rows])[:, :3]
+    assert np.abs(values[1:4].T - hand_m).max() < 1e-12
+    assert np.abs(values[4:7].T - tip_m[rows]).max() < 1e-12
+    inside = slice(1, -1)
+    assert values[7:10].T[inside] == pytest.approx(np.gradient(tip_m, t_s, axis=0)[rows][inside])
+    second = np.diff(tip_m, 2, axis=0) / (t_s[1] - t_s[0]) ** 2
+    assert values[10:13].T[inside] == pytest.approx(second[rows[inside] - 1])
+
+
+def tip_of(plan: MotionPlan) -> np.ndarray:
+    return plan.answer.x @ plan.program.point_weights("tip").toarray().T
+
+
+@pytest.mark.long
+def test_a_tip_stays_upright():
+    free, kept = (plan_motion(hung_bar(), away(costs=costs), LIMITS) for costs in ([], [UPRIGHT]))
+    costs = bound(costs=[UPRIGHT]).path_costs
+    before, after = (np.sum(costs.evaluate(each.answer.x) ** 2) for each in (free, kept))
+    assert after < 0.5 * before
+    assert kept.answer.status in ("converged", "flat")
+
+
+@pytest.mark.long
+def test_a_corridor_is_kept():
+    way = {"point": "tip", "t_s": [0.25, 0.5], "relative": True,
+           "position_m": [(0.015, 0.02, np.nan), (0.03, 0.0, np.nan)]}  # fmt: skip
+    free, kept = (
+        plan_motion(hung_bar(), away(reference=[way], limits=each), LIMITS, solver="interior-point")
+        for each in ([], [CORRIDOR])
+    )
+    assert kept.is_complete
+    assert tip_of(free)[:, 1].max() > 0.02
+    assert 0.0177 < tip_of(kept)[:, 1].max() <= 0.018
+    assert not kept.exceeds_body_limits
+
+
+@pytest.mark.long
+def test_an_acceleration_is_limited():
+    free, kept = (
+        plan_motion(hung_bar(), away(limits=each), LIMITS, solver="interior-point")
+        for each in ([], [CALM])
+    )
+    assert kept.is_complete
+    of_free, of_kept = (
+        np.linalg.norm(np.diff(tip_of(each), 2, axis=0), axis=1).max() / 0.02**2
+        for each in (free, kept)
+    )
+    assert of_free > 1.5
+    assert 1.15 < of_kept <= 1.2
+    assert not kept.exceeds_body_limits
+
+
+def test_limits_that_are_functions_are_planned_by_ipopt_alone():
+    with pytest.raises(InputError, match=r'reduced-space cannot .* solver = "interior-point"'):
+        plan_motion(hung_bar(), away(limits=[CALM]), LIMITS)
+    stretched = away(limits=[CALM], avoid={"largest_stretch": 2.0})
+    with pytest.raises(InputError, match=r"avoid.*expected a task without limits of its own"):
+        plan_motion(hung_bar(), stretched, LIMITS, solver="interior-point")
+
+
+@pytest.mark.long
+def test_both_solvers_find_the_same_motion_with_costs_that_are_functions():
+    planned = bound(costs=[UPRIGHT])
+    reduced = solve_reduced(planned, tolerances=TIGHT)
+    assert reduced.status == "converged"
+    early = solve_reduced(planned, tolerances=replace(TIGHT, iterations=1))
+    full = solve_full(planned, early)
+    assert full.status == "converged"
+    assert planned.objective(full.c, full.x) == pytest.approx(reduced.history[-1], rel=1e-6)
+    assert np.abs(full.x - reduced.x).max() < 1e-5 * np.ptp(reduced.x)
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        ({"costs": [cs.PathCost(lambda: 0.0)]}, r"costs\[0\]: the function cannot be evaluated"),
+        ({"costs": [UPRIGHT, cs.PathCost(lambda at, own: own)]}, r"costs\[1\].* an argument `at`"),
+        ({"costs": [cs.PathCost(lambda at: math.sin(at.t_s))]}, "in CasADi operations"),
+        ({"limits": [cs.PathLimit(lambda at: "up", upper=1.0)]}, r"limits\[0\].*cannot be eval"),
+        ({"costs": [UPRIGHT, cs.PathCost(lambda at: 1.0)]}, r"costs\[1\].*ignores the motion"),
+        ({"costs": [cs.PathCost(lambda at: at.t_s)]}, "ignores the motion"),
+        ({"costs": [cs.PathCost(lambda at: None)]}, "the function returns None"),
+        ({"costs": [cs.PathCost(lambda at: [])]}, "returns no number"),
+        ({"costs": [cs.PathCost(lambda at: at.position_m[:, 1])]}, "for 1 points"),
+        ({"costs": [cs.PathCost(lambda at: ca.norm_2(at.velocity_m_s))]}, "not finite before"),
+        ({"limits": [cs.PathLimit(lambda at: at.position_m[1], upper=-1.0)]}, "before the motion"),
+    ],
+)
+def test_functions_that_cannot_be_are_explained(terms, message):
+    with pytest.raises(InputError, match=message):
+        bound(**terms)
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        ({}, "expected lower or upper"),
+        ({"lower": 2.0, "upper": 1.0}, "a lower one that is smaller"),
+        ({"upper": 0.0}, "scale: the only limit is 0"),
+    ],
+)
+def test_limits_without_a_range_are_explained(limits, message):
+    with pytest.raises(InputError, match=message):
+        cs.PathLimit(tilt, **limits)
+
+
+def test_functions_are_not_stated_in_a_file(tmp_path: Path):
+    file = tmp_path / "task.toml"
+    file.write_text("costs = [1]\n" + GOOD)
+    with pytest.raises(InputError, match=r"costs.*from Python alone"):
+        Task.read(file)

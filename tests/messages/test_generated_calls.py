@@ -39,6 +39,7 @@ NOT_CALLED = {
     *(
         "ModelComparison",
         "MotionPlan",
+        "PathQuantities",
         "PointQuantities",
         "Run",
         "Solution",
@@ -142,6 +143,8 @@ def valid(name: str) -> dict[str, Any]:
         "Parameter": {"name": "a", "guess": 1.0, "lower": 0.1, "upper": 10.0},
         "Parameters": {"items": (parameter,)},
         "Parameters.from_mapping": {"statements": unknown},
+        "PathCost": {"function": lambda at: at.position_m[0]},
+        "PathLimit": {"function": lambda at: at.position_m[0], "upper": 1.0},
         "Penalty": {},
         "Placement": {
             **{"nodes": np.array([[0, 1, 2, 3]]), "weights": np.ones((1, 4)) / 4},
@@ -268,6 +271,7 @@ ALLOWED = {
     **dict.fromkeys(("Stencil.p", "Stencil.q", "Stencil.w", "Stencil.s", "Stencil.r"), "-1.0"),
     **dict.fromkeys(("Unknown.guess", "Unknown.lower", "Unknown.upper", "Tied.ratio"), "-1.0"),
     **dict.fromkeys(("Obstacle.relaxed", "Pressure.pressure_pa"), "-1.0"),
+    **dict.fromkeys(("PathLimit.lower", "PathLimit.upper"), "-1.0"),
     # Calibrations, which an estimate may change in both directions.
     **dict.fromkeys(("factor", "loss_n", "loss_pa"), "-1.0"),
     # Not known until the stiffness is scanned.

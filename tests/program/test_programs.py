@@ -642,3 +642,24 @@ def test_the_loss_of_simulated_motions_has_one_gradient_forward_and_backward(
         return made.objective(simulate_variables(made, at))
 
     assert_derivative(loss, lambda d: forward @ d, p, rng, 1e-5, 0.1, 1)
+
+
+def test_a_gauge_of_zeros_is_a_residual_and_with_a_small_sigma_an_equation():
+    """The strain of a hanging bar is stated instead of measured."""
+    t_s = np.linspace(0.0, 0.1, 6)
+    bar = cs.Body(cs.box_mesh((0.04, 0.04, 0.12), (1, 1, 3)), density_kg_m3=1000.0)
+    held = cs.Grasp(np.flatnonzero(bar.nodes_m[:, 2] > 0.119), cs.PoseSequence.fixed())
+    ends_m = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.08)]
+    surroundings = {"nuisance": cs.Nuisance.none(), "air_density_kg_m3": "none"}
+    markers = cs.Markers(t_s, np.zeros((6, 2, 3)), 1e-4, places_m=ends_m)
+    truth = {"young_pa": 20e3, "poisson": 0.4, "gamma_r_s": 5e-3, "gamma_m_1_s": 0.0}
+    known = cs.Experiment(bar, t_s, [held], markers, start="equilibrium", **surroundings)
+    low_m, high_m = cs.simulate(known, truth, "midpoint", substeps=1).markers_m[0, :, 2]
+
+    def equality(at):
+        return at.position_m[2, 1] - at.position_m[2, 0] - float(high_m - low_m)
+
+    equal = cs.Gauge("length", equality, t_s, np.zeros((6, 1)), 1e-7, ends_m, unit="m")
+    blind = cs.Experiment(bar, t_s, [held], readings=[equal], start="equilibrium", **surroundings)
+    problem = cs.Problem([blind], truth | {"young_pa": cs.Unknown(30e3)}, substeps=1)
+    assert cs.solve(problem).parameters["young_pa"] == pytest.approx(20e3, rel=1e-4)

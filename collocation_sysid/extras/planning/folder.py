@@ -313,7 +313,7 @@ def _limit_lines(plan: MotionPlan) -> list[Shown]:
         lines.append(f"{words}: {factor * value:.4g}{unit} (limit {limit:.4g}{unit})")
     if plan.exceeds_body_limits:
         lines.append(
-            Line("no motion was found that keeps the limits of the body; see [avoid]", "check")
+            Line("no motion was found that keeps the limits of the body ([avoid], or own)", "check")
         )
     if not plan.binding_limits:
         lines.append(f"limits reached: {', '.join(plan.active_limits) or 'none'}")

@@ -22,6 +22,7 @@ from ...common.array_types import Array, Index
 from ...errors import InputError
 from ...methods.nlpsol import create_solver, ipopt_settings
 from ...program.casadi_functions import NlpFunctions, TimedFunction
+from .path_terms import keyed_entries
 from .planned_program import PlannedProgram
 from .reduced_solver import PlanAnswer, Watch
 
@@ -36,7 +37,7 @@ class FullProgram:
 
     Variables are the scaled positions x (N · 3n,) and then the unknowns c of the hand. Constraints
     are the scaled equations of motion and prescribed positions (= 0), the squared norms of limited
-    vectors less one, and the other limits (both ≤ 0).
+    vectors less one, the other limits of the hand, and those of the path (all ≤ 0).
 
     Parameters
     ----------
@@ -61,7 +62,10 @@ class FullProgram:
         limits = program.hand_limits
         self.limit_count = len(limits.names)
         self.vector_count = len(limits.t_s) * len(limits.at_time.vector_names)
-        self.constraint_count = self.motion_count + self.limit_count
+        self.path_count = 0
+        if program.path_limits is not None:
+            self.path_count = program.path_limits.value_count
+        self.constraint_count = self.motion_count + self.limit_count + self.path_count
 
     # Variables ------------------------------------------------------------------------------------
 
@@ -86,6 +90,9 @@ class FullProgram:
         matrix, target = self.program.residuals
         by_jerk, jerk = self.program.effort
         by_x = 2 * self.length_m * (matrix.T @ (matrix @ x.ravel() - target))
+        if self.program.path_costs is not None:
+            values, slopes = self.program.path_costs.linearise(x)
+            by_x = by_x + 2 * self.length_m * (slopes.T @ values.ravel())
         return np.concatenate([by_x, 2 * by_jerk.T @ (by_jerk @ c + jerk)])
 
     # Constraints ----------------------------------------------------------------------------------
@@ -95,7 +102,9 @@ class FullProgram:
         c, x = self.unpack(w)
         equations = self.driven.equations(self.program.drive(c).without_controls)
         rows = self.transcription.constraint_values(x, equations)
-        return np.concatenate([rows, self._limits(c)[0]])
+        path = self.program.path_limits
+        of_path = np.zeros(0) if path is None else path.evaluate(x).ravel()
+        return np.concatenate([rows, self._limits(c)[0], of_path])
 
     def constraints_and_jacobian(self, w: Array, out: Array | None = None) -> tuple[Array, Array]:
         """Return the constraints, and the values of their Jacobian in the order of
@@ -109,10 +118,19 @@ class FullProgram:
             x, equations, forces=forces, values=of_x
         )
         limits, of_limits = self._limits(c)
-        by_c = np.concatenate([of_motion, of_limits]).T[self._depends_on_c]
+        by_hand = np.concatenate([of_motion, of_limits, np.zeros((self.path_count, len(c)))])
+        by_c = by_hand.T[self._depends_on_c]
         result = np.empty(len(self.jacobian_structure[1])) if out is None else out
-        result[:] = np.concatenate([of_x, by_c])
-        return np.concatenate([rows, limits]), result
+        path, of_path, by_x = self.program.path_limits, np.zeros(0), of_x
+        if path is not None:
+            values, slopes = path.linearise(x)
+            of_path = values.ravel()
+            keys, entries = keyed_entries(self.length_m * slopes)
+            by_path = np.zeros(len(self._path_keys))
+            by_path[np.searchsorted(self._path_keys, keys)] = entries
+            by_x = np.concatenate([of_x, by_path])[self._columns_of_x[2]]
+        result[:] = np.concatenate([by_x, by_c])
+        return np.concatenate([rows, limits, of_path]), result
 
     def jacobian(self, w: Array) -> sp.csc_array:
         """Return the Jacobian (constraints, variables)."""
@@ -124,12 +142,37 @@ class FullProgram:
     @cached_property
     def jacobian_structure(self) -> tuple[Index, Index]:
         """Column pointers and row indices of the Jacobian."""
-        of_x = self.transcription.motion_rows.structure
-        ends = of_x.nnz + np.cumsum(self._depends_on_c.sum(axis=1))
+        pointers, rows, _ = self._columns_of_x
+        ends = len(rows) + np.cumsum(self._depends_on_c.sum(axis=1))
         return (
-            np.concatenate([of_x.indptr, ends]),
-            np.concatenate([of_x.indices, np.nonzero(self._depends_on_c)[1]]),
+            np.concatenate([pointers, ends]),
+            np.concatenate([rows, np.nonzero(self._depends_on_c)[1]]),
         )
+
+    @cached_property
+    def _path_keys(self) -> Index:
+        """Keys of the entries of the limits of the path, ascending."""
+        path = self.program.path_limits
+        return (
+            np.zeros(0, np.int64) if path is None else np.sort(keyed_entries(path.patterns[0])[0])
+        )
+
+    @cached_property
+    def _columns_of_x(self) -> tuple[Index, Index, Index]:
+        """Column pointers and rows of the entries by x, and their places among the entries of the
+        motion followed by those of the limits of the path.
+        """
+        motion = self.transcription.motion_rows.structure
+        if not self.path_count:
+            return motion.indptr, motion.indices, np.arange(motion.nnz)
+        columns, rows = np.divmod(self._path_keys, self.path_count)
+        all_columns = np.concatenate(
+            [np.repeat(np.arange(self.position_count), np.diff(motion.indptr)), columns]
+        )
+        all_rows = np.concatenate([motion.indices, self.motion_count + self.limit_count + rows])
+        places = np.lexsort([all_rows, all_columns])
+        counts = np.bincount(all_columns, minlength=self.position_count)
+        return np.concatenate([[0], np.cumsum(counts)]), all_rows[places], places
 
     @cached_property
     def _depends_on_c(self) -> NDArray[np.bool_]:
@@ -139,7 +182,8 @@ class FullProgram:
         moves_hand = self.program.space.moves_hand[:, None]
         of_motion = moves_hand == self.transcription.is_grasp_constraint
         of_limits = np.ones((len(moves_hand), self.limit_count), dtype=bool)
-        return np.concatenate([of_motion, of_limits], axis=1)
+        of_path = np.zeros((len(moves_hand), self.path_count), dtype=bool)
+        return np.concatenate([of_motion, of_limits, of_path], axis=1)
 
     def _limits(self, c: Array) -> tuple[Array, Array]:
         """Return the limits of the hand as smooth constraints, and their derivatives (k, c)."""
@@ -184,7 +228,11 @@ class FullProgram:
     @cached_property
     def _keys(self) -> Index:
         """Keys of all entries by x, ascending."""
-        return np.unique(np.concatenate([self._motion_entries[1], self._objective_entries[0]]))
+        terms = (self.program.path_costs, self.program.path_limits)
+        of_path = [keyed_entries(sp.triu(t.patterns[1]))[0] for t in terms if t is not None]
+        return np.unique(
+            np.concatenate([self._motion_entries[1], self._objective_entries[0], *of_path])
+        )
 
     @cached_property
     def _places(self) -> tuple[Index, Index]:
@@ -211,10 +259,11 @@ class FullProgram:
         places_of_motion, places_of_objective = self._places
         of_x[places_of_motion] += values[self._motion_entries[0]]
         of_x[places_of_objective] += weight * self._objective_entries[1]
+        self._add_path_hessian(x, weight, multipliers[self.motion_count + self.limit_count :], of_x)
         by_jerk, _ = self.program.effort
         of_c = by_c + 2 * weight * by_jerk.T @ by_jerk
         of_c += self._grasp_hessian(c, of_motion) + self._limit_hessian(
-            c, multipliers[self.motion_count :]
+            c, multipliers[self.motion_count : self.motion_count + self.limit_count]
         )
         mixed = self.length_m * by_x.reshape(self.position_count, -1)
         columns = [
@@ -222,6 +271,20 @@ class FullProgram:
             for k, moves_hand in enumerate(self.program.space.moves_hand)
         ]  # fmt: skip
         out[:] = np.concatenate([of_x, *columns])
+
+    def _add_path_hessian(self, x: Array, weight: float, multipliers: Array, of_x: Array) -> None:
+        """Add the second derivatives of the costs and limits of the path to those by x."""
+        costs, limits = self.program.path_costs, self.program.path_limits
+        found = []
+        if costs is not None:
+            values, slopes = costs.linearise(x)
+            curvature = costs.weighted_hessian(x, values)
+            found.append(2 * weight * (slopes.T @ slopes + curvature))
+        if limits is not None:
+            found.append(limits.weighted_hessian(x, multipliers.reshape(-1, limits.t_s.shape[1])))
+        for each in found:
+            keys, entries = keyed_entries(sp.triu(self.length_m**2 * each))
+            of_x[np.searchsorted(self._keys, keys)] += entries
 
     def _grasp_hessian(self, c: Array, multipliers: Array) -> Array:
         """Return Σ multipliers · ∂²constraint/∂c² (c, c) of the prescribed positions."""
@@ -274,10 +337,11 @@ def require_full_program(program: PlannedProgram) -> None:
         "where the largest or nearest one changes": program.body_limits is not None,
         "the task has [information], which has no second derivatives": program.criterion is not None,
     }  # fmt: skip
+    remedy = "a task without limits of its own" if program.task.limits else "reduced-space"
     for reason, applies in reasons.items():
         if applies:
             raise InputError(
-                f"interior-point cannot plan this: {reason}; expected reduced-space",
+                f"interior-point cannot plan this: {reason}; expected {remedy}",
                 None,
                 where="--solver",
             )
@@ -332,7 +396,7 @@ def solve_full(
         return replace(start, status=ended)
     c, x = full.unpack(found["x"].full().ravel())
     # Of half the objective and of the norms of vectors, as in the reduced space.
-    multipliers = found["lam_g"].full().ravel()[full.motion_count :]
+    multipliers = found["lam_g"].full().ravel()[full.motion_count :][: full.limit_count]
     multipliers[full.vector_count :] /= 2
     history = [float(value) for value in solver.stats()["iterations"]["obj"]]
     return PlanAnswer(c, x, multipliers, "converged", [*start.history, *history])

@@ -348,7 +348,9 @@ class MotionPlan:
 
     @property
     def exceeds_body_limits(self) -> bool:
-        """Whether the largest stretch or the clearance of the task is not kept."""
+        """Whether the largest stretch, the clearance or a `PathLimit` of the task is not kept."""
+        if self.program.exceeds_path_limits(self.answer.x):
+            return True
         avoid, found = self.program.task.avoid, self.body_extremes
         stretch, clearance_m = avoid.largest_stretch, avoid.clearance_m
         return (stretch is not None and found["largest_stretch"] > stretch) or (
@@ -421,7 +423,8 @@ def plan_motion(
 ) -> MotionPlan:
     """Return the motion of the hand with which points of the body follow their references.
 
-    Ctrl-C ends the search with the best plan so far, which respects all limits.
+    Ctrl-C ends the search with the best plan so far, which respects all limits but those
+    of a `PathLimit`.
 
     Parameters
     ----------
@@ -443,7 +446,7 @@ def plan_motion(
         frame of the poses, such as limits of joints; by default those of the task.
     solver : {"reduced-space", "interior-point"}
         Gauss–Newton steps in the space of the hand's unknowns, or IPOPT after these, with the
-        positions of all nodes as variables.
+        positions of all nodes as variables. Only IPOPT keeps a `PathLimit`.
     robust : bool
         Whether the objective is its mean over the noise of the constants; a run is needed.
     tolerances : ReducedTolerances, optional
@@ -484,6 +487,13 @@ def plan_motion(
             None,
             where="--robust",
         )
+    if task.limits and solver != "interior-point":
+        raise InputError(
+            "reduced-space cannot keep limits that are functions of the motion; expected "
+            'solver = "interior-point"',
+            None,
+            where="limits",
+        )
     began_s = time.perf_counter()
 
     def solve(duration_s: float) -> tuple[PlannedProgram, PlanAnswer]:
@@ -504,6 +514,8 @@ def plan_motion(
         return program, answer
 
     def suffices(program: PlannedProgram, answer: PlanAnswer) -> bool:
+        if program.exceeds_path_limits(answer.x):
+            return False
         if program.criterion is not None:
             return program.criterion.suffices(answer.c, answer.x)
         return task.largest_error_m is None or (
@@ -531,7 +543,7 @@ def plan_motion(
     except np.linalg.LinAlgError as error:
         raise InputError(f"{error}; state wider limits", None, where="hand") from error
     is_enough = suffices(program, answer)
-    has_error = not is_enough and task.information is None
+    has_error = not is_enough and task.information is None and task.largest_error_m is not None
     if answer.status != "interrupted" and (task.shortest or has_error):
         with suppress(KeyboardInterrupt):  # the plan of the stated duration remains
             first = (program, answer) if is_enough else None

@@ -37,8 +37,9 @@ from ...program.forward.initial_equilibrium import equilibrium
 from ...program.modes.natural import natural_modes
 from ...recording import Experiment, PoseSequence
 from .body_limits import BodyLimits
-from .hand_limits import HandBounds, Limits
+from .hand_limits import WITHIN, HandBounds, Limits
 from .information import InformationCriterion
+from .path_terms import PathCost, PathLimit, PathValues
 from .planned_body import PlannedBody
 from .signals import Signal, task_signals
 from .spline_motion import HAND, LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
@@ -240,7 +241,18 @@ class PlannedProgram:
         return program
 
     def require_start_within_limits(self) -> None:
-        """Raise an `InputError` if the body exceeds its limits before the motion."""
+        """Raise an `InputError` if the body exceeds its limits before the motion, or a function of the
+        task cannot be evaluated there.
+        """
+        _, limits = self.path_costs, self.path_limits
+        standing = np.tile(self.start, (len(self.grid_since_s), 1))
+        if limits is not None and (excess := limits.evaluate(standing)[:, 0].max()) > 0:
+            raise InputError(
+                f"a limit is exceeded before the motion, by {excess:.2g} of its scale; expected "
+                "limits that the body keeps at rest",
+                None,
+                where="limits",
+            )
         if self.body_limits is None:
             return
         avoid = self.task.avoid
@@ -407,6 +419,39 @@ class PlannedProgram:
         return BodyLimits(self.experiment, theta, self.sample_rows, **vars(avoid))
 
     @cached_property
+    def reference_places_m(self) -> list[Array]:
+        """Places of the points of the references on the undeformed body, each once."""
+        names, places = point_names(self.task), point_places(self.task, self.body.marker_places_m)
+        return [*dict(zip(names, places, strict=True)).values()]
+
+    @cached_property
+    def path_costs(self) -> PathValues | None:
+        """Residuals of the costs that the task states as functions; None if there are none."""
+        return self._path_values(self.task.costs)
+
+    @cached_property
+    def path_limits(self) -> PathValues | None:
+        """Limits that the task states as functions; None if there are none."""
+        return self._path_values(self.task.limits)
+
+    def _path_values(self, terms: Sequence[PathCost | PathLimit]) -> PathValues | None:
+        hand = self.experiment.grasps[self.body.grasp_number].nodes
+        return PathValues.from_terms(
+            terms,
+            self.reference_places_m,
+            self.experiment.body,
+            hand,
+            self.start,
+            self.grid_since_s,
+            self.sample_rows,
+        )
+
+    def exceeds_path_limits(self, x: Array) -> bool:
+        """Whether a motion x (N, 3n) [m] exceeds a `PathLimit` of the task."""
+        limits = self.path_limits
+        return limits is not None and bool(limits.evaluate(x).max() > 1 / WITHIN - 1)
+
+    @cached_property
     def hand_limits(self) -> LimitsOverTime:
         """Limits of the hand and of the signals."""
         at_time = HandLimits.from_bounds(
@@ -519,14 +564,20 @@ class PlannedProgram:
         """Return the derivatives (m, c) by the unknowns, and the values (m,), of the residuals of
         the body for a motion x (N, 3n) with derivatives (N, 3n, c).
         """
+        flat = slopes.reshape(-1, len(c))
         if self.criterion is not None:
-            return self.criterion.linearise(c, x, slopes)
-        matrix, target = self.residuals
-        return matrix @ slopes.reshape(-1, len(c)), matrix @ x.ravel() - target
+            rows, values = self.criterion.linearise(c, x, slopes)
+        else:
+            matrix, target = self.residuals
+            rows, values = matrix @ flat, matrix @ x.ravel() - target
+        if self.path_costs is None:
+            return rows, values
+        costs, by_x = self.path_costs.linearise(x)
+        return np.concatenate([rows, by_x @ flat]), np.concatenate([values, costs.ravel()])
 
     def objective_parts(self, c: Array, x: Array) -> dict[str, float]:
         """Return the parts of the objective at unknowns c and motion x (N, 3n): of each reference,
-        of the rest at the end, of the information, and of the jerk.
+        of the rest at the end, of the information, of the costs, and of the jerk.
         """
         parts: dict[str, float] = {}
         flat = x.ravel()
@@ -535,6 +586,8 @@ class PlannedProgram:
             parts[name] = parts.get(name, 0.0) + value
         if self.criterion is not None:
             parts["information"] = self.criterion.value(c, x)
+        if self.path_costs is not None:
+            parts["costs"] = float(np.sum(self.path_costs.evaluate(x) ** 2))
         matrix, constant = self.effort
         parts["jerk"] = float(np.sum((matrix @ c + constant) ** 2))
         return parts
@@ -584,6 +637,8 @@ SHARED = (
     "hand_limits",
     "residual_rows",
     "residuals",
+    "path_costs",
+    "path_limits",
     "effort",
 )
 

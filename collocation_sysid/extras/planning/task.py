@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, InstanceOf, model_validator
+from pydantic.json_schema import SkipJsonSchema
 
 from ...common.array_types import Array
 from ...common.schema_tables import Section, Vector, require_one
@@ -34,6 +35,7 @@ from ...problem.validation_messages import StatedSection
 from ...recording.sources.columns import find_time
 from ...recording.sources.source import read_table
 from ...recording.sources.text import numeric_cells, times_in_column
+from .path_terms import PathCost, PathLimit
 
 HandAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXES: tuple[HandAxis, ...] = ("x", "y", "z", "rx", "ry", "rz")
@@ -351,6 +353,10 @@ class Task(StatedSection):
     information : table, optional
         Constants that a recording of the motion shall determine, in place of references; the search
         ends when their intervals are as narrow as wanted.
+    costs : sequence of PathCost
+        Costs that are functions of the motion, from Python alone.
+    limits : sequence of PathLimit
+        Limits that are functions of the motion, from Python alone.
     """
 
     duration_s: Positive
@@ -364,6 +370,8 @@ class Task(StatedSection):
     pressure: list[PressureSection] = Field(default_factory=list)
     avoid: AvoidSection = Field(default_factory=AvoidSection)
     information: InformationSection | None = None
+    costs: SkipJsonSchema[tuple[InstanceOf[PathCost], ...]] = ()
+    limits: SkipJsonSchema[tuple[InstanceOf[PathLimit], ...]] = ()
 
     @property
     def signals(self) -> list[tuple[str, int, SignalSection]]:
@@ -408,7 +416,7 @@ class Task(StatedSection):
                 where="shortest",
             )
         ends = [hand.end_m, hand.end_rotation_deg, *(each.end for each in signals)]
-        has_purpose = self.reference or self.information is not None
+        has_purpose = self.reference or self.information is not None or self.costs
         if not has_purpose and all(end is None for end in ends):
             raise InputError(
                 "nothing to do; expected a [[reference]] table, end_m in [hand], or [information]",
