@@ -214,5 +214,7 @@ class GraspConstraint:
             axis = grasp.prescribed_dofs % 3
             pose_rotations, pose_shifts = grasp.poses.at(self.t_s[times])
             rotations[np.ix_(times, place)] = pose_rotations[:, axis]
-            shifts_m[np.ix_(times, place)] = pose_shifts[:, axis]
+            nodes_m = self.experiment.body.nodes_m[grasp.nodes]
+            moved_m = grasp.poses.deformation_at(nodes_m, self.t_s[times])[..., grasp.axis_indices]
+            shifts_m[np.ix_(times, place)] = pose_shifts[:, axis] + moved_m.reshape(len(times), -1)
         return rotations, shifts_m

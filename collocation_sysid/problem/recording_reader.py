@@ -39,6 +39,7 @@ from ..recording import (
 )
 from ..recording.alignment import AlignedRecording
 from ..recording.gap_interpolation import interpolation_error
+from ..recording.measured_faces import face_note, read_face
 from ..recording.poses import require_determined_motion
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.sources.columns import name_and_unit
@@ -220,7 +221,12 @@ class RecordingReader:
         grasp = self.section.moved_sections[k]
         if grasp.markers is not None:
             return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
-        if grasp.displacement is not None:
+        if isinstance(grasp, GraspSection) and grasp.displacements is not None:
+            key = self._grasp_key(k, "displacements")
+            file = existing_file(self.folder, grasp.displacements, key=key)
+            poses = read_face(file, self.body.nodes_m, axes=grasp.axes)
+            self._add_notes(f"{grasp.displacements}: {face_note(poses)}")
+        elif grasp.displacement is not None:
             file = self._table_file(grasp.displacement, self._grasp_key(k, "displacement"))
             layout = grasp.displacement.dump_layout()
             layout |= {"length_m": strain_length_m(grasp.displacement, self.body)}
@@ -566,9 +572,7 @@ class RecordingReader:
             (-np.inf if first is None else first, np.inf if last is None else last)
             for first, last in (each.values() for each in intervals)
         ]
-        pose_files = [
-            grasp.poses or section.file_of(grasp.displacement) for grasp in section.moved_sections
-        ]
+        pose_files = [section.motion_file(grasp) for grasp in section.moved_sections]
         first_s, last_s = section.window_s or (-np.inf, np.inf)
         t_s = table.t_s[table.t_s >= first_s - TIME_TOLERANCE_S]
         t_s = t_s[t_s <= last_s + TIME_TOLERANCE_S]

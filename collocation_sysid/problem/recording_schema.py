@@ -282,11 +282,29 @@ class GraspSection(MovedSection, of=Grasp):
 
     Attributes
     ----------
+    displacements : str, optional
+        Table of measured displacements that the nodes follow, as of image correlation, instead of
+        poses: for each time and place a row of t_s, x_m, y_m, z_m (place on the undeformed body) or
+        node (index, from 0), and ux_m, uy_m, uz_m, the displacement from the undeformed body.
     wrench : ForceSensorSection, optional
         Measured force and torque on the body: file, sigma_n, sigma_nm, …
     """
 
+    axes: Declared
+    sigma_m: Declared
+    displacements: Text | None = None
     wrench: ForceSensorSection | None = None
+
+    @model_validator(mode="after")
+    def _require_deviation(self) -> GraspSection:
+        others = used_keys(self, "poses", "displacement", "markers")
+        if self.displacements is not None and (others or self.sigma_m is None):
+            found = f"together with {others[0]}" if others else "without sigma_m"
+            raise ValueError(
+                f"found displacements {found}; expected displacements and sigma_m, the standard "
+                "deviation of the measured displacements [m], and no other motion"
+            )
+        return self
 
     @property
     def sensor(self) -> ForceSensorSection | None:
@@ -523,8 +541,13 @@ class ExperimentSection(NamedSection, of=Experiment):
             ),
         ]
         for grasp in self.moved_sections:
-            names += [grasp.poses or self.file_of(grasp.displacement), self.file_of(grasp.sensor)]
+            names += [self.motion_file(grasp), self.file_of(grasp.sensor)]
         return names
+
+    def motion_file(self, moved: MovedSection) -> str | None:
+        """Return the file of the motion of a grasp or an obstacle; None without a file."""
+        measured = moved.displacements if isinstance(moved, GraspSection) else None
+        return moved.poses or measured or self.file_of(moved.displacement)
 
     @property
     def measurement_tables(self) -> dict[str, list[MeasurementSection]]:

@@ -61,7 +61,8 @@ class Grasp:
         grasp ends at the first sample, the body is released from its equilibrium in this grasp.
     sigma_m : float, optional
         Standard deviation of the noise in each position of the poses [m]; by default it is
-        estimated from the roughness of the poses.
+        estimated from the roughness of the poses. With `displacements`, it is required, and the
+        budget contains an error of this size in addition, see `measured_face`.
     sigma_rad : float, optional
         Standard deviation of the noise in each rotation, about each axis [rad]; by default it is
         estimated from the roughness of the poses.
@@ -116,9 +117,15 @@ class Grasp:
         Raises
         ------
         InputError
-            If the selection has no nodes on this body, or matrices are no rigid motions.
+            If the selection has no nodes on this body, matrices are no rigid motions, or a node is
+            far from the places whose displacements were measured.
         """
-        return self._with_nodes(select_on_body(self.nodes, body), t_s)
+        placed = self._with_nodes(select_on_body(self.nodes, body), t_s)
+        if (measured := placed.poses.deformation) is not None:
+            edges_m = np.diff(body.nodes_m[body.cells][:, [0, 1, 2, 3, 0]], axis=1)
+            edge_m = float(np.linalg.norm(edges_m, axis=2).max())
+            measured.require_near(body.nodes_m[placed.nodes], edge_m)
+        return placed
 
     def _with_nodes(self, nodes: Index, t_s: Array) -> Self:
         """Poses that are matrices (T, 4, 4) become a `PoseSequence` at the times `t_s` (T,)."""

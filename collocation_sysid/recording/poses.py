@@ -6,7 +6,7 @@ motion is smooth (splines with continuous accelerations), linear, or constant (z
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -14,11 +14,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline, PPoly
+from scipy.interpolate import CubicSpline, PPoly, RBFInterpolator, interp1d
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ..common.array_types import Array, Index
-from ..common.checked_arrays import as_array, float_converter, read_only_floats
+from ..common.checked_arrays import as_array, float_converter, point_text, read_only_floats
 from ..common.declarations import declaration, key
 from ..common.validated_classes import validated
 from ..errors import InputError
@@ -46,6 +47,77 @@ _LEAST_JUMP_SHARE = 1e-3
 LONGEST_STEP_S = 1.0
 # Largest difference of the poses of a grasp at rest, in metres and in a quaternion's components.
 LARGEST_REST_DIFFERENCE = 1e-6
+# Measured places nearest to a node that determine its displacement.
+_NEAREST_PLACES = 50
+# Relative spread of places along a direction below which they have no gradient along it.
+_FLATNESS = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class FaceDeformation:
+    """Measured displacements of a face beyond its rigid motion, along the axes of the world.
+
+    Between the places they are an affine map and radial functions (`RBFInterpolator` of SciPy with
+    the kernel "linear"), which agree with every measured displacement.
+    """
+
+    t_s: Array  # (m,): times of the measurement
+    places_m: Array  # (k, 3): places on the undeformed body
+    displacements_m: Array  # (m, k, 3)
+    # Displacements (m, 3n) at points that were asked for.
+    _known: dict[bytes, Array] = field(default_factory=dict, init=False)
+
+    def at(self, points_m: Array, t_s: Array, interpolation: Interpolation) -> Array:
+        """Return the displacements (T, n, 3) [m] of undeformed points (n, 3) at the times `t_s`
+        (T,); constant before the first and after the last measurement.
+        """
+        key = points_m.tobytes()
+        if key not in self._known:
+            self._known[key] = self._at_points(points_m)
+        values = self._known[key]
+        times = np.clip(t_s, self.t_s[0], self.t_s[-1])
+        if len(self.t_s) == 1 or interpolation == "hold":
+            moved = values[np.searchsorted(self.t_s, times + TIME_TOLERANCE_S, side="right") - 1]
+        elif interpolation == "smooth" and len(self.t_s) > 2:
+            moved = smooth_spline(self.t_s, values)(times)
+        else:
+            moved = interp1d(self.t_s, values, axis=0)(times)
+        return moved.reshape(len(times), len(points_m), 3)
+
+    def _at_points(self, points_m: Array) -> Array:
+        """Return the displacements (m, 3n) of points (n, 3) at the times of the measurement."""
+        middle_m = self.places_m.mean(axis=0)
+        size_m = self.places_m.std(axis=0).max()
+        measured, asked = (
+            np.column_stack([np.ones(len(each)), (each - middle_m) / size_m])
+            for each in (self.places_m, points_m)
+        )
+        values = np.moveaxis(self.displacements_m, 0, 1).reshape(len(measured), -1)
+        affine = np.linalg.lstsq(measured, values, rcond=_FLATNESS)[0]
+        radial = RBFInterpolator(
+            self.places_m,
+            values - measured @ affine,
+            neighbors=min(_NEAREST_PLACES, len(measured)),
+            kernel="linear",
+        )
+        at_points = asked @ affine + radial(points_m)
+        by_time = at_points.reshape(len(points_m), len(self.t_s), 3)
+        return np.moveaxis(by_time, 1, 0).reshape(len(self.t_s), -1)
+
+    def require_near(self, points_m: Array, edge_m: float) -> None:
+        """Raise an `InputError` for a point (of n, 3) that is farther from all places than an edge
+        of the mesh and than the largest distance from a place to the next.
+        """
+        tree = KDTree(self.places_m)
+        spacing_m = float(tree.query(self.places_m, 2)[0][:, 1].max())
+        away_m = np.asarray(tree.query(points_m)[0])
+        if away_m.max() > 1.01 * max(edge_m, spacing_m):
+            raise InputError(
+                f"the node at {point_text(points_m[away_m.argmax()])} m is {away_m.max():.3g} m away "
+                f"from the nearest place of a measured displacement; expected at most "
+                f"{max(edge_m, spacing_m):.3g} m: select fewer nodes, or check that the places are "
+                "those of the undeformed body in the frame of the mesh"
+            )
 
 
 @declaration
@@ -69,6 +141,8 @@ class PoseSequence:
         Constant rigid motion [[R, p], [0, 1]] [m] that the poses contain as their first part, such
         as a hand–eye transform; set by `after`, by default the identity. It changes no pose, but
         separates the poses of a file from it when mistakes in the file are searched.
+    deformation : FaceDeformation, optional
+        Measured displacements of the carried nodes, which are added to the rigid motion.
 
     Raises
     ------
@@ -85,6 +159,7 @@ class PoseSequence:
         converter=float_converter((4, 4), "first_motion of the poses"),
         default_factory=lambda: np.eye(4),
     )
+    deformation: FaceDeformation | None = None
 
     def __post_init__(self) -> None:
         t_s = self.t_s
@@ -219,11 +294,21 @@ class PoseSequence:
 
     def moved_positions(self, points_m: ArrayLike, t_s: ArrayLike) -> Array:
         """Return positions R X + p (T, k, 3) [m] of undeformed points X (k, 3) at the times `t_s`
-        (T,); errors as of `at`.
+        (T,), with the measured deformation; errors as of `at`.
         """
         rotations, translations = self.at(t_s)
         points = np.asarray(points_m, dtype=np.float64)
-        return np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
+        carried_m = np.einsum("tij,kj->tki", rotations, points) + translations[:, None, :]
+        return carried_m + self.deformation_at(points, t_s)
+
+    def deformation_at(self, points_m: Array, t_s: ArrayLike) -> Array:
+        """Return the measured displacements (T, k, 3) [m] of undeformed points (k, 3) beyond the
+        rigid motion, at the times `t_s` (T,); zero where none were measured.
+        """
+        times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
+        if self.deformation is None:
+            return np.zeros((len(times), len(points_m), 3))
+        return self.deformation.at(points_m, times, self.interpolation)
 
     @cached_property
     def jumps_s(self) -> Array:

@@ -40,6 +40,7 @@ from ..problem.specimen_reader import layout_from_section
 from ..problem.specimen_schema import SpecimenSection
 from ..program.simulation import NEWMARK, Trajectory, simulate
 from ..recording import Experiment, write_gauge_csv, write_markers_csv, write_poses_csv
+from ..recording.measured_faces import face_columns
 from ..recording.specimen_files import SpecimenLayout, specimen_columns
 from ..recording.writers import write_columns_csv
 from ..statistics.stability_concerns import branch_concern
@@ -130,7 +131,8 @@ def write_data(
     folder : str or Path
         Created if missing; gets ``<experiment>_markers.csv`` if there are markers,
         ``<experiment>_poses.csv`` (``_poses_2`` … by the number of the grasp) for grasps whose
-        poses the problem reads, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a
+        poses the problem reads, ``<experiment>_face.csv`` for grasps that follow measured
+        displacements, ``<experiment>_wrench.csv`` (``_wrench_2`` …) for grasps with a
         force sensor, ``<experiment>_reading_<name>.csv`` for custom sensors, and ``<experiment>/``
         with frames if requested. An experiment whose displacements come from a table, as on a test
         bench, gets its tables of displacement and load under their names in the problem file, in
@@ -262,6 +264,8 @@ def _write_tables(
     for k, grasp in enumerate(experiment.grasps):
         if (key := _numbered_key("poses", k)) in files:
             write_poses_csv(files[key], grasp.poses)
+        if (key := _numbered_key("face", k)) in files:
+            write_columns_csv(files[key], face_columns(grasp.poses))
     layouts = _wrench_layouts(section) or [ForceSensorSection.model_construct()] * len(
         experiment.wrenches
     )
@@ -364,7 +368,9 @@ def _table_names(
     keys = [_MARKERS_KEY] * bool(experiment.markers.names)
     for k in range(len(experiment.grasps)):
         moved = section and section.moved_sections[k]
-        if moved is None or moved.poses is not None or moved.markers is not None:
+        if experiment.grasps[k].poses.deformation is not None:
+            keys.append(_numbered_key("face", k))
+        elif moved is None or moved.poses is not None or moved.markers is not None:
             keys.append(_numbered_key("poses", k))
     bench: list[str] = []
     if section is not None and has_displacement_table(section):

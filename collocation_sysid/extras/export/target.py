@@ -220,6 +220,8 @@ def _common_limitations(body: IdentifiedBody) -> Iterator[str]:
             "the specimen is one homogeneous cell with a nominal density of "
             f"{e.body.parts[0].density_kg_m3:g} kg/m³: use the card of the material in a model of your own"
         )
+    if any(grasp.poses.deformation is not None for grasp in e.grasps):
+        yield "measured displacements of grasped nodes are not exported: the nodes move rigidly"
     if e.actuators:
         yield "tendons and pressures are not exported"
     if e.air_density_kg_m3:

@@ -183,6 +183,8 @@ def partial_displacement(
         middle = start.mean(axis=0)
         way = (goal - start).mean(axis=0)
         partial_m = middle + share * way + part.apply(start - middle)
+        own_m = grasp.poses.deformation_at(experiment.body.nodes_m[nodes], time_s)[0]
+        partial_m += share * (own_m - own_m.mean(axis=0))
         positions[place] = partial_m[:, grasp.axis_indices]
     return positions
 

@@ -199,7 +199,8 @@ def sliding_faces(
     faces = []
     for grasp in experiment.body_grasps:
         heights_m = nodes_m[grasp.nodes, axis]
-        if len(grasp.axes) < 3 or np.ptp(heights_m) > tolerance_m:
+        is_measured = grasp.poses.deformation is not None
+        if is_measured or len(grasp.axes) < 3 or np.ptp(heights_m) > tolerance_m:
             continue
         normal = np.isin(dofs, 3 * grasp.nodes + axis)
         outward_n = reactions_n[:, normal].sum(axis=1) * np.sign(heights_m.mean() - middle_m)

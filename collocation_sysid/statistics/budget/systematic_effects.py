@@ -335,10 +335,14 @@ class ExperimentAtAnswer:
         """Effect of grippers that hold the body at one metre outside the faces that they hold; None
         without such faces. The body is longer there before and after they hold it, too.
 
-        A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper.
+        A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper, and
+        measured displacements are those of the body.
         """
-        holding = self.iterate.transcription.experiment.body_grasps
-        gripped = [grasp.nodes for grasp in holding if len(grasp.axes) == len(_AXES)]
+        gripped = [
+            grasp.nodes
+            for grasp in self.iterate.transcription.experiment.body_grasps
+            if len(grasp.axes) == len(_AXES) and grasp.poses.deformation is None
+        ]
         if not gripped:
             return None
         body = self.body
@@ -627,6 +631,8 @@ def _machine(at: ExperimentAtAnswer, _: int) -> Effect | None:
         return None
     displacement_m = np.zeros_like(at.grasp_force_n)
     for grasp in experiment.grasps:
+        if grasp.poses.deformation is not None:
+            continue  # measured on the body
         for axis in range(3):
             here = np.flatnonzero(
                 np.isin(prescribed.dofs, grasp.prescribed_dofs) & (prescribed.dofs % 3 == axis)
@@ -653,6 +659,31 @@ def _machine_of_specimen(
         columns = np.searchsorted(dofs, 3 * node + np.arange(3))
         displacement_m[:, columns] = strain_m_n[:, None] * by_strain_m
     return Effect(displacement_m=displacement_m)
+
+
+def _measured_face(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Return the effect of measured displacements of grasped nodes that are off by `Grasp.sigma_m`
+    at the ends of the body and at the largest displacement.
+
+    The error of one component is linear in one coordinate of the place, zero in the middle of the
+    body, and proportional to the RMS displacement of the face over time.
+    """
+    component, along = divmod(index, 3)
+    prescribed = at.iterate.equations.prescribed
+    displacement_m = np.zeros_like(prescribed.positions_m)
+    nodes_m = at.body.nodes_m
+    low_m, high_m = nodes_m[:, along].min(), nodes_m[:, along].max()
+    for grasp in at.iterate.transcription.experiment.body_grasps:
+        if grasp.poses.deformation is None or component not in grasp.axis_indices:
+            continue
+        rows = np.flatnonzero(grasp.is_active(at.dynamics.t_s))
+        moved_m = grasp.positions_at(nodes_m, at.dynamics.t_s[rows]) - nodes_m[grasp.nodes]
+        size_m = np.linalg.norm(moved_m, axis=(1, 2))
+        share = (2 * nodes_m[grasp.nodes, along] - low_m - high_m) / (high_m - low_m)
+        columns = np.searchsorted(prescribed.dofs, 3 * grasp.nodes + component)
+        error_m = (grasp.sigma_m or 0.0) * np.outer(size_m / (size_m.max() or 1.0), share)
+        displacement_m[np.ix_(rows, columns)] = error_m
+    return Effect(displacement_m=displacement_m) if displacement_m.any() else None
 
 
 def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -1070,6 +1101,17 @@ ASSUMPTIONS = (
         "in [uncertainty.assumptions]",
         effect=_machine,
         of_specimens=True,
+    ),
+    Deviation(
+        "measured_face",
+        "σ",
+        considered=1.0,
+        description="error of measured displacements of grasped nodes, over their sigma_m, linear in "
+        "place and proportional to the displacement",
+        remedy="measure a known rigid motion and a known stretch with the same camera, and state "
+        "the deviation as sigma_m of the grasp",
+        effect=_measured_face,
+        axes="xx xy xz yx yy yz zx zy zz",
     ),
     Deviation(
         "gauge_length",
