@@ -263,7 +263,8 @@ def _with_problem_notes(answer: Run) -> Run:
     )
     tests = one_kind_notes(problem.experiments, problem.parameters)
     impacts = ()
-    if problem.substeps == "auto" and problem.choose_first_substeps() > 1:
+    may_strike = any(each.obstacles for each in problem.experiments)
+    if may_strike and problem.substeps == "auto" and problem.choose_first_substeps() > 1:
         impacts = (IMPACT_NOTE.format(substeps),)
     return replace(answer, notes=(*coarse, *impacts, *tests, *answer.notes))
 

@@ -132,7 +132,7 @@ def _body_section(body: BodyCheck, details: bool) -> Table:
         }
         | (
             {"quality": f"median {body.median_element_quality:.2f}, worst in elements {worst}"}
-            if details
+            if details and worst
             else {}
         )
         | ({"origin": body.open_question} if body.open_question else {})

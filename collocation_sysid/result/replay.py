@@ -153,6 +153,7 @@ class MotionRecord:
     # measured, fitted and simulated; NaN where one of these is missing.
     wrenches: Sequence[Array] = ()
     static: bool = False  # whether every sample is an equilibrium of its own
+    slender: bool = False  # whether the body is a rod, whose tetrahedra are no elements
     # (p, 3), or None: points of the tendons on the undeformed body, a row of NaN after each tendon.
     tendons_m: Array | None = None
     # mapping of name to (S, 1 + 3m): for each custom sensor: time [s], and its m numbers as
@@ -243,6 +244,7 @@ class MotionRecord:
             *(simulated or (None, None)),
             natural_hz,
             static=experiment.is_static,
+            slender=body.is_slender,
             tendons_m=_join_polylines([tendon.points_m for tendon in experiment.tendons]),
             obstacles_m=_obstacle_outlines(experiment),
             reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit}
@@ -298,7 +300,8 @@ class MotionRecord:
         if self.rolled_out_positions_m is not None:
             stored["rolled_out_positions_m"] = self.rolled_out_positions_m.astype(np.float32)
         stored |= {key: np.array(getattr(self, key)) for key in ("part_names", "marker_names")}
-        stored["static"] = np.array(True) if self.static else None
+        for flag in ("static", "slender"):
+            stored[flag] = np.array(True) if getattr(self, flag) else None
         stored["residuals_m"] = None if self.markers_m is None else self.markers_m - self.measured_m
         stored |= {f"{WRENCH_PREFIX}{k}": columns for k, columns in enumerate(self.wrenches, 1)}
         for group, front in GROUP_PREFIXES.items():
@@ -353,7 +356,8 @@ class MotionRecord:
             if (at := f"{prefix}{COLUMNS_PREFIX}{name}") in arrays
             and 3 * len(arrays[at]) + 1 == values.shape[1]
         }
-        stored["static"] = bool(arrays.get(f"{prefix}static", False))
+        for flag in ("static", "slender"):
+            stored[flag] = bool(arrays.get(f"{prefix}{flag}", False))
         _require_shapes(stored)
         stored["marker_names"] = [str(marker) for marker in arrays[f"{prefix}marker_names"]]
         names_key = "part_names" if "part_names" in shared else f"{prefix}part_names"

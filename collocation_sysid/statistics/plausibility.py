@@ -142,10 +142,12 @@ def _likely_density(body: Body, density_kg_m3: float, size_m: float) -> str:
 def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
     """Return the hypothesis "density/metal" that no material is as dense and as soft as a body with
     constants θ (k,); None if there may be one: with a density below `METAL_KG_M3`, or a Young's
-    modulus of the stiffest part above `SOFTEST_METAL_PA`.
+    modulus of the stiffest part above `SOFTEST_METAL_PA`, and for cables of wires.
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
+    if body.is_slender:
+        return None
     density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
     young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())
     if density_kg_m3 < METAL_KG_M3 or young_pa > SOFTEST_METAL_PA:

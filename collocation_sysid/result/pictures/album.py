@@ -75,7 +75,8 @@ def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, F
     if with_mesh:
         body = with_mesh[0]
         pictures["mesh"] = mesh_picture(body)
-        pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
+        if not body.slender:
+            pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values=values)
     drawn = (named for replay in replays for named in experiment_pictures(replay))

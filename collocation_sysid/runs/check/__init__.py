@@ -85,7 +85,7 @@ EDGE_POWER = 4.5
 # Largest relative deviation from fourth-order central differences that rounding explains.
 DERIVATIVE_TOLERANCE = 1e-6
 SUBSTEPS_NOTE = (
-    "check assumes one time step per sample. If transcription.substeps is not given, solve uses "
+    "check assumes {} per sample. If transcription.substeps is not given, solve uses "
     f"as many as the error bars require, up to {MOST_SUBSTEPS}"
 )
 
@@ -329,7 +329,11 @@ def check_problem(
         )
     if problem.substeps == "auto" and findings.motions:
         steps = problem.choose_first_substeps()
-        notes.append(SUBSTEPS_NOTE if steps == 1 else IMPACT_NOTE.format(steps))
+        has_obstacles = any(e.obstacles for e in problem.experiments)
+        if steps > 1 and has_obstacles:
+            notes.append(IMPACT_NOTE.format(steps))
+        else:
+            notes.append(SUBSTEPS_NOTE.format(f"{steps} time step{'s' * (steps > 1)}"))
     search_s = chosen_cost.time_s if chosen_cost else None
     if first_s == np.inf:
         largest = max(findings.bodies, key=lambda body: body.nodes)

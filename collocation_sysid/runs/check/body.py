@@ -250,7 +250,7 @@ def check_body(
         part.field_name: part.field.describe_resolution() for part in body.parts if part.field
     }
     quality = mesh.quality()
-    worst = worst_elements(mesh)
+    worst = () if body.is_slender else worst_elements(mesh)
     shape = slenderness(mesh)
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
     return BodyCheck(
@@ -269,7 +269,11 @@ def check_body(
         cells_across=shape[2],
         guess=_constants_at_guess(body, theta),
         concerns=(
-            *(() if is_homogeneous else element_concerns(body, theta, shape=shape, worst=worst[0])),
+            *(
+                element_concerns(body, theta, shape=shape, worst=worst[0])
+                if worst and not is_homogeneous
+                else ()
+            ),
             *rest_stability_concerns(body, theta),
             *(() if is_homogeneous else density_concerns(body)),
             *(() if is_homogeneous else _field_concerns(fields)),
@@ -309,8 +313,10 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     """Return E [Pa] and ν of each part, then the constants; stated moduli replace computed ones."""
     moduli = {}
-    for part, lame in zip(body.parts, body.lame(theta).values(), strict=True):
-        young, poisson = engineering_constants(*lame)
+    # Stiffnesses of a section follow from no modulus, or E and ν are constants.
+    moduli_of_parts = body.lame(theta)
+    for part in () if body.is_slender else body.parts:
+        young, poisson = engineering_constants(*moduli_of_parts[part.name])
         moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
     constants = zip(body.constants, theta.tolist(), strict=True)
     coefficients = body.field_coefficient_names
