@@ -38,6 +38,7 @@ from ..recording import (
     read_wrench,
 )
 from ..recording.alignment import AlignedRecording
+from ..recording.experiment import require_no_surface
 from ..recording.gap_interpolation import interpolation_error
 from ..recording.measured_faces import face_note, read_face
 from ..recording.poses import require_determined_motion
@@ -113,10 +114,6 @@ class RecordingReader:
     size: Size | None = None  # size of the problem with one sample; None skips the check of memory
     say: Say | None = None  # function that is called with a sentence before long work
 
-    def __post_init__(self) -> None:
-        if self.section.markers.s_m:
-            self.section = _with_places_on_rod(self.section, self.body)
-
     def read(self) -> Experiment:
         """Read all files of the experiment and return it; notes are added to `notes`.
 
@@ -129,6 +126,16 @@ class RecordingReader:
             Names the file and line, or the key within the experiment's table. Also if all nodes are
             grasped, or if the problem exceeds this machine's memory.
         """
+        if self.body.is_slender:
+            loads = [
+                key for key in ("obstacle", "tendon", "pressure") if getattr(self.section, key)
+            ]
+            images = [
+                key for key in ("depth", "outlines") if key in self.section.measurement_tables
+            ]
+            require_no_surface([*loads, *images])
+        if self.section.markers.s_m:
+            self.section = _with_places_on_rod(self.section, self.body)
         section = self.section
         aligned = self._align([*map(self._poses, range(len(section.moved_sections)))])
         t_s = aligned.t_s

@@ -121,6 +121,7 @@ class Depth(Measurement):
     sigma_text: ClassVar[str] = "its sigma_m"
     points_name: ClassVar[str] = "depth points"
     precedence: ClassVar[int] = 1
+    needs_surface: ClassVar[bool] = True
 
     name: str
     t_s: Array = key(converter=unconverted)

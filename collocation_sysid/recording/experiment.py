@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
 from itertools import combinations
@@ -51,6 +51,15 @@ FLATNESS = 1e-4
 # Default gravity [m/s²], with z upwards.
 EARTH_M_S2 = (0.0, 0.0, -9.81)
 DEFAULT_NUISANCE = Nuisance()
+
+
+def require_no_surface(found: Sequence[str]) -> None:
+    """Raise an `InputError` if anything was found that only a solid body can have."""
+    if found:
+        raise InputError(
+            f"found {listed(found)} of a rod; expected a solid body, because a rod has no surface: "
+            "leave out obstacles, tendons, pressures, depth images and outlines"
+        )
 
 
 def _state(name: str) -> Callable[[ArrayLike], Array]:
@@ -186,6 +195,8 @@ class Experiment:
     def __post_init__(self) -> None:
         """Append the frames of the obstacles to the body, put obstacles last, and resolve nodes."""
         loads = ("masses", "forces", "tendons", "pressures")
+        if self.body.is_slender:
+            self._require_no_surface()
         vars(self)["body"] = with_obstacle_frames(
             self.body, self.obstacles, is_static=self.is_static
         )
@@ -803,6 +814,11 @@ class Experiment:
                     f"where {1e3 * apart_m:.4g} mm are between them; expected less: check the unit, the "
                     "sign and the scale of the displacement"
                 )
+
+    def _require_no_surface(self) -> None:
+        found = {"obstacle": self.obstacles, "tendon": self.tendons, "pressure": self.pressures}
+        surfaces = [each for each in self.separate_sensors if each.needs_surface]
+        require_no_surface([*filter(found.get, found), *(each.title for each in surfaces)])
 
     def _check_obstacles(self) -> None:
         names = [obstacle.name for obstacle in self.obstacles]

@@ -44,6 +44,8 @@ class Measurement:
     counts_pixels : bool
         Whether its numbers are pixels from a corner of an image: their sign, unit and zero cannot be
         wrong, and a flipped image shows a mirror image of the body.
+    needs_surface : bool
+        Whether it observes the surface of the body, which a rod does not have.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # subclasses are dataclasses
@@ -56,6 +58,7 @@ class Measurement:
     points_name: ClassVar[str] = "points"
     precedence: ClassVar[int] = 3
     counts_pixels: ClassVar[bool] = False
+    needs_surface: ClassVar[bool] = False
     sigma_ratios: Array | None = None
 
     @property

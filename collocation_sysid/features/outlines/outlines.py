@@ -68,6 +68,7 @@ class Outlines(CameraImages):
     noise_key: ClassVar[str] = "sigma_px of outlines"
     sigma_text: ClassVar[str] = "its sigma_px"
     precedence: ClassVar[int] = 2
+    needs_surface: ClassVar[bool] = True
     suffix: ClassVar[str] = ".json"
 
     masks: Sequence[Mask | None] | None = key(converter=identity_or_none, default=None)
