@@ -45,7 +45,7 @@ class IdentifiedRegion:
     cells: Index  # (k,): indices of its elements
     material: str
     constants: Mapping[str, float]  # mapping of name to value: constants of the material
-    # Elastic constants at rest and small strain, of the long-term energy.
+    # Elastic constants at rest and small strain, of the long-term energy; NaN for a cable.
     lambda_pa: float
     mu_pa: float
     young_pa: float
@@ -352,6 +352,8 @@ class IdentifiedBody:
         body = self.body
         regions = []
         lame = body.lame(self.theta)
+        cables = (each.name for each in body.parts if each.material.name == "cable")
+        lame |= dict.fromkeys(cables, (np.nan, np.nan))
         shares = body.split_theta(self.theta)
         densities = body.densities(self.theta)
         for part, share, density in zip(body.parts, shares, densities, strict=True):

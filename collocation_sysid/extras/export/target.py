@@ -15,6 +15,7 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ...errors import InputError, printable
 from ...fem.meshes.refinement import split_in_eight
+from ...fem.rods import LAWS as LAWS_OF_RODS
 from ...model.forces import Forces
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.simulation import simulate
@@ -28,9 +29,9 @@ _CALCULIX = (
 # Laws that each target has, by the names of `IdentifiedBody.laws`; the json file has all. Newton has
 # that of its `SolverVBD`, with which it also reads a stage.
 LAWS: Mapping[str, tuple[str, ...]] = {
-    "mujoco": ("st-venant-kirchhoff", "rod", "cable"),
+    "mujoco": ("st-venant-kirchhoff", *LAWS_OF_RODS),
     "newton": ("stable-neo-hookean",),
-    "usd": ("stable-neo-hookean",),
+    "usd": ("stable-neo-hookean", *LAWS_OF_RODS),
     "calculix": _CALCULIX,
     "abaqus": (*_CALCULIX, "ogden-4", "hyperfoam-4", "neo-hookean with dispersed fibres"),
     "febio": (
@@ -319,9 +320,11 @@ def comment_lines(
         *(f"not expressed: {limit}" for limit in limitations),
     ]
     for region in body.regions:
+        stiffness = f"E = {region.young_pa:.6g} Pa, nu = {region.poisson:.6g}"
+        if np.isnan(region.young_pa):
+            stiffness = ", ".join(f"{name} = {v:.6g}" for name, v in region.constants.items())
         lines.append(
-            f"{region.name}: {region.material}, E = {region.young_pa:.6g} Pa, "
-            f"nu = {region.poisson:.6g}, density = {region.density_kg_m3:.6g} kg/m3, "
+            f"{region.name}: {region.material}, {stiffness}, density = {region.density_kg_m3:.6g} kg/m3, "
             f"gamma_r = {region.gamma_r_s:.6g} s ({region.damping}), "
             f"gamma_m = {region.gamma_m_1_s:.6g} 1/s"
         )

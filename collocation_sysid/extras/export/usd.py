@@ -1,13 +1,15 @@
-"""OpenUSD: a tetrahedral mesh with the schemas for deformable bodies that Newton and Isaac read.
+"""OpenUSD: a tetrahedral mesh, or the centreline of a rod, with the schemas for deformable bodies
+that Newton and Isaac read.
 
 The schemas are those of the proposal for deformables in USD physics. They have Young's modulus,
-Poisson's ratio, density and masses, and no damping, which is stored in custom attributes.
+Poisson's ratio, density and masses; those of curves have stiffnesses over the area and the second
+moments of a circle of their thickness. Damping is stored in custom attributes.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import InputError, printable
+from ...fem.rods import CrossSection, RodMaterial, RodMesh, frames_of_sections
 from ...recording import Grasp, Obstacle
 from .identified import IdentifiedBody, IdentifiedRegion
 from .newton import compare_at_rest
@@ -32,6 +35,7 @@ from .target import (
 
 STAGE_FILE = "body.usda"
 ATTRIBUTE_NAMESPACE = "collocationSysid"
+MESH_PATH = "/World/Body/Mesh"  # of the mesh or the centreline
 CAPABILITIES = TargetCapabilities(
     stiffness_damping="damping γ_r is not part of the USD schemas: it is exported as a custom attribute",
     mass_damping="γ_m = {gamma_m_1_s:.4g} 1/s is not part of the USD schemas: it is exported as a custom "
@@ -62,6 +66,10 @@ NO_SIMULATION = (
 LEAST_TILT_DEG = 1e-3
 # Frames per second of a single sample, which has no rate of its own.
 SINGLE_RATE_HZ = 24.0
+CURVE_ROUND = (
+    "the section is a circle of the same stiffnesses; that of bending is the mean about both axes"
+)
+CURVE_NATURAL = "natural curvature and twist are not part of the USD schemas"
 SINGLE_AXES = "nodes that are held along single axes only are free"
 
 
@@ -76,8 +84,11 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     """
     require_known_laws(body, "usd")
     pxr = _import_usd()
-    limits = [*CAPABILITIES.limitations(body), READERS_LAW, SINGLE_PRECISION]
-    limits += [REGIONS] * (len(body.regions) > 1)
+    limits = [*CAPABILITIES.limitations(body), SINGLE_PRECISION]
+    if body.body.is_slender:
+        limits += _curve_limitations(body)
+    else:
+        limits += [READERS_LAW, *[REGIONS] * (len(body.regions) > 1)]
     limits += [SINGLE_AXES] * bool(
         (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any()
     )
@@ -103,7 +114,8 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     scene.CreateGravityMagnitudeAttr(size)
     scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist()))
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
-    _add_mesh(pxr, stage, body=body, start_positions_m=placed_m)
+    add = _add_curve if body.body.is_slender else _add_mesh
+    add(pxr, stage, body=body, start_positions_m=placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         _add_gripper(pxr, stage, number=k, grasp=grasp, body=body, start_positions_m=placed_m)
     for k, obstacle in enumerate(body.obstacles, start=1):
@@ -133,21 +145,97 @@ def _import_usd() -> Any:
     return SimpleNamespace(**{each.__name__.rpartition(".")[2]: each for each in modules})
 
 
-def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
+def _curve_limitations(body: IdentifiedBody) -> list[str]:
+    """Return what a curve cannot express; raise an `InputError` for regions and point masses."""
+    if len(body.regions) > 1 or body.point_masses_kg.any():
+        raise InputError(
+            "a cable with regions or point masses is not exported to usd; expected --to json"
+        )
+    law = body.body.parts[0].material
+    assert isinstance(law, RodMaterial)
+    about_1, about_2 = law.section.moments_m4
+    is_round = np.isclose(about_1, about_2)
+    return [CURVE_NATURAL] * law.has_natural_curvature + [CURVE_ROUND] * (not is_round)
+
+
+def _add_curve(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
+    """Add the centreline with the normal d₁ of each section."""
+    curve = pxr.UsdGeom.BasisCurves.Define(stage, MESH_PATH)
+    tokens = pxr.UsdGeom.Tokens
+    curve.CreateTypeAttr(tokens.linear)
+    curve.CreateWrapAttr(tokens.nonperiodic)
+    prim = _add_points(pxr, stage, curve, body, start_positions_m, "PhysicsCurvesDeformableSimAPI")
+    count = len(start_positions_m) // 3
+    curve.CreateCurveVertexCountsAttr([count])
+    part, region, mesh = body.body.parts[0], body.regions[0], body.body.mesh
+    assert isinstance(part.material, RodMaterial)
+    assert isinstance(mesh, RodMesh)
+    section = part.material.section
+    thickness_m = 2 * float(np.sqrt(np.prod(section.extent_m)))
+    curve.CreateWidthsAttr([thickness_m])
+    curve.SetWidthsInterpolation(tokens.constant)
+    curve.SetNormalsInterpolation(tokens.vertex)
+    types = pxr.Sdf.ValueTypeNames
+    rest_m, frames = frames_of_sections(body.body.nodes_m)
+    normals = frames[:, :, 1]
+    if mesh.is_straight_at_rest:
+        rest_m, normals = np.outer(mesh.s_m, [1, 0, 0]), np.tile([0, 1, 0], (count, 1))
+    for name, kind, values in (
+        ("restShapePoints", types.Point3fArray, rest_m),
+        ("restNormals", types.Normal3fArray, normals),
+    ):
+        prim.CreateAttribute(f"physics:{name}", kind, False).Set(values.astype(np.float32))
+    masses = prim.CreateAttribute("physics:masses", types.FloatArray, False)
+    masses.Set(body.node_mass_kg.reshape(count, 3).sum(axis=1).astype(np.float32))
+    held = body.is_node_prescribed.reshape(count, 3).all(axis=1)
+    grasped = prim.CreateAttribute(f"{ATTRIBUTE_NAMESPACE}:graspedPoints", types.IntArray)
+    grasped.Set(np.flatnonzero(held).astype(np.int32))
+    shear, _, axial, bend_1, bend_2, twist = part.material.stiffness(
+        [region.constants[constant.name] for constant in part.material.constants]
+    )
+    circle = CrossSection.round(thickness_m)
+    (moment, _), area = circle.moments_m4, circle.area_m2
+    values = {
+        "physics:thickness": thickness_m,
+        "physics:density": body.node_mass_kg.sum() / (area * mesh.s_m[-1]),
+        "physics:stretchStiffness": axial / area,
+        "physics:shearStiffness": shear / area,
+        "physics:bendStiffness": (bend_1 + bend_2) / 2 / moment,
+        "physics:twistStiffness": twist / circle.torsion_m4,
+    }
+    material = _add_material(pxr, stage, region, region.name, values, "Curves")
+    _bind_material(pxr, prim, material=material)
+
+
+def _add_points(
+    pxr: Any, stage: Any, shape: Any, body: IdentifiedBody, start_positions_m: Array, schema: str
+) -> Any:
+    """Set the points of the body, and of a curve its normals; return its prim."""
     body_prim = pxr.UsdGeom.Xform.Define(stage, "/World/Body").GetPrim()
     body_prim.AddAppliedSchema("PhysicsDeformableBodyAPI")
-    mesh = pxr.UsdGeom.TetMesh.Define(stage, "/World/Body/Mesh")
-    cells = linear_tetrahedra(body)
-    prim = mesh.GetPrim()
-    prim.AddAppliedSchema("PhysicsVolumeDeformableSimAPI")
+    prim = shape.GetPrim()
+    prim.AddAppliedSchema(schema)
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
-    # Default positions for simulators; time samples for playback.
-    points = mesh.CreatePointsAttr(start_positions_m.astype(np.float32))
+    is_curve = body.body.is_slender
+    points, normals = shape.CreatePointsAttr(), shape.CreateNormalsAttr() if is_curve else None
     t_s = body.experiment.t_s
     codes = (_rate_hz(t_s) * t_s).tolist()
-    if body.simulated_m is not None:
-        for code, shape_m in zip(codes, body.simulated_m, strict=True):
-            points.Set(shape_m.astype(np.float32), code)
+    # Default positions for simulators; time samples for playback.
+    times = [pxr.Usd.TimeCode.Default(), *([] if body.simulated_m is None else codes)]
+    moving = () if body.simulated_m is None else body.simulated_m
+    for time, nodes_m in zip(times, [start_positions_m, *moving], strict=True):
+        placed_m = nodes_m
+        if normals:
+            placed_m, frames = frames_of_sections(nodes_m)
+            normals.Set(frames[:, :, 1].astype(np.float32), time)
+        points.Set(placed_m.astype(np.float32), time)
+    return prim
+
+
+def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:
+    mesh = pxr.UsdGeom.TetMesh.Define(stage, MESH_PATH)
+    cells = linear_tetrahedra(body)
+    prim = _add_points(pxr, stage, mesh, body, start_positions_m, "PhysicsVolumeDeformableSimAPI")
     mesh.CreateTetVertexIndicesAttr(np.concatenate(cells).astype(np.int32))
     mesh.CreateSurfaceFaceVertexIndicesAttr(pxr.UsdGeom.TetMesh.ComputeSurfaceFaces(mesh))
     number = pxr.Sdf.ValueTypeNames
@@ -160,7 +248,21 @@ def _add_mesh(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Arr
     grasped.Set(np.flatnonzero(body.is_node_prescribed).astype(np.int32))
     names = _unique_prim_names([region.name for region in body.regions])
     pairs = zip(body.regions, names, strict=True)
-    materials = [_add_material(pxr, stage, region=region, name=name) for region, name in pairs]
+    materials = [
+        _add_material(
+            pxr,
+            stage,
+            region,
+            name,
+            {
+                "physics:youngsModulus": region.young_pa,
+                "physics:poissonsRatio": region.poisson,
+                "physics:density": region.density_kg_m3,
+            },
+            "Volume",
+        )
+        for region, name in pairs
+    ]
     _bind_material(pxr, prim, material=materials[int(np.argmax([len(each) for each in cells]))])
     firsts = np.cumsum([0, *map(len, cells)])
     for k, material in enumerate(materials if len(cells) > 1 else ()):
@@ -179,15 +281,19 @@ def _cell_masses_kg(body: IdentifiedBody, cells: list[Index]) -> Array:
     return np.concatenate([region.density_kg_m3 * volume for region, volume in pairs])
 
 
-def _add_material(pxr: Any, stage: Any, region: IdentifiedRegion, name: str) -> Any:
+def _add_material(
+    pxr: Any,
+    stage: Any,
+    region: IdentifiedRegion,
+    name: str,
+    physics: Mapping[str, float],
+    kind: str,
+) -> Any:
     """Add a region's material under /World/Materials/`name`."""
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
-    prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
-    values = {
-        "physics:youngsModulus": region.young_pa,
-        "physics:poissonsRatio": region.poisson,
-        "physics:density": region.density_kg_m3,
+    prim.AddAppliedSchema(f"Physics{kind}DeformableMaterialAPI")
+    values = physics | {
         f"{ATTRIBUTE_NAMESPACE}:gammaR_s": region.gamma_r_s,
         f"{ATTRIBUTE_NAMESPACE}:gammaM_1_s": region.gamma_m_1_s,
     }
@@ -230,13 +336,16 @@ def _add_gripper(
         t_s=body.experiment.t_s,
     )
     nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.is_node_prescribed))
+    points_m = start_positions_m
+    if body.body.is_slender:
+        nodes, points_m = nodes[::3] // 3, frames_of_sections(start_positions_m)[0]
     prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
     types = pxr.Sdf.ValueTypeNames
-    for name, target in (("src0", "/World/Body/Mesh"), ("src1", path)):
+    for name, target in (("src0", MESH_PATH), ("src1", path)):
         prim.CreateRelationship(f"physics:{name}", False).SetTargets([pxr.Sdf.Path(target)])
     for name, text in (("type0", "point"), ("type1", "xform")):
         _set_token(pxr, prim, name=f"physics:{name}", text=text)
-    local_m = (start_positions_m[nodes] - positions_m[0]) @ matrices[0]
+    local_m = (points_m[nodes] - positions_m[0]) @ matrices[0]
     for name, kind, values in (
         ("indices0", types.IntArray, nodes.astype(np.int32)),
         ("coords1", types.Vector3fArray, local_m.astype(np.float32)),
@@ -327,10 +436,12 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     Raises
     ------
     InputError
-        If Newton is not installed.
+        If Newton is not installed, and for a rod.
     SimulationError
         If the equilibrium of this package cannot be computed.
     """
+    if body.body.is_slender:
+        raise InputError("a cable is verified in MuJoCo alone; expected --to mujoco --verify")
 
     def add_to(builder: Any) -> None:
         # Grippers are left out, since Newton would simulate them too.
