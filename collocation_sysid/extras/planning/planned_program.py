@@ -179,6 +179,12 @@ class PlannedProgram:
                 None,
                 where="avoid.clearance_m",
             )
+        if task.avoid.largest_stretch is not None and template.body.is_slender:
+            raise InputError(
+                "a rod hardly stretches; expected largest_stretch for a solid body",
+                None,
+                where="avoid.largest_stretch",
+            )
         usual_s = task.duration_s / EQUILIBRIA if template.is_static else template.timestep_s
         sample_s = task.sample_s or usual_s
         count = round(task.duration_s / sample_s)
