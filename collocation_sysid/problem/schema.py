@@ -325,6 +325,10 @@ class ObjectSection(Section):
                 "section is missing; expected the cross-section of the rod, such as "
                 "section = { diameter_m = 0.006 }"
             )
+        if "material" in self.model_fields_set and self.material not in ROD_LAWS:
+            raise ValueError(
+                f"found material = {self.material!r} for a rod; expected 'rod' (E and ν) or 'cable'"
+            )
         if len(used_keys(self, "mass_kg", "density_kg_m3", "mass_per_length_kg_m")) > 1:
             require_one(self, "mass_kg", "density_kg_m3", "mass_per_length_kg_m")
         if solid := [

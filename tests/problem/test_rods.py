@@ -76,6 +76,13 @@ def test_the_rest_shape_of_a_curved_centreline_is_as_stated(rest_shape, problem)
         ("diameter_m = 0.006", "width_m = 0.006", "width_m and height_m"),
         ("length_m = 0.6  ", "box_m = [0.1, 0.1, 0.1]\nedge_length_m = 0.05", "without centreline"),
         ('material = "cable"', 'material = "yeoh"', "'rod' (E and ν) or 'cable'"),
+        ('material = "cable"', 'material = "neo-hookean"', "'rod' (E and ν) or 'cable'"),
+        (
+            "s_m = [0.0, 0.05] }",
+            "box_m = [[-1, -0.0005, -1], [0.05, 1, 1]] }",
+            "only some nodes of the rod's section at 0 m",
+        ),
+        ("s_m = [0.0, 0.05] }", 'face = "top" }', "expected whole sections"),
         ('material = "cable"', 'material = "cable"\nelement = "tet10"', "element for a rod"),
         ("tip = 0.6 }", "tip = 0.7 }", "0.7"),
         ("s_m = [0.0, 0.05]", "s_m = [0.05, 0.0]", "the first arc length"),

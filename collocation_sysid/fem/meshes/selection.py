@@ -28,9 +28,9 @@ class _PositionSelection:
     def resolve(self, nodes: ElementNodes) -> np.ndarray:
         """Return the sorted indices of the selected nodes, mid nodes included."""
         hint = self._nearest_hint(nodes.points_m)
-        return _indices_or_error(
-            self._contains(nodes.points_m), nodes.mesh, what=str(self), of="nodes" + hint
-        )
+        mask = self._contains(nodes.points_m)
+        _require_whole_sections(mask, nodes.mesh, what=str(self))
+        return _indices_or_error(mask, nodes.mesh, what=str(self), of="nodes" + hint)
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
         """Return the indices of the cells whose centres are inside, sorted int64."""
@@ -160,6 +160,7 @@ class Face(_PositionSelection):
         mask = self._contains(points_m)
         if self.name.startswith("side"):
             mask &= ~(Face("top")._contains(points_m) | Face("bottom")._contains(points_m))
+        _require_whole_sections(mask, nodes.mesh, what=str(self))
         return _indices_or_error(mask, nodes.mesh, what=str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
@@ -445,6 +446,20 @@ def _indices_or_error(
         missed = missed or f"selects none of the {len(mask)} {of}"
         raise InputError(f"{what} {missed}; the body spans {_describe_bounds(mesh.bounds_m)}")
     return np.flatnonzero(mask).astype(np.int64)
+
+
+def _require_whole_sections(mask: np.ndarray, mesh: TetMesh, what: str) -> None:
+    """Raise an `InputError` if a mask of nodes cuts a cross-section of a rod."""
+    if mesh.arc_lengths_m is None:
+        return
+    s_m, section = np.unique(mesh.arc_lengths_m, return_inverse=True)
+    count = np.bincount(section, weights=mask)
+    cut = np.flatnonzero((count > 0) & (count < np.bincount(section)))
+    if len(cut):
+        raise InputError(
+            f"{what} has only some nodes of the rod's section at {s_m[cut[0]]:.4g} m; expected whole "
+            "sections, such as s_m = [first, last]"
+        )
 
 
 def _describe_bounds(bounds_m: np.ndarray) -> str:
