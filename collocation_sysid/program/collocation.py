@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -43,7 +43,7 @@ import scipy.sparse as sp
 from ..common.array_types import Array, Index
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
-from ..errors import InputError
+from ..errors import InputError, require_among
 from ..fem.schemes import Scheme, as_scheme
 from ..model.parameters import Parameters
 from ..recording.experiment import Experiment
@@ -763,8 +763,10 @@ class Collocation:
         Raises
         ------
         InputError
-            If the program eliminates variables, or a parameter has no guess.
+            If the program eliminates variables, a parameter has no guess, or `hessian` is another
+            text.
         """
+        require_among(hessian, get_args(Hessian), where="hessian")
         if self.eliminates_variables:
             raise InputError(
                 "this program eliminates history variables, measured reactions or pressures of "

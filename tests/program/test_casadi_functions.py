@@ -97,6 +97,11 @@ def test_other_solvers_have_no_direct_derivatives():
         cube().casadi().derivatives("fatrop")
 
 
+def test_a_program_has_no_other_hessians():
+    with pytest.raises(cs.InputError, match="'bfgs'; expected one of"):
+        cube().casadi("bfgs")  # pyright: ignore
+
+
 def test_patterns_are_drawn():
     figure = cube().plot()
     jacobian, hessian = figure.axes
