@@ -281,14 +281,15 @@ def _with_posterior(
         order = as_scheme(problem.scheme).order
         discretisation["time_step"] = [extrapolated(each[..., None], order) for each in steps]
     rows = _row_count(solution)
+    by_mesh = None
     notes = answer.notes
-    say("estimating the error of the mesh")
-    with counted_phase(StepUnit.TIME_STEP, rows):
-        changes, by_mesh, note = mesh_changes(problem, solution, fit)
-    if note and not problem.uncertainty.numerical:
-        notes = (*notes, note)
-    if by_mesh is not None:
-        discretisation["mesh"] = [extrapolated(each, MESH_ORDER) for each in changes]
+    if not problem.uncertainty.numerical:
+        say("estimating the error of the mesh")
+        with counted_phase(StepUnit.TIME_STEP, rows):
+            changes, by_mesh, note = mesh_changes(problem, solution, fit)
+        notes = (*notes, note) if note else notes
+        if by_mesh is not None:
+            discretisation["mesh"] = [extrapolated(each, MESH_ORDER) for each in changes]
     say("computing the effects of assumptions")
     # One sweep for the assumptions, and one for the nuisance parameters that are not estimated.
     with counted_phase(StepUnit.TIME_STEP, 2 * rows):

@@ -15,11 +15,9 @@ information, that of an estimate with derivative g by q contains (gᵀ C_k)² fo
 is the standard deviation of its prior.
 
 The error of the mesh and of the time step are effects with a mean: that of the estimated change to
-elements, or steps, of half the length, extrapolated to infinitely small ones. No residual shows the
-part of this change that a change of the constants would cause too: it is considered, not learnt. The
-data learn the size of the rest, which says nothing about this part, because the shape of the change
-is known as badly as its size: each channel (one number of a marker over time) has an amplitude of
-its own with the same deviation, which is considered.
+elements, or steps, of half the length, extrapolated to infinitely small ones. The data learn its
+size, but not its shape, which is known as badly: each channel (one number of a marker over time) has
+an amplitude of its own with the same deviation, which is considered.
 
 A single curve of a static test does not tell effects from each other, nor from the law of the
 material, which is never exact. There effects are considered but not learnt: the estimates are
@@ -126,6 +124,13 @@ class Effects:
             sizes[seen],
         )
 
+    def without(self, rows: Iterable[str]) -> Effects:
+        """Return the effects without those of some rows, by name."""
+        left_out = set(rows)
+        return self.only(
+            k for k, name in enumerate(self.names) if name.partition(" ")[0] not in left_out
+        )
+
     def only(self, indices: Iterable[int]) -> Effects:
         """Return some of the effects."""
         kept = list(indices)
@@ -135,22 +140,6 @@ class Effects:
             self.means[kept],
             self.deviations[kept],
         )
-
-    def divided(self, fit: LinearisedFit, count: int) -> tuple[Effects, Effects]:
-        """Return the effects without the part of the errors of mesh and time step that the first
-        `count` parameters of a fit without effects would cause, and this part.
-        """
-        places = [k for k, name in enumerate(self.names) if effect_row(name) in DISCRETISATION]
-        of_parameters = self.only(places)
-        changes = -estimate_changes(fit, of_parameters.blocks)[:count]
-        rest, parts = [], []
-        for block, own in zip(fit.blocks, self.blocks, strict=True):
-            part = block.jacobian[..., :count] @ changes / block.compute_root_weight()[..., None]
-            left = own.copy()
-            left[..., places] -= part
-            rest.append(left)
-            parts.append(part)
-        return replace(self, blocks=tuple(rest)), replace(of_parameters, blocks=tuple(parts))
 
     def added_to(self, fit: LinearisedFit, parameters: Parameters) -> tuple[LinearisedFit, Array]:
         """Return the fit with the effects as its last parameters, and their definition: the matrix
@@ -240,6 +229,7 @@ class Posterior:
     definition: Array  # (p + a, p + a): turns parameters and learnt effects into those of the body
     step: Array  # (p + a,): step of all parameters and learnt effects
     uncertainty: Uncertainty  # of the fit after the step
+    reported_q: Array  # (nq,): q of `uncertainty`, after the step
 
     @classmethod
     def from_fit(
@@ -260,13 +250,12 @@ class Posterior:
         fit : LinearisedFit
             Linearised fit at q (nq,), without effects.
         is_learnt : bool
-            Whether the data correct the effects; never what `Effects.divided` separates.
+            Whether the data correct the effects.
         derived_at : callable, optional
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
-        learnt, considered = effects.only(()), effects
-        if is_learnt:
-            learnt, considered = effects.divided(fit, len(q))
+        none = effects.only(())
+        learnt, considered = (effects, none) if is_learnt else (none, effects)
         wide, definition = learnt.added_to(fit, parameters)
         step = gauss_newton_step(wide)
         after = wide.after_step(step)
@@ -276,7 +265,7 @@ class Posterior:
             after = replace(after, derived=derived_at(there))
         uncertainty = uncertainty_from_fit(after, parameters, there, error_model)
         wide = replace(wide, derived=after.derived)
-        return cls(wide, parameters, q, learnt, considered, definition, step, uncertainty)
+        return cls(wide, parameters, q, learnt, considered, definition, step, uncertainty, there)
 
     @cached_property
     def q(self) -> Array:
@@ -305,36 +294,62 @@ class Posterior:
 
     @cached_property
     def sources(self) -> tuple[tuple[str, ...], Array]:
-        """Names of the learnt and of the considered effects, and changes (p + a, …) of all parameters
-        and learnt effects if each is off by the standard deviation of its prior; errors of mesh and
-        time step that are divided occur again, once for each channel.
+        """Names of the effects, and changes (nq, a) of q if each is off by the standard deviation of
+        its prior; mesh and time step occur again, once for each channel.
         """
-        considered = estimate_changes(self.fit, self.considered.blocks)
-        ways = [self.covariance[:, self._of_effects], considered]
+        names, ways = self._sources
+        return names, ways[: len(self.start)]
+
+    @cached_property
+    def _sources(self) -> tuple[tuple[str, ...], Array]:
+        """The same for all parameters and learnt effects (p + a, a)."""
+        ways = [self.covariance[:, self._of_effects]]
+        ways.append(estimate_changes(self.fit, self.considered.blocks))
+        rows = {row.name for row in DISCRETISATION}
+        again = [k for k, name in enumerate(self.effects.names) if name in rows]
         names = (*self.effects.names, *self.considered.names)
-        for name, change in zip(self.considered.names, considered.T, strict=True):
-            if name in self.effects.names:
-                unknown = self._changes_by_channel(name, change)
-                ways.append(unknown)
-                names += (name,) * unknown.shape[1]
+        for k in again:
+            unknown = self._changes_by_channel(k) * self.effects.deviations[k]
+            ways.append(unknown)
+            names += (self.effects.names[k],) * unknown.shape[1]
         return names, np.hstack(ways)
 
-    def _changes_by_channel(self, name: str, change: Array) -> Array:
-        """Return the changes (p + a, c) by each channel alone of an effect that is divided; a channel
-        is one number of a marker over time. `change` (p + a,) is that by the considered part.
+    def _changes_by_channel(self, k: int) -> Array:
+        """Return the changes (p + a, c) by each channel of effect k alone, as large as it is
+        estimated; a channel is one number of a marker over time.
         """
-        place = self._of_effects[self.effects.names.index(name)]
-        column = -change
-        column[place] = 1.0
+        place = self._of_effects[k]
         scores = [
-            np.einsum("tmap,tma->pma", block.jacobian, block.jacobian @ column)
+            np.einsum("tmap,tma->pma", block.jacobian, block.jacobian[..., place])
             for block in self.fit.blocks
         ]
-        return -self.covariance @ np.hstack([each.reshape(len(each), -1) for each in scores])
+        flat = np.hstack([each.reshape(len(each), -1) for each in scores])
+        return -self.step[place] * self.covariance @ flat
 
     @property
     def _of_effects(self) -> Index:
         return np.arange(len(self.fit.names) - len(self.effects.names), len(self.fit.names))
+
+    def without(self, rows: Iterable[str]) -> Posterior:
+        """Return the posterior without some effects, with the same statistical uncertainty."""
+        first = len(self.fit.names) - len(self.effects.names)
+        left_out = set(rows)
+        kept = [
+            *range(first),
+            *(
+                first + k
+                for k, name in enumerate(self.effects.names)
+                if name.partition(" ")[0] not in left_out
+            ),
+        ]
+        fit = self.fit.only(kept, effect_count=len(kept) - first)
+        considered = self.considered.without(left_out)
+        learnt = self.effects.without(left_out)
+        definition = self.definition[np.ix_(kept, kept)]
+        step = gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
+        return replace(
+            self, fit=fit, effects=learnt, considered=considered, definition=definition, step=step
+        )
 
     def joint(self, transcriptions: Iterable[Transcription]) -> JointPosterior:
         """Return the joint posterior of what acts on the body in the fitted experiments, without the
@@ -350,14 +365,13 @@ class Posterior:
                 if acts and entry.row not in GRIP:
                     rows[name] = place, entry.sigma
         effects = (*self.effects.names, *self.considered.names)
-        # Of mesh and time step, the part that is considered acts on other motions too.
         for k, name in enumerate(effects, start=count - learnt):
             row = effect_row(name)
             if row.effect is not None or row in DISCRETISATION:
                 rows[EFFECT + name] = k, 1.0
         own = len(self.considered.names)
-        ways = np.pad(self.sources[1], ((0, own), (0, 0)))
-        ways[count:, learnt : learnt + own] = np.eye(own)
+        ways = np.pad(self._sources[1], ((0, own), (0, 0)))
+        ways[count:, :own] = np.eye(own)
         covariance = np.pad(self.uncertainty.noise_covariance, (0, own)) + ways @ ways.T
         scatter = self.uncertainty.scatter
         if scatter is not None:
@@ -379,7 +393,7 @@ class Posterior:
     @cached_property
     def derivatives(self) -> dict[str, Array]:
         """Derivatives (nq,) of each estimate by q, by name; zero for fixed ones."""
-        values = self.parameters.values(self.q)
+        values = self.parameters.values(self.reported_q)
         slopes = {name: np.zeros(len(self.start)) for name in values}
         for k, item in enumerate(self.parameters.free):
             slopes[item.name][k] = item.value_derivative(values[item.name])
@@ -410,25 +424,15 @@ class Posterior:
             np.sqrt(sum(self._systematic_variances(name, self._coordinate(name)).values()))
         )
 
-    def besides_discretisation(self, name: str, optimum: float) -> tuple[float, float]:
-        """Return the standard deviation of an estimate, and its change from the value `optimum` without
-        effects, in the coordinate of its interval, without what a refinement measures: the change of
-        the constants with finer meshes and steps.
+    def change(self, name: str, optimum: float) -> float:
+        """Return the change of an estimate from its value `optimum` without effects, in the coordinate
+        of its interval.
         """
-        linear, _ = self.parameters.scale_and_bounds(name)
         value = self.statistical[name].value
+        linear, _ = self.parameters.scale_and_bounds(name)
         at = IntervalCoordinate.for_estimate(name, (value, optimum), linear=linear)
-        names, ways = self.sources
-        first = len(self.effects.names)
-        measured = [k for k, each in enumerate(names) if effect_row(each) in DISCRETISATION]
-        measured = [k for k in measured if k >= first]
-        means = np.zeros(len(names))
-        means[first : first + len(self.considered.names)] = self.considered.means
-        parts = self.derivatives[name] @ ways[: len(self.start), measured]
-        change = at.from_value(value) - at.from_value(optimum)
-        change -= float(parts @ means[measured]) * at.derivative(value)
-        own = self._coordinate(name).derivative(value) * parts
-        return float(np.sqrt(max(0.0, self.systematic(name) ** 2 - own @ own))), change
+        besides = float(self.derivatives[name] @ (self.q - self.reported_q)) * at.derivative(value)
+        return at.from_value(value) - at.from_value(optimum) + besides
 
     def _coordinate(self, name: str) -> IntervalCoordinate:
         estimate = self.statistical[name]
@@ -443,7 +447,7 @@ class Posterior:
         by_q = self.derivatives[name] * at.derivative(self.statistical[name].value)
         variances: dict[str, float] = {}
         names, ways = self.sources
-        for effect, way in zip(names, by_q @ ways[: len(by_q)], strict=True):
+        for effect, way in zip(names, by_q @ ways, strict=True):
             row = effect.partition(" ")[0]
             variances[row] = variances.get(row, 0.0) + float(way) ** 2
         between = self._variance_between_recordings(name, at, by_q, sum(variances.values()))
@@ -520,7 +524,7 @@ class Posterior:
         """Return the covariance (nq, nq) due to noise and systematic effects in the coordinates of a
         statistical one, `sizes` (nq,) being the derivatives of these coordinates by q.
         """
-        ways = [self.sources[1][: len(self.start)]]
+        ways = [self.sources[1]]
         if self.uncertainty.scatter is not None:
             ways.append(self.uncertainty.scatter.sensitivities[: len(self.start)])
         moved = sizes[:, None] * np.hstack(ways)
@@ -564,7 +568,7 @@ class Posterior:
         out.
         """
         fit = self.fit
-        before = least_squares_of_fit(fit).loss(gauss_newton_step(fit))
+        before = least_squares_of_fit(fit).loss(self.step)
         found = []
         for name in dict.fromkeys(others.names):
             own = others.only(k for k, each in enumerate(others.names) if each == name)
@@ -578,7 +582,7 @@ class Posterior:
         suspects = []
         for gain, name, after in found:
             if gain > AS_WELL * most:
-                bars = uncertainty_from_fit(after, self.parameters, self.q, errors)
+                bars = uncertainty_from_fit(after, self.parameters, self.reported_q, errors)
                 suspects.append(EffectEstimate.beyond(name, gain, not fit_concerns(bars)))
         return tuple(suspects)
 

@@ -170,7 +170,7 @@ def _modulus_axis_sentence(answer: SolvedProblem) -> str:
     names, columns = answer.posterior.sources
     by_axis = {
         name.partition(" ")[2]: float(by_q @ way)
-        for name, way in zip(names, columns[: len(by_q)].T, strict=True)
+        for name, way in zip(names, columns.T, strict=True)
         if name.startswith("anisotropy")
     }
     axis = max(by_axis, key=lambda each: by_axis[each], default="")

@@ -29,6 +29,7 @@ from ..statistics.assessment import (
 from ..statistics.budget.combined_intervals import ReportedEstimate, combine
 from ..statistics.budget.discretisation_error import Refinement
 from ..statistics.budget.effect_estimates import EffectEstimate, JointPosterior, effect_concerns
+from ..statistics.budget.systematic_effects import DISCRETISATION
 from ..statistics.combinations import (
     Combination,
     Direction,
@@ -130,8 +131,13 @@ class SolvedProblem:
         if posterior is None or name not in self.budget:
             combined = ReportedEstimate(**vars(known))
         else:
-            systematic, change = posterior.besides_discretisation(name, optimum)
-            combined = replace(posterior.reported(name), systematic=systematic, known_effect=change)
+            combined = posterior.reported(name)
+            besides = self._besides_discretisation
+            combined = replace(
+                combined,
+                systematic=besides.systematic(name),
+                known_effect=besides.change(name, optimum),
+            )
         combined = replace(combined, optimum=optimum)
         if self.refinement is not None and name in self.refinement.errors:
             linear, bounds = self.solution.collocation.parameters.scale_and_bounds(name)
@@ -154,6 +160,12 @@ class SolvedProblem:
     def _statistical(self) -> dict[str, Estimate]:
         bars = self.uncertainty
         return {} if bars is None else {**bars.estimates, **bars.derived}
+
+    @cached_property
+    def _besides_discretisation(self) -> Posterior:
+        """The posterior without the errors of mesh and time step, which a refinement measures."""
+        assert self.posterior is not None
+        return self.posterior.without(row.name for row in DISCRETISATION)
 
     @property
     def optimum(self) -> dict[str, Estimate]:
@@ -492,7 +504,7 @@ class SolvedProblem:
 
     @property
     def _q(self) -> Array:
-        return self.solution.q if self.posterior is None else self.posterior.q
+        return self.solution.q if self.posterior is None else self.posterior.reported_q
 
     @property
     def _estimated_names(self) -> tuple[str, ...]:

@@ -274,8 +274,8 @@ class LinearisedFit:
             return self
         return self.only(range(len(self.names) - self.effect_count))
 
-    def only(self, kept: Sequence[int]) -> LinearisedFit:
-        """Return the fit of some of its parameters, none of which is an effect, the others unchanged."""
+    def only(self, kept: Sequence[int], effect_count: int = 0) -> LinearisedFit:
+        """Return the fit of some of its parameters, the others unchanged."""
         own = [*kept]
         blocks = (replace(b, jacobian=b.jacobian[..., own]) for b in self.blocks)
         return replace(
@@ -285,7 +285,7 @@ class LinearisedFit:
             prior_residual=self.prior_residual[own],
             prior_jacobian=self.prior_jacobian[own],
             at_bound=self.at_bound[own],
-            effect_count=0,
+            effect_count=effect_count,
         )
 
     @property

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
-from dataclasses import replace
-from functools import partial
-
 import numpy as np
 import pytest
-import study_image_tracks as filmed
 from study_effects import CONSTANTS, answer
-from study_independent_twins import compare
 
 import collocation_sysid as cs
 from collocation_sysid.judge.posterior import NOISE, NUISANCES, Effects, Posterior
@@ -173,41 +167,13 @@ def test_the_joint_posterior_has_the_constants_of_the_body(rng, is_learnt):
     np.testing.assert_allclose(raw @ joint.offset, defined @ step, atol=1e-9)
 
 
-def test_data_do_not_learn_the_part_of_a_mesh_error_that_is_a_change_of_constants(rng):
-    """Whatever they say of the rest, constants are corrected for this part and half of it."""
-    by_parameters, rest = slopes(rng, 4), slopes(rng, 1)
-    rest -= by_parameters @ np.linalg.lstsq(by_parameters, rest, rcond=None)[0]
-    change = np.array([0.1, -0.2, 0.05])
-    column = rest - by_parameters[:, :3] @ change[:, None]
-    noise = rng.normal(size=len(column))
-    residual = noise - 0.2 * column[:, 0]  # a fifth of the estimated error
-    found = posterior(linear_fit(by_parameters, residual), 0.5 * column, "mesh", means=2.0)
-    answer = posterior(linear_fit(by_parameters, residual), column[:, :0])
-    np.testing.assert_allclose(found.q, answer.q + change, atol=1e-9)
-    own = of_effect(found, "mesh")
-    assert own.value == pytest.approx(0.2, abs=0.05)
-    assert own.surprise < -1.4
-    for k, name in enumerate(PARAMETERS.names):
-        line = found.budget[name]
-        variance = (line.combined_std_error / line.value) ** 2
-        optimum = answer.statistical[name].value
-        systematic, besides = found.besides_discretisation(name, optimum)
-        assert besides == pytest.approx(0, abs=1e-9)
-        assert systematic < 0.01 * abs(change[k])
-        assert line.shares["mesh"] * variance > (0.5 * change[k]) ** 2
-    joint = found.joint(())
-    assert joint.offset == pytest.approx([*(answer.q - Q + change), 2.0])
-    np.testing.assert_allclose(joint.covariance[:3, 3], 0.5 * change, atol=1e-9)
-
-
-def test_an_error_of_the_mesh_does_not_make_other_effects_suspect(rng):
-    """What the correction for the mesh changes in the constants is no misfit of the data."""
-    by_parameters = slopes(rng, 4)
-    fit = linear_fit(by_parameters, rng.normal(size=len(by_parameters)))
-    by_constants = by_parameters[:, :1] + 0.01 * slopes(rng, 1)
-    found = posterior(fit, by_constants, "mesh", means=5.0)
-    for suspect in found.suspected(effects(slopes(rng, 1), "mass"), GIVEN):
-        assert suspect.surprise < 4
+def test_effects_without_some_are_those_of_a_fit_without_them(rng):
+    by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
+    fit = linear_fit(by_parameters, rng.normal(size=len(columns)))
+    whole = posterior(fit, columns, "mass", "grip_layer_m", "body_scale")
+    part = posterior(fit, columns[:, 1:], "grip_layer_m", "body_scale")
+    np.testing.assert_allclose(whole.without(["mass"]).q, part.q, atol=1e-9)
+    np.testing.assert_allclose(whole.without(["mass"]).covariance, part.covariance, atol=1e-9)
 
 
 @pytest.mark.long
@@ -245,16 +211,6 @@ def test_an_effect_that_the_data_cannot_see_leaves_the_value_and_adds_its_prior(
     np.testing.assert_allclose(added, np.diag([0.01, 0.0, 0.0]), atol=1e-9)
     assert found.systematic("young_pa") == pytest.approx(0.1)
     assert found.effect_estimates == ()
-
-
-def test_residuals_that_a_step_makes_smaller_are_no_outliers(rng):
-    """Of a fit with Huber's loss that shortened none; the noise is that of the sum of squares."""
-    by_parameters, column = slopes(rng, 4), slopes(rng, 1)
-    fit = linear_fit(by_parameters, rng.normal(size=len(column)) - 0.5 * column[:, 0])
-    blocks = tuple(replace(each, misfit=each.residual) for each in fit.blocks)
-    level = posterior(replace(fit, blocks=blocks), column, "mass").uncertainty.level
-    assert level.pooled == pytest.approx(1.0, abs=0.4)
-    assert level.pooled == pytest.approx(posterior(fit, column, "mass").uncertainty.level.pooled)
 
 
 def test_an_effect_that_the_data_determine_corrects_the_value_and_adds_nothing(rng):
@@ -305,16 +261,3 @@ def test_many_large_errors_of_the_description_do_not_lead_the_answer_away():
     answered = answer(0, (1, 1, 4))
     assert answered["verdict"] == "good"
     assert all(answered["constants"][name]["inside"] for name in CONSTANTS)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("number", [3, 10])
-def test_the_error_of_one_element_across_a_filmed_bar_is_in_the_interval(number: int):
-    """Its E would be 7 to 8 % too small; other effects explain the rest of the change by the mesh."""
-    options = Namespace(
-        places="unknown", turn_deg=2.0, shift_m=5e-3, focal=0.01, centre_px=2.0, rate_hz=None,
-        outliers=0.0, constants="young_pa,gamma_r_s", judged=True, below=False,
-    )  # fmt: skip
-    names = options.constants.split(",")
-    answered = compare(partial(filmed.problem, 1, number, options), filmed.TRUTH, number, names)
-    assert all(answered["constants"][name]["inside"] for name in names)
