@@ -85,7 +85,7 @@ class ThinnedStart(SmallerProblem):
             f"interrupted during the search with {point_counts(solution.collocation)}: the values "
             "do not fit all points best"
         )
-        return Start(collocation_with_all_points(problem, solution), solution.z, note)
+        return Start(collocation_with_all_points(problem, solution), solution.z, note=note)
 
     def notes(self, first: Solution, given: Solution, replaced: Sequence[str]) -> list[str]:
         return [
