@@ -166,7 +166,7 @@ BAR = {
 BENCH = {
     "noise of the load": ("sigma_n", "sigman"),
     "kind of the recording": ('"static"', '"statics"'),
-    "displacement of the platen": ("displacement =", "displacements ="),
+    "displacement of the platen": ("displacement =", "displacment ="),
     "face": ('face = "top"', 'faces = "top"'),
     "shape": ("cylinder =", "cylinders ="),
     "file of the bench": ('"run_1.csv"', '"run1.csv"'),

@@ -47,7 +47,10 @@ def markers(t_s=TIMES, node_count=5, present=True):
 
 def experiment(**changes) -> Experiment:
     body: Any = SimpleNamespace(
-        nodes_m=NODES, nodes=SimpleNamespace(points_m=NODES), frames=np.zeros((0, 4), dtype=int)
+        nodes_m=NODES,
+        nodes=SimpleNamespace(points_m=NODES),
+        frames=np.zeros((0, 4), dtype=int),
+        is_slender=False,
     )
     body.parts = [SimpleNamespace(name="", density_kg_m3=1000.0)]
     body.with_frames = lambda *_, **__: body
