@@ -127,13 +127,13 @@ class RecordingReader:
             grasped, or if the problem exceeds this machine's memory.
         """
         if self.body.is_slender:
-            loads = [
+            of_surface = [
                 key for key in ("obstacle", "tendon", "pressure") if getattr(self.section, key)
             ]
-            images = [
+            cameras = [
                 key for key in ("depth", "outlines") if key in self.section.measurement_tables
             ]
-            require_no_surface([*loads, *images])
+            require_no_surface([*of_surface, *cameras])
         if self.section.markers.s_m:
             self.section = _with_places_on_rod(self.section, self.body)
         section = self.section

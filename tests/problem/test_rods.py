@@ -107,7 +107,7 @@ def test_arc_lengths_of_a_solid_body_are_refused(tmp_path):
 @pytest.mark.long
 def test_the_example_gives_the_true_constants(problem):
     run = cs.run(cs.Problem.read(problem))
-    assert run.result.quality.rating == "good"
+    assert run.trust.verdict == "good"
     for name, true in TRUTH.items():
         low, high = run.interval(name)
         assert low <= true <= high

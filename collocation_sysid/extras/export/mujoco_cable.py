@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...errors import InputError
 from ...fem.rods import RodMaterial, RodMesh, frames_of_sections
 from ...recording import Grasp
@@ -38,7 +38,7 @@ class Chain:
     gamma_r_s: float
     gamma_m_1_s: float
     # Places of the sections at the beginning of the links and at the free end, in a configuration.
-    sections: Array
+    sections: Index
 
     @classmethod
     def from_body(cls, body: IdentifiedBody) -> Chain:
@@ -63,7 +63,7 @@ class Chain:
             raise InputError(
                 "a cable with regions or point masses is not exported to mujoco; expected --to json"
             )
-        (region,), (part,) = body.regions, body.body.parts
+        region, part = body.regions[0], next(iter(body.body.parts))
         law = part.material
         assert isinstance(law, RodMaterial)
         first = len(held) - 1
@@ -133,7 +133,7 @@ class Chain:
         return lines + end + "</body>\n" * len(self.lengths_m)
 
 
-def hinge_angles(nodes_m: Array, sections: Array) -> Array:
+def hinge_angles(nodes_m: Array, sections: Index) -> Array:
     """Return the angles (k, 3) of the hinges at all given sections but the last, from positions of
     nodes (n, 3): from the clamped section to the first link, then between links.
     """

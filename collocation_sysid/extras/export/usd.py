@@ -293,7 +293,7 @@ def _add_material(
     material = pxr.UsdShade.Material.Define(stage, f"/World/Materials/{name}")
     prim = material.GetPrim()
     prim.AddAppliedSchema(f"Physics{kind}DeformableMaterialAPI")
-    values = physics | {
+    values = dict(physics) | {
         f"{ATTRIBUTE_NAMESPACE}:gammaR_s": region.gamma_r_s,
         f"{ATTRIBUTE_NAMESPACE}:gammaM_1_s": region.gamma_m_1_s,
     }

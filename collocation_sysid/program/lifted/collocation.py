@@ -36,7 +36,9 @@ class LiftedCollocation(Collocation):
     The attributes are those of `Collocation`.
     """
 
-    eliminates_variables = False
+    @property
+    def eliminates_variables(self) -> bool:
+        return False
 
     @cached_property
     def lifted(self) -> tuple[LiftedVariables, ...]:
