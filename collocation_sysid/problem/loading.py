@@ -376,6 +376,8 @@ def _lengths_checked(section: ObjectSection) -> Iterator[None]:
     """Turn an `InputError` into one that names an implausible length."""
     if (shape := section.cylinder) is not None:
         lengths_m = {"cylinder.diameter_m": shape.diameter_m, "cylinder.height_m": shape.height_m}
+    elif section.is_rod:
+        lengths_m = {"length_m": section.length_m or 0.0}
     else:
         lengths_m = {"box_m": max(section.box_m or (0.0,))}
     try:

@@ -85,6 +85,7 @@ def test_the_rest_shape_of_a_curved_centreline_is_as_stated(rest_shape, problem)
         ("s_m = [0.0, 0.05] }", 'face = "top" }', "expected whole sections"),
         ('material = "cable"', 'material = "cable"\nelement = "tet10"', "element for a rod"),
         ("tip = 0.6 }", "tip = 0.7 }", "0.7"),
+        ("length_m = 0.6  ", "length_m = 600.0  ", "likely 0.6, if it was in mm"),
         ("s_m = [0.0, 0.05]", "s_m = [0.05, 0.0]", "the first arc length"),
         ("mass_per_length_kg_m = 0.034", "mass_per_length_kg_m = 0.034\nmass_kg = 1.0", "mass_kg"),
     ],
