@@ -38,7 +38,6 @@ from ..common.checked_arrays import read_only_floats
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive
 from ..errors import InputError
-from .chain_rule import ChainRule
 from .elements import ROD, Element
 from .laws.constants import AXIAL, BENDING, NATURAL_STRAINS, POISSON, TORSION, YOUNG, Constant
 from .laws.materials import Material
@@ -440,12 +439,6 @@ class RodMaterial(Material):
             ("has_natural_curvature", has_natural_curvature),
         ):
             object.__setattr__(self, name, value)
-
-    def chain_rule(self, F: ca.SX, values: ca.SX) -> ChainRule:
-        return ChainRule()
-
-    def psi_in(self, rule: ChainRule, F: ca.SX, values: ca.SX) -> ca.SX:
-        return self.psi(F, values)
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
         """Return the energy per volume [J/m³] at G (3, 5), from the constants, then half the

@@ -148,18 +148,16 @@ def style_axes(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") 
         spine.set(linewidth=0.6, color=_GREY)
 
 
-def add_legend_above(axes: Axes, columns: int, height: float = 1.0) -> None:
+def add_legend_above(axes: Axes, columns: int) -> None:
     """Add a legend above the axes, where it hides nothing.
 
     Parameters
     ----------
     columns : int
         Number of entries in a row.
-    height : float
-        Lower edge in heights of the axes; above 1 to leave room for a title.
     """
     axes.legend(
-        loc="lower left", bbox_to_anchor=(0.0, height), ncols=columns, fontsize=SMALL_PT,
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize=SMALL_PT,
         frameon=False, borderaxespad=0.1, borderpad=0.1, columnspacing=1.2, handlelength=1.6,
         labelspacing=0.2,
     )  # fmt: skip

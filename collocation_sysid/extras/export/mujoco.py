@@ -113,7 +113,7 @@ def _export_cable(body: IdentifiedBody) -> ExportedFiles:
     gravity = values_as_text(body.experiment.gravity_m_s2)
     grasp = _grasp_xml(body).removesuffix("</body>\n")
     (holding,) = body.experiment.grasps
-    clamp = clamp_in_gripper(body, holding, int(chain.sections[0]))
+    clamp = clamp_in_gripper(body, int(chain.sections[0]))
     x += f"<mujoco model={xml_attribute(body.title or 'cable')}>\n"
     x += f'<option timestep="{step_s!r}" gravity="{gravity}" integrator="implicitfast" '
     x += f'viscosity="{chain.viscosity!r}"/>\n'

@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from ...common.array_types import Array, Index
 from ...errors import InputError
 from ...fem.rods import RodMaterial, RodMesh, frames_of_sections
-from ...recording import Grasp
 from .identified import IdentifiedBody
 from .target import values_as_text
 
@@ -151,7 +150,7 @@ def hinge_angles(nodes_m: Array, sections: Index) -> Array:
     return np.array([each.as_euler("XYZ") for each in relative])
 
 
-def clamp_in_gripper(body: IdentifiedBody, grasp: Grasp, section: int) -> tuple[Array, Array]:
+def clamp_in_gripper(body: IdentifiedBody, section: int) -> tuple[Array, Array]:
     """Return position (3,) [m] and quaternion (w, x, y, z) of the clamped section in the frame of
     the gripper.
     """
