@@ -10,6 +10,7 @@ from kit.checks import observed_order
 from kit.rods import (
     CABLE,
     DENSITY_KG_M3,
+    UNDAMPED,
     DiscreteRod,
     cable,
     centres,
@@ -26,12 +27,16 @@ from kit.rods import (
     straight,
     wrench_on_section,
 )
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.rods import CrossSection, rod_mesh
+from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.forces import Forces
+from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.modes.natural import natural_modes
 
 G_M_S2 = 9.81
@@ -100,6 +105,75 @@ def test_a_quarter_circle_bends_and_twists_under_a_load_across():
         errors.append(abs(np.sum(loads * moved) / expected - 1))
     assert errors[-1] < 1e-3
     assert observed_order(1 / (counts - 1), errors) == pytest.approx(2, abs=0.2)
+
+
+def castigliano_m(
+    places_m: np.ndarray, tangents: np.ndarray, ds_m: float, end_m: np.ndarray, stiffness: dict
+) -> np.ndarray:
+    """Displacement (3,) of the end of a curved rod clamped at its beginning, under its weight.
+
+    The principle of virtual forces with a unit force at the end: ∫ (M·M̄ over EI, T T̄/GJ, N N̄/EA,
+    Q·Q̄/GA) ds, in the middles of equal parts.
+    """
+    beyond = np.arange(len(places_m))[::-1] + 0.5
+    part_n = stiffness["weight_n_m"] * ds_m
+    force = np.outer(part_n * beyond, [0.0, 0.0, -1.0])
+    sums_m = np.cumsum(places_m[::-1], axis=0)[::-1] - 0.5 * places_m
+    moment = np.cross(sums_m - beyond[:, None] * places_m, [0.0, 0.0, -part_n])
+    moved = []
+    for unit in np.eye(3):
+        pairs = (
+            (moment, np.cross(end_m - places_m, unit), stiffness["GJ"], stiffness["EI"]),
+            (force, np.tile(unit, (len(places_m), 1)), stiffness["EA"], stiffness["GA"]),
+        )
+        work = 0.0
+        for own, virtual, along, across in pairs:
+            first, second = ((each * tangents).sum(axis=1) for each in (own, virtual))
+            both = (own * virtual).sum(axis=1)
+            work += ds_m * np.sum(first * second / along + (both - first * second) / across)
+        moved.append(work)
+    return np.array(moved)
+
+
+def test_a_helical_spring_is_stretched_by_its_weight():
+    """Three coils; the closed form of close coils is W/2 · 2π R³ n/GJ (Wahl 1963)."""
+    radius_m, pitch_m, coils, section = 0.03, 0.01, 3, CrossSection.round(0.003)
+    young, poisson = 2e6, 0.3
+    shear = young / (2 + 2 * poisson)
+    stiffness = {
+        "EI": young * section.moments_m4[0],
+        "GJ": shear * section.torsion_m4,
+        "EA": young * section.area_m2,
+        "GA": shear * section.area_m2,
+        "weight_n_m": DENSITY_KG_M3 * section.area_m2 * G_M_S2,
+    }
+
+    def helix(angle):
+        angle = np.asarray(angle)
+        fall = -pitch_m * angle / (2 * np.pi)
+        return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), fall], axis=-1)
+
+    whole = 2 * np.pi * coils
+    angle = (np.arange(4000) + 0.5) * whole / 4000
+    slopes = np.stack(
+        [-radius_m * np.sin(angle), radius_m * np.cos(angle), 0 * angle - pitch_m / (2 * np.pi)],
+        axis=1,
+    )
+    rate_m = np.linalg.norm(slopes[0])
+    expected = castigliano_m(
+        helix(angle), slopes / rate_m, rate_m * whole / 4000, helix(whole), stiffness
+    )
+    close = stiffness["weight_n_m"] * rate_m * whole * np.pi * radius_m**3 * coils
+    assert -expected[2] == pytest.approx(close / stiffness["GJ"], rel=5e-3)
+    errors, counts = [], np.array([37, 73, 145])
+    for count in counts:
+        mesh = rod_mesh(helix(np.linspace(0, whole, 181)), section, int(count))
+        spring = Body(mesh, density_kg_m3=DENSITY_KG_M3)
+        weight_n = np.outer(spring.node_mass, DOWN)
+        moved = small_displacement(spring, weight_n, young_pa=young, poisson=poisson)
+        errors.append(np.linalg.norm(tip(moved) - expected) / np.linalg.norm(expected))
+    assert errors[-1] < 5e-3
+    assert observed_order(1 / (counts - 1), errors) == pytest.approx(2, abs=0.1)
 
 
 # Large displacements ---------------------------------------------------------------------------
@@ -206,6 +280,28 @@ def test_a_twisted_ring_buckles_at_the_twist_of_michell(ratio):
     assert above[0] < -1e-2
 
 
+def twisted_eigenvalue(count: int, moment: float, ratio: float) -> float:
+    """Lowest eigenvalue over EI/L³ of the stiffness of a straight rod that is clamped at both ends
+    and twisted, by a moment in units of EI/L.
+    """
+    rod = cable(straight(LENGTH_M, CrossSection.round(0.01), count))
+    turn = Rotation.from_rotvec(np.outer(moment / ratio * rod.mesh.s_m / LENGTH_M, [1, 0, 0]))
+    frames = directors(rod.mesh, rod.nodes_m)
+    turned = np.stack([turn.apply(frames[:, k]) for k in range(2)], axis=1)
+    constants = {"bending_n_m2": EI, "torsion_n_m2": ratio * EI, "axial_n": 4 * EI / 0.005**2}
+    start = placed(rod.mesh, centres(rod.nodes_m), turned)
+    _, values = relaxed(rod, start, free_dofs(rod, *ends(rod)), 0.01 * EI, **constants)
+    return values[0] / (EI / LENGTH_M**3)
+
+
+@pytest.mark.parametrize("ratio", [0.65, 2.0])
+def test_a_twisted_rod_between_clamps_buckles_at_the_moment_of_greenhill(ratio):
+    """M L/EI = 2 u with tan u = u, u = 4.4934 (Timoshenko & Gere 1961, section 2.21)."""
+    critical = 2 * 4.493409
+    assert twisted_eigenvalue(31, 0.97 * critical, ratio) > 0.1
+    assert twisted_eigenvalue(31, 1.03 * critical, ratio) < -0.1
+
+
 # Motions ---------------------------------------------------------------------------------------
 
 
@@ -251,6 +347,90 @@ def test_frequencies_of_a_cantilever():
         assert np.log2(first / second) == pytest.approx(2, abs=0.3), name
 
 
+ROOTS = np.array([1.875104069, 4.694091133])
+
+
+@pytest.mark.parametrize("damping", ["kelvin-voigt", "rayleigh"])
+@pytest.mark.parametrize(("stiffness", "mass"), [(0.02, 0.0), (0.0, 0.03), (0.01, 0.02)])
+def test_bending_vibrations_decay_as_damping_says(damping, stiffness, mass):
+    """ζ = γ_r ω/2 + γ_m/(2 ω) of bending 1 and 2, after gravity begins to act across; stated are both
+    terms of bending 1.
+    """
+    length_m, section = 0.5, THIN
+    rod = cable(straight(length_m, section, 16), damping=damping)
+    mass_kg_m = DENSITY_KG_M3 * section.area_m2
+    slow, fast = ROOTS**2 * np.sqrt(EI / mass_kg_m) / length_m**2
+    t_s = 2 * np.pi / slow * np.arange(601) / 200
+    released = clamped(
+        rod, t_s=t_s, start="undeformed", gravity_m_s2=(0.0, 0.0, -0.05), air_density_kg_m3="none"
+    )
+    constants = {"gamma_r_s": 2 * stiffness / slow, "gamma_m_1_s": 2 * mass * slow}
+    values = {"bending_n_m2": EI, "torsion_n_m2": GJ, "axial_n": 500.0} | constants
+    motion = cs.simulate(released, values, "midpoint", substeps=1)
+    fall = centres(motion.positions_m)[:, -1, 2]
+    fall = fall / np.abs(fall).max()
+
+    def difference(values: np.ndarray) -> np.ndarray:
+        predicted = np.full(len(t_s), values[0])
+        for decay, omega, cosine, sine in values[1:].reshape(2, 4):
+            phase = omega * t_s
+            waves = cosine * np.cos(phase) + sine * np.sin(phase)
+            predicted = predicted + np.exp(-decay * t_s) * waves
+        return predicted - fall
+
+    guess = [-0.5, 0.01 * slow, slow, 0.5, 0.0, 0.03 * fast, fast, 0.01, 0.0]
+    scales = [1, slow, slow, 1, 1, fast, fast, 1, 1]
+    fit = least_squares(difference, guess, x_scale=scales, xtol=1e-12, ftol=1e-12)
+    assert np.abs(fit.fun).max() < 1e-3  # of the other modes
+    for (decay, omega), usual, most in zip(
+        fit.x[1:].reshape(2, 4)[:, :2], (slow, fast), (5e-3, 0.015), strict=True
+    ):
+        assert np.hypot(omega, decay) == pytest.approx(usual, rel=most)
+        # The frequency has the error of 16 sections.
+        expected = constants["gamma_r_s"] * omega**2 / 2 + constants["gamma_m_1_s"] / 2
+        assert decay == pytest.approx(expected, rel=most)
+
+
+def test_a_tumbling_rod_keeps_its_momenta_and_its_energy():
+    """The midpoint rule keeps both momenta exactly, and the energy within bounds.
+
+    A soft rod turns twice and exchanges a fifth of its energy with its bending.
+    """
+    rod = cable(straight(0.5, CrossSection.round(0.012), 11))
+    from_middle = rod.nodes_m - rod.nodes_m.mean(axis=0)
+    velocity = np.cross([3.0, 2.0, 8.0], from_middle)
+    velocity[:, 2] += 1.5 * np.cos(4 * np.pi * from_middle[:, 0])
+    velocity -= np.average(velocity, axis=0, weights=rod.node_mass)
+    thrown = clamped(
+        rod,
+        t_s=8e-4 * np.arange(2001),
+        grasps=[],
+        start="given",
+        start_positions_m=rod.nodes_m,
+        start_velocities_m_s=velocity,
+        air_density_kg_m3="none",
+    )
+    constants = {"bending_n_m2": 1e-3, "torsion_n_m2": 8e-4, "axial_n": 50.0}
+    theta = rod.theta_from_values(constants | UNDAMPED)
+    dynamics = Dynamics.from_experiment(thrown, "midpoint").with_theta(theta)
+    x = simulate_scheme(thrown, dynamics)
+    rates, middle = np.diff(x, axis=0) / dynamics.step_s, (x[1:] + x[:-1]) / 2
+    momentum = rod.dof_mass * rates + rod.force(middle, rates, theta) * dynamics.step_s / 2
+    kinetic = (momentum**2 / rod.dof_mass).sum(axis=1) / 2
+    momentum = momentum.reshape(len(momentum), -1, 3)
+    places = x[1:].reshape(momentum.shape)
+    angular = np.cross(places, momentum).sum(axis=1)
+    usual = np.linalg.norm(momentum[0], axis=1).sum()
+    assert np.abs(momentum.sum(axis=1)).max() < 1e-10 * usual
+    assert np.ptp(angular, axis=0).max() < 1e-10 * np.linalg.norm(angular[0])
+    kinetic = kinetic[::10]
+    energy = kinetic + np.array([rod.energy(each, **constants) for each in places[::10]])
+    assert np.ptp(energy) < 2e-3 * energy[0]
+    assert (kinetic / energy).min() < 0.85
+    cords = centres(places)[:, -1] - centres(places)[:, 0]
+    assert np.linalg.norm(cords, axis=1).min() < 0.45
+
+
 # Other models ----------------------------------------------------------------------------------
 
 
@@ -276,6 +456,44 @@ def test_a_discrete_elastic_rod_takes_the_same_shape_in_space(ratio):
     x = centres(rest_shape_under(hanging, **constants))
     assert np.abs(reference[-1] - [1.0, 0.0, 0.0]).min() > 0.05
     np.testing.assert_allclose(x[-1], reference[-1], atol=3e-3)
+
+
+@pytest.mark.parametrize(("poisson", "most"), [(0.0, 5e-3), (0.3, 0.012)])
+def test_a_bar_of_tetrahedra_bends_and_swings_like_a_rod(poisson, most):
+    """Ten times as long as wide, with two quadratic elements across, under its own weight; it sags
+    by a fifth and by two thirds of its length.
+    """
+    length_m, width_m, young = 0.2, 0.02, 3e5
+    shear = young / (2 + 2 * poisson)
+    first_lame = 2 * shear * poisson / (1 - 2 * poisson)
+    middle_m = width_m / 2
+    mesh = rod_mesh(
+        [[0, middle_m, middle_m], [length_m, middle_m, middle_m]],
+        CrossSection.rectangle(width_m, width_m),
+        41,
+        first_director=[0, 1, 0],
+    )
+    solid = box_mesh((length_m, width_m, width_m), (20, 2, 2))
+    bodies = [Body(mesh, density_kg_m3=1000.0), Body(solid, density_kg_m3=1000.0, element="tet10")]
+    values = [{"young_pa": young, "poisson": poisson}, {"lambda_pa": first_lame, "mu_pa": shear}]
+    sags, found = [], []
+    for body, constants in zip(bodies, values, strict=True):
+        held, end = (np.flatnonzero(np.abs(body.nodes_m[:, 0] - x) < 1e-9) for x in (0.0, length_m))
+        for gravity_m_s2 in (2.0, G_M_S2):
+            hung = clamped(
+                body,
+                grasps=[cs.Grasp(held, cs.PoseSequence.fixed())],
+                gravity_m_s2=(0.0, 0.0, -gravity_m_s2),
+                air_density_kg_m3="none",
+            )
+            moved = rest_shape_under(hung, **constants) - body.nodes_m
+            sags.append(moved[end].mean(axis=0))
+        hz = modes(body, held, count=8, **constants).frequencies_hz
+        found.append(hz[[0, 1, 2, 3, 5, 6, 7]])  # bending 1 and 2, stretch, bending 3; not torsion
+    rod, bar = np.array(sags).reshape(2, 2, 3)
+    away = np.linalg.norm(bar - rod, axis=1) / np.linalg.norm(rod, axis=1)
+    assert away.max() < most
+    np.testing.assert_allclose(found[1], found[0], rtol=0.015)
 
 
 @pytest.mark.parametrize("is_held", [True, False])
