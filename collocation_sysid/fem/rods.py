@@ -182,8 +182,7 @@ class RodMesh(TetMesh):
     @property
     def centres_of_sections_m(self) -> Array:
         """Centre of each section (N, 3) [m]."""
-        centres: Array = self.points_m.reshape(-1, 3, 3).mean(axis=1)
-        return centres
+        return centres_of_sections(self.points_m)
 
     @property
     def lengths_m(self) -> Array:
@@ -203,7 +202,7 @@ class RodMesh(TetMesh):
         """Return the geometry, see `rod_geometry`, with nodes (n, 3) at other positions [m]."""
         straight_m = None
         if self.is_straight_at_rest:
-            centres = positions_m.reshape(-1, 3, 3).mean(axis=1)
+            centres = centres_of_sections(positions_m)
             changed = np.linalg.norm(np.diff(centres, axis=0), axis=1) / self.lengths_m
             straight_m = np.diff(self.s_m) * changed
         return rod_geometry(positions_m, cells, self.section.area_m2, straight_lengths_m=straight_m)
@@ -364,6 +363,12 @@ def midpoint_interpolation(s_m: Array) -> Array:
         np.fill_diagonal(away, 1.0)
         weights[2 * k + 1, near] = np.prod(away / differences, axis=1)
     return weights
+
+
+def centres_of_sections(nodes_m: Array) -> Array:
+    """Return the centre (…, N, 3) of each section, from positions of the nodes (…, 3 N, 3)."""
+    centres: Array = nodes_m.reshape(*nodes_m.shape[:-2], -1, 3, 3).mean(axis=-2)
+    return centres
 
 
 def frames_of_sections(nodes_m: Array) -> tuple[Array, Array]:

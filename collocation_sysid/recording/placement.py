@@ -17,6 +17,7 @@ from ..common.array_types import Array, Index
 from ..common.checked_arrays import point_text, read_only_floats, read_only_nodes
 from ..common.validated_classes import validated
 from ..errors import InputError
+from ..fem.rods import centres_of_sections
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -267,7 +268,7 @@ class LocatedBody:
         return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
 
     def _nearest_point_of_centreline(self, point: Array) -> tuple[Array, Array]:
-        centres = self.nodes_m.reshape(-1, 3, 3).mean(axis=1)
+        centres = centres_of_sections(self.nodes_m)
         steps = np.diff(centres, axis=0)
         squares = np.sum(steps**2, axis=1)
         shares = np.sum((point - centres[:-1]) * steps, axis=1) / squares

@@ -24,6 +24,7 @@ from script_arguments import make_parser
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.selection import Along
+from collocation_sysid.fem.rods import centres_of_sections
 from collocation_sysid.result.figure_style import RESOLUTION_DPI
 
 Array = NDArray[np.float64]
@@ -263,8 +264,7 @@ def draw_twists(curves: dict[str, tuple[Array, Array, Wire]]) -> None:
 def shape_m(solution: cs.Solution) -> Array:
     """Return the centreline (N, 3) [m] of the first loop of a solution."""
     iterate = solution.collocation.iterates(solution.z)[0]
-    shape: Array = np.reshape(iterate.x, (-1, 3, 3)).mean(axis=1)
-    return shape
+    return centres_of_sections(iterate.x.reshape(-1, 3))
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...errors import InputError
+from ...fem.rods import centres_of_sections
 from ...model.forces import Forces
 from ...program.modes.natural import natural_modes
 from ...recording import Grasp, Solid
@@ -142,8 +143,8 @@ def _compare_tip(body: IdentifiedBody, mujoco: ModuleType, model: Any) -> Predic
             mujoco.mj_forward(model, data)
             tips.append(data.site("tip").xpos.copy())
         mujoco.mj_step(model, data)
-    ours = body.simulated_m[:, -3:].mean(axis=1)
-    rigid_m = e.rigid_positions(e.t_s)[:, -3:].mean(axis=1)
+    ours = centres_of_sections(body.simulated_m)[:, -1]
+    rigid_m = centres_of_sections(e.rigid_positions(e.t_s))[:, -1]
     moved, theirs = ours - rigid_m, np.array(tips) - rigid_m
     moved, theirs = moved - moved[0], theirs - theirs[0]
     difference_m = _rms_length(theirs - moved)
