@@ -364,8 +364,6 @@ def _checked(problem: Problem, solution: Solution, say: Log) -> Checked:
     answer = Run(
         problem, solution, rollouts, uncertainty=None, fit=own, diagnoses=diagnose_markers(fit)
     )
-    if not solution.collocation.nq:
-        return answer, fit, None
     parameters = solution.collocation.parameters
     try:
         uncertainty = uncertainty_from_fit(
@@ -411,9 +409,9 @@ def _fine_enough(
     scheduler: str | None,
 ) -> Checked:
     """A parameter at a bound starts from its guess again: coarse steps may have driven it there."""
-    if steps is None or fit is None or coarse.uncertainty is None:
-        return coarse, fit, steps
     first = coarse.solution
+    if steps is None or fit is None or coarse.uncertainty is None or not first.collocation.nq:
+        return coarse, fit, steps
     known = {**coarse.uncertainty.estimates, **coarse.uncertainty.derived}
     error = step_error(coarse.problem, first, fit, steps, known)
     problem = coarse.problem

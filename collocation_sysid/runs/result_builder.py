@@ -184,7 +184,7 @@ def _modulus_axis_sentence(answer: SolvedProblem) -> str:
 
 def _uncertainty_result(answer: SolvedProblem) -> UncertaintyResult | None:
     known = answer.uncertainty
-    if known is None:
+    if known is None or not known.names:
         return None
     reported = [k for k, name in enumerate(known.names) if name in known.estimates]
     both = np.ix_(reported, reported)

@@ -226,13 +226,17 @@ class SolvedProblem:
         interruption it is doubtful, and contains concerns about the solution only if the error bars
         were computed.
         """
+        effects = effect_concerns(self.effects, self.suspects)
         of_fit = solution_concerns(
             self.solution,
             self.rollouts,
             motions=self.modes_by_experiment.values(),
             uncertainty=self.uncertainty,
             phi=self.posterior and self.posterior.phi,
+            surprise=effects[0].grade if effects else None,
         )
+        if not self.solution.collocation.nq:
+            effects = []
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
         numerical = numerical_concerns(self.optimum, uncertainties, refinement=self.refinement)
         of_fields = [concern for field in self.fields.values() for concern in field.list_concerns()]
@@ -241,7 +245,6 @@ class SolvedProblem:
             if any(each.suffices for each in self.suspects):
                 causes = [each for each in causes if each.code != "description/insufficient"]
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
-            effects = effect_concerns(self.effects, self.suspects)
             # Effects are judged with this mesh, so that a coarse one is as grave.
             known = [replace(each, grade=effects[0].grade) for each in meshes] if effects else []
             return Assessment.from_concerns(

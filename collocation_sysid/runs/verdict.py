@@ -35,7 +35,7 @@ from ..statistics.assessment import (
     stability_concerns,
     validation_concerns,
 )
-from ..statistics.concerns import Concern
+from ..statistics.concerns import Concern, Grade
 from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.plausibility import (
     copied_measurements,
@@ -60,6 +60,7 @@ def solution_concerns(
     motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
     phi: Array | None = None,
+    surprise: Grade | None = None,
 ) -> Iterator[Concern]:
     """Yield the concerns about a solution and its forward simulations.
 
@@ -79,6 +80,9 @@ def solution_concerns(
     phi : (nphi,) array, optional
         Nuisance parameters of all experiments, in units of their priors, in the posterior with all
         effects; by default those of the solution.
+    surprise : {"check", "doubtful"} or None
+        Grade of the effects that the residuals need; None if they need none. Without free constants
+        the stated ones may as well be wrong, so that the prediction is as grave.
     """
     status = solution.status
     yield from body_concerns(solution)
@@ -94,6 +98,8 @@ def solution_concerns(
     transcriptions = solution.collocation.transcriptions
     collocation = solution.collocation
     unknowns = unknown_concerns(solution, phi)
+    if not solution.collocation.nq:
+        yield from _prediction_concerns(solution, rollouts, surprise)
     if uncertainty is not None:
         misfits = fit_concerns(uncertainty)
         of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
@@ -113,8 +119,6 @@ def solution_concerns(
     yield from branch_concerns(solution.parts)
     for feature in FEATURES:
         yield from feature.concerns(solution.parts)
-    if not solution.collocation.nq:
-        yield from _prediction_concerns(solution, rollouts)
     fitted = fit_misfits(solution)
     static = [each.experiment.name for each in transcriptions if each.experiment.is_static]
     for name, rollout in rollouts.items():
@@ -222,12 +226,12 @@ def allowance_concerns(solution: Solution) -> Iterator[Concern]:
 
 
 def _prediction_concerns(
-    solution: Solution, rollouts: Mapping[str, ForwardSimulation | str]
+    solution: Solution, rollouts: Mapping[str, ForwardSimulation | str], surprise: Grade | None
 ) -> Iterator[Concern]:
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation) and solution.part_of(name) is not None:
             for misfit in rollout.misfits:
-                yield from prediction_concerns(name, **vars(misfit))
+                yield from prediction_concerns(name, **vars(misfit), surprise=surprise)
 
 
 def _forward_concerns(

@@ -22,7 +22,7 @@ from ..recording.experiment import Experiment
 from ..recording.impact_steps import impact_steps
 from ..recording.rotation_per_step import WARNING_ANGLE_RAD, fastest_rotation
 from .budget.discretisation_error import Refinement
-from .concerns import Concern, concern_if
+from .concerns import Concern, Grade, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name, limitless_shares
 from .hypothesis import Hypothesis
@@ -519,6 +519,7 @@ def prediction_concerns(
     robust_sigmas: float,
     count: int,
     size: str = "",
+    surprise: Grade | None = None,
 ) -> list[Concern]:
     """Return a concern if a prediction, for which nothing was fitted, differs from the measurements
     by more than chance and a limit, or is much closer to them than their noise; else an empty list.
@@ -536,6 +537,9 @@ def prediction_concerns(
         Number of measured values.
     size : str
         Root mean square difference with its unit, for the message; "" leaves it out.
+    surprise : {"check", "doubtful"} or None
+        Grade of a difference of any size that is larger than by chance; None if its effects are
+        expected.
     """
     squares = count * robust_sigmas**2
     is_chance = float(chi2_sf(squares, count)) > RARE
@@ -549,8 +553,8 @@ def prediction_concerns(
     }
     return [
         *concern_if(
-            robust_sigmas > MISFIT and not is_chance,
-            robust_sigmas > GROSS_MISFIT,
+            (robust_sigmas > MISFIT or surprise is not None) and not is_chance,
+            robust_sigmas > GROSS_MISFIT or surprise == "doubtful",
             code="prediction/misses",
             **data,
         ),

@@ -222,7 +222,7 @@ def field_estimates(
     if isinstance(uncertainty, Uncertainty):
         sizes = relative_derivatives(parameters, q)
         covariance = uncertainty.covariance / np.outer(sizes, sizes)
-        quantile = float(np.nanmax(uncertainty.quantiles))
+        quantile = float(np.nanmax(uncertainty.quantiles, initial=0.0))
     elif uncertainty is not None:
         covariance = uncertainty
         quantile = 1.96

@@ -41,7 +41,7 @@ def stored(finished: cs.Run) -> dict:
 
 
 @cache
-def predicted(softer: float) -> cs.Run:
+def predicted(softer: float, is_exact: bool = False) -> cs.Run:
     """A swinging cube whose motion is predicted with stated parameters."""
     hung = hung_cube(30)
     tracks = cs.simulate(hung, TRUTH).markers_m
@@ -49,15 +49,22 @@ def predicted(softer: float) -> cs.Run:
     sigma_m = np.full(tracks.shape[1], NOISE_M)
     seen = replace(hung.markers, positions_m=tracks, sigma_m=sigma_m)
     stated = {n: v * softer if n.endswith("_pa") else v for n, v in TRUTH.items()}
-    problem = cs.Problem([replace(hung, markers=seen)], stated, substeps=4)
+    deviations = cs.Assumptions.exact() if is_exact else cs.Assumptions()
+    problem = cs.Problem(
+        [replace(hung, markers=seen)],
+        stated,
+        substeps=4,
+        uncertainty=cs.UncertaintyOptions(assumptions=deviations),
+    )
     return cs.run(problem, seek_causes=False)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("softer", "verdict"), [(1.0, "good"), (0.75, "check"), (0.3, "doubtful")])
+@pytest.mark.parametrize(
+    ("softer", "verdict"), [(1.0, "good"), (0.75, "doubtful"), (0.3, "doubtful")]
+)
 def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
     finished = predicted(softer)
-    assert finished.uncertainty is None
     assert finished.trust.verdict == verdict
     concerns = [c for c in finished.trust.concerns if c.topic == "prediction"]
     assert len(concerns) == (verdict != "good")
@@ -67,6 +74,15 @@ def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
         assert "deviates from the markers by" in concern.message
         assert f"{rms_mm:.3g} mm RMS" in concern.message
         assert concern.data["sigmas"] == pytest.approx(rms_mm / np.sqrt(3), rel=0.01)
+
+
+@pytest.mark.long
+def test_a_prediction_off_by_more_than_noise_and_description_explain_is_doubtful():
+    assert predicted(1.0, is_exact=True).trust.verdict == "good"
+    finished = predicted(1.1, is_exact=True)
+    first, *_ = finished.trust.concerns
+    assert (first.code, first.grade) == ("prediction/misses", "doubtful")
+    assert first.data["sigmas"] < 1.2  # each marker is within its noise, all together are not
 
 
 def test_few_numbers_that_are_off_by_chance_are_no_concern():
