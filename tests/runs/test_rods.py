@@ -212,19 +212,22 @@ def test_what_needs_a_surface_is_refused(what):
 HUNG = VALUES | {"bending_n_m2": 1e-3, "torsion_n_m2": 8e-4}
 
 
-def hung() -> cs.Problem:
-    """A cable of 0.3 m that hangs from a hand."""
-    mesh = cs.rod_mesh([[0, 0, 0], [0, 0, -0.3]], SECTION, 5)
-    t_s = 0.02 * np.arange(11)
-    tip = cs.Markers(t_s, np.zeros((11, 1, 3)), 1e-3, ["tip"], places_m=[[0.0, 0.0, -0.3]])
-    experiment = cs.Experiment(
+def hung_experiment(hand: cs.PoseSequence, t_s: np.ndarray, sections: int) -> cs.Experiment:
+    """A cable of 0.3 m, a quarter of which a hand holds, and the rest hangs."""
+    mesh = cs.rod_mesh([[0, 0, 0], [0, 0, -0.3]], SECTION, sections, stations_m=[0.075])
+    tracks_m = np.zeros((len(t_s), 1, 3))
+    return cs.Experiment(
         cable(mesh),
         t_s,
-        [cs.Grasp(range(6), cs.PoseSequence.fixed())],
-        tip,
+        [cs.Grasp(np.flatnonzero(mesh.arc_lengths_m < 0.0751), hand)],
+        cs.Markers(t_s, tracks_m, 1e-3, ["tip"], places_m=[[0.0, 0.0, -0.3]]),
         nuisance=IDEAL,
         air_density_kg_m3="none",
     )
+
+
+def hung() -> cs.Problem:
+    experiment = hung_experiment(cs.PoseSequence.fixed(), 0.02 * np.arange(11), 5)
     return cs.Problem([experiment], {n: cs.Unknown(v) for n, v in HUNG.items()}, substeps=1)
 
 
@@ -250,3 +253,18 @@ def task(**changes) -> Task:
 def test_a_limit_of_the_stretch_of_a_rod_is_refused():
     with pytest.raises(InputError, match="largest_stretch"):
         plan_motion(hung(), task(avoid={"largest_stretch": 1.2}), LIMITS)
+
+
+def test_a_planned_cable_draws_a_circle_also_with_four_times_as_many_sections():
+    """A hand that draws the circle itself is off by more than the circle's diameter."""
+    t_s = np.linspace(0.0, 1.4, 141)
+    plan = plan_motion(hung(), task(), LIMITS)
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1))
+    rigid = cs.PoseSequence(t_s, circle_m(t_s), quaternions_xyzw=still)
+    errors_m = []
+    for hand in (plan.poses(t_s), rigid):
+        tip_m = simulate(hung_experiment(hand, t_s, 17), HUNG).markers_m[:, 0]
+        away_m = np.linalg.norm(tip_m - tip_m[0] - circle_m(t_s), axis=1)
+        errors_m.append(np.sqrt(np.mean(away_m**2)))
+    assert errors_m[1] > 0.06
+    assert errors_m[0] < 0.1 * errors_m[1]
