@@ -87,11 +87,11 @@ def test_points_nearest_to_hidden_parts_are_omitted_and_counted():
 def test_hidden_points_count_once_the_shape_has_settled():
     sought, _ = seen_in(np.array([0.0, -0.7 * APART_M, 0.0]), settled=False)
     nothing = np.zeros(sought.camera.nuisance.size)
-    far = sought.updated(sought.shapes_m + 0.004, nothing)
-    near = sought.updated(sought.shapes_m + 0.001, nothing)
+    far = sought.updated(sought.shapes_m + 0.004, nothing, np.inf)
+    near = sought.updated(sought.shapes_m + 0.001, nothing, np.inf)
     assert far.excluded_counts["hidden"] == 0
     assert near.excluded_counts["hidden"] > 100
     # Where nothing moves any more, it is found once.
-    same = sought.updated(sought.shapes_m, nothing)
+    same = sought.updated(sought.shapes_m, nothing, np.inf)
     assert same.excluded_counts["hidden"] > 100
-    assert same.updated(sought.shapes_m, nothing) is same
+    assert same.updated(sought.shapes_m, nothing, np.inf) is same

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from kit.depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar
+from kit.depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar, camera_residuals
 from kit.problems import smooth_poses, times
+from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
 from collocation_sysid.extras.studies.model_choice import reserve_test_data
@@ -94,3 +96,34 @@ def test_images_that_are_held_out_are_not_fitted():
     (whole,), (left,) = problem().experiments, known.experiments
     np.testing.assert_array_equal(left.depths[0].sample_times_s, times(SAMPLES)[[2, 5, 8]])
     assert left.depths[0].sample_times_s[-1] <= start_s < whole.depths[0].sample_times_s[3]
+
+
+@pytest.mark.parametrize("late_s", [0.02, -0.02])
+def test_a_delay_does_not_extrapolate_between_fine_time_steps(late_s):
+    (experiment,) = problem().experiments
+    depth = experiment.depths[0].until_time(experiment.t_s[-1] + late_s)
+    early = replace(depth, t_s=depth.t_s - late_s)
+    experiment = replace(
+        experiment, depths=[early], nuisance=cs.Nuisance.none(depth_time_s=abs(late_s))
+    )
+    described = replace(problem(), experiments=[experiment], substeps=8)
+    program = described.collocation()
+    fine_s = np.linspace(0.0, experiment.t_s[-1], 8 * (len(experiment.t_s) - 1) + 1)
+    nodes_m = CubicSpline(experiment.t_s, cs.simulate(experiment, MADE).positions_m)(fine_s)
+    nodes_m += 1e-6 * np.random.default_rng(4).normal(size=nodes_m.shape)
+    p = program.guess_p
+    place = program.parameter_names.index("swing: time shift of front [s]")
+    for share in (1.0, 1.0, 2.0):
+        p[place] = share * np.sign(late_s)
+        program, p = program.follow_estimates(p, [nodes_m])
+        part = program.transcriptions[0]
+        (residual,) = camera_residuals(part)
+        phi = p[part.nuisance_indices.indices]
+        values = residual.observable.evaluate_positions(nodes_m, phi)
+        off_m = residual.signed_distances_m(values, phi)
+        shown_s = early.t_s + p[place] * abs(late_s)
+        within = (shown_s >= 0.0) & (shown_s <= experiment.t_s[-1])
+        assert np.isfinite(off_m).any(axis=1)[within].all()
+        assert np.isnan(off_m[~within]).all()
+        if share == 1.0:
+            assert np.sqrt(np.nanmean(off_m**2)) < 2 * NOISE_M

@@ -26,6 +26,7 @@ from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_TIME
 from ...recording.placement import Placement
 from ...recording.sample_times import TIME_TOLERANCE_S
+from ..association import SAMPLES_OFF
 from ..correspondences import CorrespondenceResidual
 from ..markers.association import MarkerAssociation
 from ..measurement_residual import (
@@ -108,6 +109,7 @@ class DepthResidual(CorrespondenceResidual):
             normal.
         """
         view = correspondences.camera
+        correspondences = correspondences.within(at_s)
         samples, points = correspondences.is_compared.shape
         return cls(
             observable=_surface_positions(correspondences, len(at_s)),
@@ -141,9 +143,12 @@ class DepthResidual(CorrespondenceResidual):
     @cached_property
     def _neighbour_times(self) -> NDArray[np.int64]:
         """Indices (S, k) of the observable's times around each image; k = 1 if at its time."""
-        nearest = np.abs(self.observable_s - self.t_s[:, None]).argmin(axis=1)
+        return self._times_around(self.correspondences.taken_s)
+
+    def _times_around(self, taken_s: Array) -> NDArray[np.int64]:
+        nearest = np.abs(self.observable_s - taken_s[:, None]).argmin(axis=1)
         is_off_grid = (
-            np.abs(self.observable_s[nearest] - self.t_s).max(initial=0.0) > TIME_TOLERANCE_S
+            np.abs(self.observable_s[nearest] - taken_s).max(initial=0.0) > TIME_TOLERANCE_S
         )
         clock = self.nuisance.indices_of_rows(
             DEPTH_TIME, component=self.correspondences.camera.camera_index
@@ -151,7 +156,7 @@ class DepthResidual(CorrespondenceResidual):
         if not (is_off_grid or len(clock)) or len(self.observable_s) < 2:
             return nearest[:, None]
         used = min(NEIGHBOURS, len(self.observable_s))
-        return neighbouring_times(self.observable_s, self.t_s + TIME_TOLERANCE_S, count=used)
+        return neighbouring_times(self.observable_s, taken_s + TIME_TOLERANCE_S, count=used)
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -194,7 +199,8 @@ class DepthResidual(CorrespondenceResidual):
         return int(self._neighbour_times[0, -1])
 
     def reassociated(self, x: Array, phi: Array) -> SurfaceCorrespondences:
-        return self.correspondences.updated(self.surface_shapes(x, phi), phi)
+        largest_s = SAMPLES_OFF * np.diff(self.observable_s).max(initial=0.0)
+        return self.correspondences.updated(self.surface_shapes(x, phi), phi, largest_s)
 
     def correspondences_of(self, measured: Depth, x: Array, phi: Array) -> SurfaceCorrespondences:
         return self.correspondences.with_depth(measured, self.surface_shapes(x, phi), phi=phi)
@@ -379,18 +385,19 @@ class DepthResidual(CorrespondenceResidual):
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
         """Return the surface nodes (s, n, 3) [m] at the times of those first s images for which the
-        first rows x (rows, 3n) [m] suffice, with the clock shift of φ (k,); s may be 0.
+        first rows x (rows, 3n) [m] suffice, with the clock shift of φ (k,); s may be 0. The first and
+        last shapes are those of images before and after the motion.
         """
-        clock_shift = self.correspondences.camera.clock_shift_s(phi)
-        known = int((self._neighbour_times[:, -1] < len(x)).sum())
+        late_s = self.correspondences.camera.clock_shift_s(phi)
+        taken_s = np.clip(self.t_s + late_s, self.observable_s[0], self.observable_s[-1])
+        around = self._times_around(taken_s)
+        known = int((around[:, -1] < len(x)).sum())
         nodes = x.reshape(len(x), -1, 3)[:, self.correspondences.surface.nodes]
         return np.array(
             [
                 np.tensordot(
-                    lagrange_weights(t + clock_shift, self.observable_s[times].tolist()),
-                    nodes[times],
-                    1,
+                    lagrange_weights(t, self.observable_s[times].tolist()), nodes[times], 1
                 )
-                for t, times in zip(self.t_s[:known], self._neighbour_times[:known], strict=True)
+                for t, times in zip(taken_s[:known], around[:known], strict=True)
             ]
         ).reshape(known, *nodes.shape[1:])

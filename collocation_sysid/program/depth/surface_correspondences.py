@@ -21,6 +21,7 @@ from ...fem.body import Body
 from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ..correspondences import Correspondences
+from ..custom_sensor_residual import is_within
 from .camera_alignment import align_camera, thinned
 from .camera_model import DepthCameraModel
 from .outline import Outline
@@ -97,6 +98,21 @@ class SurfaceCorrespondences(Correspondences):
     @property
     def measured(self) -> Depth:
         return self.camera.depth
+
+    @property
+    def taken_s(self) -> Array:
+        """Times (S,) of the images [s] with the clock shift for which they were found; another shift
+        would extrapolate the motion between the grid times around them.
+        """
+        view = self.camera
+        late_s = view.clock_shift_s(view.parameters_from(self.start_values))
+        return view.depth.sample_times_s + late_s
+
+    def within(self, at_s: Array) -> SurfaceCorrespondences:
+        """Return the correspondences without images beyond the times `at_s` of the motion."""
+        inside = is_within(self.taken_s, at_s)[:, None]
+        outline = replace(self.outline, is_compared=self.outline.is_compared & inside)
+        return replace(self, is_compared=self.is_compared & inside, outline=outline)
 
     def with_start_values(self, phi: Array) -> Array:
         own = self.camera.parameter_indices
@@ -220,7 +236,9 @@ class SurfaceCorrespondences(Correspondences):
             and bool((before[others] == phi[others]).all())
         )
 
-    def updated(self, shapes_m: Array, phi: Array) -> SurfaceCorrespondences:
+    def updated(
+        self, shapes_m: Array, phi: Array, largest_shift_s: float
+    ) -> SurfaceCorrespondences:
         """Return the correspondences of other shapes and camera poses.
 
         Parameters
@@ -229,12 +247,15 @@ class SurfaceCorrespondences(Correspondences):
             Surface nodes at the first s images [m]; later images keep their shapes.
         phi : (k,) array
             Nuisance parameters.
+        largest_shift_s : float
+            Largest change of the clock shift [s] that keeps the grid times around the images.
 
         Returns
         -------
         SurfaceCorrespondences
-            The new correspondences; self if they have converged, the gate is unchanged, and neither
-            surface nor measured points have moved by more than the share `SAME` of σ.
+            The new correspondences; self if they have converged, the gate and the grid times are
+            unchanged, and neither surface nor measured points have moved by more than the share
+            `SAME` of σ.
         """
         known = len(shapes_m)
         all_shapes_m = np.concatenate([shapes_m, self.shapes_m[known:]])
@@ -246,7 +267,9 @@ class SurfaceCorrespondences(Correspondences):
             moved_m = max(moved_m, np.abs(way).max(initial=0.0))
         gate_m = self.next_gate_m(all_shapes_m, phi)
         settled = moved_m < FRONT * depth.spacing_m
-        if moved_m < SAME * depth.sigma_m and gate_m == self.gate_m and self.has_converged:
+        shift_s = self.camera.clock_shift_s(phi) - self.camera.clock_shift_s(before)
+        is_same = moved_m < SAME * depth.sigma_m and abs(shift_s) <= largest_shift_s
+        if is_same and gate_m == self.gate_m and self.has_converged:
             return self
         return SurfaceCorrespondences.from_shapes(
             self.camera,
