@@ -542,6 +542,9 @@ class Posterior:
         count = len(self.effects.names)
         actual = np.diag(self.uncertainty.nuisance_covariance)[-count:] if count else own
         predicted = np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
+        # The shape of the errors of mesh and time step is not known.
+        by_shape = self._sources[1][places, count + len(self.considered.names) :]
+        predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
         found = []
         for k, name in enumerate(self.fit.names[len(self.fit.names) - count :]):

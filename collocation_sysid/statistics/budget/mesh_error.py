@@ -7,10 +7,10 @@ I x, its nodes satisfy
 
     K e = F(I ξ, I ν) − M I a
 
-to first order. In a motion, e is set to zero at the given nodes: e of the new ones, relative to the
-given shape functions, changes slowly compared with their own vibrations (static condensation in a
-hierarchical basis: Zienkiewicz, Gago and Kelly, Computers & Structures 16, 1983). In equilibria all
-free nodes move, and nothing is neglected. The given nodes are subject to a change of force
+to first order. In a motion, e is set to zero at the corners of the given mesh: e of the other
+nodes changes slowly compared with their own vibrations (static condensation: Guyan, AIAA Journal 3,
+1965). In equilibria all free nodes move, and nothing is neglected. The given nodes are subject to a
+change of force
 
     Iᵀ(F(I ξ, I ν) − M I a − K e) − (f(ξ, ν) − m a) + k e_g
 
@@ -18,6 +18,10 @@ compared with the given mesh, with its own derivatives k and the part e_g of e a
 this change makes them move by e_g, and changes the forces on held nodes like the finer mesh. The
 equations of motion of the given mesh turn it into a change of the measurements, like that of any
 systematic effect. No matrix of the finer mesh is factorised at every time step of a motion.
+
+With e zero at the mid nodes of quadratic elements too, their own equations would have to turn the
+forces on them into displacements, to first order; they are much too stiff where one nearly
+incompressible element is as thick as the body.
 
 Elements with mean dilatation have the pressures of the given mesh in K. Those of I x contain errors
 of the interpolated volumes times the bulk modulus, which the equilibrium of the finer mesh does not
@@ -31,8 +35,6 @@ from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 
 from ...common.array_types import Array, Index
 from ...common.last_results import known_at_last
@@ -62,10 +64,6 @@ from .systematic_effects import SMALL, Effect, ExperimentAtAnswer
 LARGEST_NODE_COUNT = 1500
 # Relative accuracy of e: that of an estimate of an error.
 ACCURACY = 1e-2
-# Largest distances of the rows of a motion at which e is solved for; between them the forces of e
-# are splines of third order, as the motion is to the accuracy of e.
-ROW_DISTANCES = (64, 32, 16, 8, 4, 2)
-ORDER = 3
 # Weight of the shape function of a node below which it is zero apart from rounding.
 NO_WEIGHT = 1e-9
 
@@ -109,24 +107,24 @@ def _effect(
 ) -> Effect:
     iterate = at.iterate
     transcription = iterate.transcription
+    body = transcription.body
     if at.dynamics.is_temporarily_prescribed.any():
         raise InputError("a grasp takes hold or lets go during the recording")
     if transcription.experiment.obstacles:
         raise InputError("obstacles touch the body")
-    fine = refined_experiment(
-        transcription.corrected_experiment(iterate.phi), finer[id(transcription.body)]
-    )
+    fine = refined_experiment(transcription.corrected_experiment(iterate.phi), finer[id(body)])
     dynamics = Dynamics.from_experiment(fine, scheme, transcription.substeps).with_theta(at.theta)
-    if transcription.body.is_slender:
+    if body.is_slender:
         return _effect_on_rod(at, fine, dynamics)
-    interpolation = _interpolation(transcription.body, fine.body)
-    by_dof = sp.csr_array(sp.kron(interpolation, sp.eye_array(3)))
+    by_dof = sp.csr_array(sp.kron(_interpolation(body, fine.body), sp.eye_array(3)))
     held = np.zeros(iterate.x.shape[1], dtype=bool)
     held[transcription.prescribed_dofs] = True
-    is_given, given = _given_dofs(by_dof)
-    moving = np.flatnonzero((abs(by_dof) @ ~held > 0) & (at.dynamics.is_static | ~is_given))
-    forces_n = _equivalent_forces(at, dynamics, by_dof, moving, given)
-    return Effect(force_n=at.pad_rows(forces_n - _forces_less_inertia(at.dynamics, iterate.x)))
+    given = _given_dofs(by_dof)
+    is_corner = np.zeros(by_dof.shape[0], dtype=bool)
+    is_corner[given[: body.mesh.points_m.size]] = True
+    is_corner[given[body.nodes.points_m.size :]] = True  # frames
+    moving = np.flatnonzero((abs(by_dof) @ ~held > 0) & (at.dynamics.is_static | ~is_corner))
+    return Effect(force_n=at.pad_rows(_changes_of_forces(at, dynamics, by_dof, moving, given)))
 
 
 def _effect_on_rod(at: ExperimentAtAnswer, fine: Experiment, dynamics: Dynamics) -> Effect:
@@ -151,16 +149,17 @@ def _forces_less_inertia(dynamics: Dynamics, x: Array) -> Array:
     return dynamics.force(x) - inertia_n[dynamics.first_row :]
 
 
-def _equivalent_forces(
+def _changes_of_forces(
     at: ExperimentAtAnswer,
     dynamics: Dynamics,
     interpolation: sp.csr_array,
     moving: Index,
     given: Index,
 ) -> Array:
-    """Return Iᵀ(F − M a − K e) + k e_g (N − first row, 3n) [N] at the evaluations."""
+    """Return the changes of force (N − first row, 3n) [N] at the evaluations."""
     x = np.ascontiguousarray(at.iterate.x @ interpolation.T)
     unbalanced_n = _forces_less_inertia(dynamics, x)
+    given_n = _forces_less_inertia(at.dynamics, at.iterate.x)
     xi, nu = map(np.ascontiguousarray, dynamics.evaluation_states(x))
     given_xi, given_nu = map(np.ascontiguousarray, at.dynamics.evaluation_states(at.iterate.x))
     sequence = FactorSequence(
@@ -169,16 +168,11 @@ def _equivalent_forces(
         accuracy=ACCURACY,
     )
     relative = np.zeros((1, dynamics.pattern.size))
-    equivalent_n = np.zeros_like(given_xi)
-    rows = _sampled_rows(given_xi, is_static=at.dynamics.is_static)
-    corrections_n = np.zeros((len(rows), dynamics.pattern.size))
+    changes_n = unbalanced_n @ interpolation - given_n
     of_rows = zip(
-        rows,
-        _forces_by_row(dynamics, x, rows),
-        _forces_by_row(at.dynamics, at.iterate.x, rows),
-        strict=True,
+        _forces_by_row(dynamics, x), _forces_by_row(at.dynamics, at.iterate.x), strict=True
     )
-    for number, (k, forces, given_forces) in enumerate(of_rows):
+    for k, (forces, given_forces) in enumerate(of_rows):
         now = slice(k, k + 1)
         stiffness = -forces.linearise(xi[now], nu[now]).by_position
         if dynamics.body.element.mean_dilatation:
@@ -188,32 +182,16 @@ def _equivalent_forces(
             stiffness += forces.joint_pattern.expand(lagged[None])
         system = ReusedFactor(sequence, Matrix(stiffness[0], NONE), points_m=xi[k].reshape(-1, 3))
         relative[0, moving] = system.solve(unbalanced_n[k, moving], guess=relative[0, moving])
-        corrections_n[number] = dynamics.pattern.products(stiffness, relative)[0]
-        if at.dynamics.is_static:
-            own = -given_forces.linearise(given_xi[now], given_nu[now]).by_position
-            equivalent_n[now] = at.dynamics.pattern.products(own, relative[:, given])
-    if len(rows) < len(given_xi):
-        corrections_n = make_interp_spline(rows, corrections_n, k=ORDER)(np.arange(len(given_xi)))
-    return equivalent_n + (unbalanced_n - corrections_n) @ interpolation
+        changes_n[k] -= dynamics.pattern.products(stiffness, relative)[0] @ interpolation
+        own = -given_forces.linearise(given_xi[now], given_nu[now]).by_position
+        changes_n[k] += at.dynamics.pattern.products(own, relative[:, given])[0]
+    return changes_n
 
 
-def _sampled_rows(xi: Array, *, is_static: bool) -> Index:
-    """Return the evaluations between which the motion is a spline to the accuracy of e."""
-    every = np.arange(len(xi))
-    largest_m = np.abs(xi - xi.mean(axis=0)).max()
-    for distance in ROW_DISTANCES if not is_static else ():
-        rows = np.append(every[:-1:distance], every[-1])
-        if len(rows) > 2 * ORDER:
-            between = make_interp_spline(rows, xi[rows], k=ORDER)(every)
-            if np.abs(between - xi).max() < ACCURACY * largest_m:
-                return rows
-    return every
-
-
-def _forces_by_row(dynamics: Dynamics, x: Array, rows: Index) -> Iterator[Forces]:
-    """Yield the forces of some evaluations along a motion (N, 3n) [m]."""
+def _forces_by_row(dynamics: Dynamics, x: Array) -> Iterator[Forces]:
+    """Yield the forces of the evaluations along a motion (N, 3n) [m]."""
     histories = dynamics.histories(x)
-    for row in dynamics.first_row + rows:
+    for row in range(dynamics.first_row, len(x)):
         yield dynamics.forces_with_histories(histories, slice(row, row + 1))
 
 
@@ -238,11 +216,11 @@ def _interpolation(body: Body, finer: Body) -> sp.csr_array:
     return sp.csr_array(sp.block_diag([matrix, sp.eye_array(frames)])) if frames else matrix
 
 
-def _given_dofs(by_dof: sp.csr_array) -> tuple[NDArray[np.bool_], Index]:
-    """Return which dofs (3m,) are dofs of the given mesh, and where those (3n,) are."""
+def _given_dofs(by_dof: sp.csr_array) -> Index:
+    """Return where the dofs of the given mesh are among those (3m,) of the finer one, (3n,)."""
     is_given = np.diff(by_dof.indptr) == 1
     entries = by_dof.tocoo()
     given = np.empty(int(entries.col.max()) + 1, dtype=np.int64)
     alone = is_given[entries.row]
     given[entries.col[alone]] = entries.row[alone]
-    return is_given, given
+    return given
