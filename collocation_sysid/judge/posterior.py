@@ -331,22 +331,24 @@ class Posterior:
         return np.arange(len(self.fit.names) - len(self.effects.names), len(self.fit.names))
 
     def without(self, rows: Iterable[str]) -> Posterior:
-        """Return the posterior without some effects, with the same statistical uncertainty."""
+        """Return the posterior without some effects, with the same statistical uncertainty.
+
+        The data learn the other effects from residuals in which these effects are as large as their
+        means; what the means alone change in the parameters is left out with them.
+        """
         first = len(self.fit.names) - len(self.effects.names)
         left_out = set(rows)
-        kept = [
-            *range(first),
-            *(
-                first + k
-                for k, name in enumerate(self.effects.names)
-                if name.partition(" ")[0] not in left_out
-            ),
-        ]
+        is_kept = [name.partition(" ")[0] not in left_out for name in self.effects.names]
+        kept = [*range(first), *(first + np.flatnonzero(is_kept))]
         fit = self.fit.only(kept, effect_count=len(kept) - first)
+        alone = self.fit.only(range(first), effect_count=0)
         considered = self.considered.without(left_out)
         learnt = self.effects.without(left_out)
         definition = self.definition[np.ix_(kept, kept)]
         step = gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
+        omitted = self.effects.only(np.flatnonzero(~np.array(is_kept, dtype=bool)))
+        step = step + estimate_changes(fit, omitted.blocks) @ omitted.means
+        step[:first] -= estimate_changes(alone, omitted.blocks) @ omitted.means
         return replace(
             self, fit=fit, effects=learnt, considered=considered, definition=definition, step=step
         )

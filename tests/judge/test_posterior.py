@@ -176,6 +176,20 @@ def test_effects_without_some_are_those_of_a_fit_without_them(rng):
     np.testing.assert_allclose(whole.without(["mass"]).covariance, part.covariance, atol=1e-9)
 
 
+def test_other_effects_are_learnt_beside_the_mean_of_one_that_a_refinement_measures(rng):
+    """The refinement corrects the constants alone for the measured change of the residuals."""
+    by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
+    residual, measured = rng.normal(size=len(columns)), 2.0 * columns[:, 0]
+    means = np.array([2.0, 0.0, 0.0])
+    names = ("mesh", "grip_layer_m", "body_scale")
+    whole = posterior(linear_fit(by_parameters, residual), columns, *names, means=means)
+    part = posterior(linear_fit(by_parameters, residual + measured), columns[:, 1:], *names[1:])
+    refined = posterior(linear_fit(by_parameters, measured), columns[:, :0])
+    besides = whole.without(["mesh"])
+    np.testing.assert_allclose(besides.q + refined.q - Q, part.q, atol=1e-9)
+    np.testing.assert_allclose(besides.covariance, part.covariance, atol=1e-9)
+
+
 @pytest.mark.long
 def test_intervals_hold_and_surprises_are_standard_normal_if_all_is_drawn_from_its_prior():
     rng = np.random.default_rng(11)
