@@ -16,8 +16,9 @@ is the standard deviation of its prior.
 
 The error of the mesh and of the time step are effects with a mean: that of the estimated change to
 elements, or steps, of half the length, extrapolated to infinitely small ones. The data learn its
-size, but not its shape, which is known as badly: each channel (one number of a marker over time) has
-an amplitude of its own with the same deviation, which is considered.
+size, but not its shape, which is known as badly: each channel (one number of a marker over time), and
+the part that parameters reproduce, of which residuals show nothing, have amplitudes of their own with
+the same deviation, which are considered.
 
 A single curve of a static test does not tell effects from each other, nor from the law of the
 material, which is never exact. There effects are considered but not learnt: the estimates are
@@ -188,6 +189,7 @@ class Effects:
         """
         first = len(fit.names) - len(self.names)
         redefining = [first + k for k in self._redefining]
+        kept = np.setdiff1d(np.flatnonzero(~fit.at_bound), redefining)
         matrix = np.eye(len(fit.names))
         for k in redefining:
             redefined = effect_row(self.names[k - first]).redefines
@@ -196,18 +198,16 @@ class Effects:
                 for j, item in enumerate(parameters.free)
                 if without_region(item.name) in redefined and not fit.at_bound[j]
             ]
-            slopes = _conditional_slopes(fit, k, redefining)
+            slopes = _conditional_slopes(least_squares_of_fit(fit).information, k, kept)
             ratio = 1.0 - min(0.0, *(float(slopes[j]) for j in defined)) if defined else 1.0
             matrix[defined, k] = slopes[defined] / ratio
             matrix[k, k] = 1 / ratio
         return matrix
 
 
-def _conditional_slopes(fit: LinearisedFit, column: int, left_out: Sequence[int]) -> Array:
-    """Return the changes (p,) of all parameters but some if one of them changes by one."""
-    information = least_squares_of_fit(fit).information
-    others = np.setdiff1d(np.flatnonzero(~fit.at_bound), left_out)
-    slopes = np.zeros(len(fit.names))
+def _conditional_slopes(information: Array, column: int, others: Index) -> Array:
+    """Return the changes (p,) of some parameters if another one changes by one."""
+    slopes = np.zeros(len(information))
     inverse = np.linalg.pinv(information[np.ix_(others, others)], hermitian=True)
     slopes[others] = -inverse @ information[others, column]
     return slopes
@@ -295,7 +295,7 @@ class Posterior:
     @cached_property
     def sources(self) -> tuple[tuple[str, ...], Array]:
         """Names of the effects, and changes (nq, a) of q if each is off by the standard deviation of
-        its prior; mesh and time step occur again, once for each channel.
+        its prior; mesh and time step occur again, once for each amplitude of their shape.
         """
         names, ways = self._sources
         return names, ways[: len(self.start)]
@@ -309,14 +309,15 @@ class Posterior:
         again = [k for k, name in enumerate(self.effects.names) if name in rows]
         names = (*self.effects.names, *self.considered.names)
         for k in again:
-            unknown = self._changes_by_channel(k) * self.effects.deviations[k]
+            unknown = self._changes_by_shape(k) * self.effects.deviations[k]
             ways.append(unknown)
             names += (self.effects.names[k],) * unknown.shape[1]
         return names, np.hstack(ways)
 
-    def _changes_by_channel(self, k: int) -> Array:
-        """Return the changes (p + a, c) by each channel of effect k alone, as large as it is
-        estimated; a channel is one number of a marker over time.
+    def _changes_by_shape(self, k: int) -> Array:
+        """Return the changes (p + a, c + 1) by each channel of effect k alone, as large as it is
+        estimated, and by what parameters reproduce of it; a channel is one number of a marker over
+        time.
         """
         place = self._of_effects[k]
         scores = [
@@ -324,7 +325,9 @@ class Posterior:
             for block in self.fit.blocks
         ]
         flat = np.hstack([each.reshape(len(each), -1) for each in scores])
-        return -self.step[place] * self.covariance @ flat
+        kept = np.flatnonzero(~self.fit.at_bound)[: -len(self.effects.names)]
+        reproduced = _conditional_slopes(self._information, place, kept)
+        return self.step[place] * np.column_stack([-self.covariance @ flat, reproduced])
 
     @property
     def _of_effects(self) -> Index:
