@@ -294,15 +294,10 @@ class Posterior:
 
     @cached_property
     def sources(self) -> tuple[tuple[str, ...], Array]:
-        """Names of the effects, and changes (nq, a) of q if each is off by the standard deviation of
-        its prior; mesh and time step occur again, once for each amplitude of their shape.
+        """Names of the effects, and changes (p + a, …) of parameters and learnt effects if each is off
+        by the standard deviation of its prior; mesh and time step occur again, once for each amplitude
+        of their shape.
         """
-        names, ways = self._sources
-        return names, ways[: len(self.start)]
-
-    @cached_property
-    def _sources(self) -> tuple[tuple[str, ...], Array]:
-        """The same for all parameters and learnt effects (p + a, a)."""
         ways = [self.covariance[:, self._of_effects]]
         ways.append(estimate_changes(self.fit, self.considered.blocks))
         rows = {row.name for row in DISCRETISATION}
@@ -375,7 +370,7 @@ class Posterior:
             if row.effect is not None or row in DISCRETISATION:
                 rows[EFFECT + name] = k, 1.0
         own = len(self.considered.names)
-        ways = np.pad(self._sources[1], ((0, own), (0, 0)))
+        ways = np.pad(self.sources[1], ((0, own), (0, 0)))
         ways[count:, :own] = np.eye(own)
         covariance = np.pad(self.uncertainty.noise_covariance, (0, own)) + ways @ ways.T
         scatter = self.uncertainty.scatter
@@ -452,7 +447,7 @@ class Posterior:
         by_q = self.derivatives[name] * at.derivative(self.statistical[name].value)
         variances: dict[str, float] = {}
         names, ways = self.sources
-        for effect, way in zip(names, by_q @ ways, strict=True):
+        for effect, way in zip(names, by_q @ ways[: len(by_q)], strict=True):
             row = effect.partition(" ")[0]
             variances[row] = variances.get(row, 0.0) + float(way) ** 2
         between = self._variance_between_recordings(name, at, by_q, sum(variances.values()))
@@ -529,7 +524,7 @@ class Posterior:
         """Return the covariance (nq, nq) due to noise and systematic effects in the coordinates of a
         statistical one, `sizes` (nq,) being the derivatives of these coordinates by q.
         """
-        ways = [self.sources[1]]
+        ways = [self.sources[1][: len(self.start)]]
         if self.uncertainty.scatter is not None:
             ways.append(self.uncertainty.scatter.sensitivities[: len(self.start)])
         moved = sizes[:, None] * np.hstack(ways)
@@ -548,7 +543,7 @@ class Posterior:
         actual = np.diag(self.uncertainty.nuisance_covariance)[-count:] if count else own
         predicted = np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
         # The shape of the errors of mesh and time step is not known.
-        by_shape = self._sources[1][places, count + len(self.considered.names) :]
+        by_shape = self.sources[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
         found = []

@@ -169,7 +169,7 @@ def _modulus_axis_sentence(answer: SolvedProblem) -> str:
     by_q = answer.posterior.derivatives[YOUNG.name] / known.value / anisotropy
     names, columns = answer.posterior.sources
     by_axis = {
-        name.partition(" ")[2]: float(by_q @ way)
+        name.partition(" ")[2]: float(by_q @ way[: len(by_q)])
         for name, way in zip(names, columns.T, strict=True)
         if name.startswith("anisotropy")
     }
