@@ -907,6 +907,23 @@ class Body(Discretisation):
         volumes = (self.volume_ratios(x)[0] * self.geometry[..., -1]).sum(axis=1)
         return -virials / (3 * volumes)
 
+    def resultants(self, x: Array, v: Array, theta: Theta, velocity_slope: float = 0.0) -> Array:
+        """Return the stresses times volume (T, any) [J] of the elements of a rod, see `mean_stresses`.
+
+        Parameters
+        ----------
+        x, v : (T, 3n)
+        """
+        stresses = self._evaluate("resultants", [x, v], theta)
+        shares = 1 + velocity_slope * self._rayleigh_rates(np.asarray(theta))
+        return stresses * np.repeat(shares, stresses.shape[1] // len(shares))
+
+    def resultant_stiffness(self, x: Array, resultants: Array, theta: Theta) -> Array:
+        """Return the lower triangles (T, m) of Σ s ∂²ε/∂x² [N/m] with strains ε of a rod at positions
+        x (T, 3n) [m] and their stresses times volume s (T, any) [J], which do not change.
+        """
+        return self._evaluate("resultant_stiffness", [x], theta, resultants=resultants)
+
     def _rayleigh_rates(self, theta: Array) -> Array:
         """Return γ_r (E,) [s] of the elements with Rayleigh damping, 0 for others."""
         rates = np.zeros(len(self.cells))

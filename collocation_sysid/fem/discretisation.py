@@ -28,6 +28,7 @@ from .node_force import NodeForce
 from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascending_nodes
 from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
+from .rods import RESULTANTS
 from .spatial_field import FieldAssembly
 
 # Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.
@@ -441,6 +442,7 @@ class Discretisation(ConstantsModel):
         theta: Theta,
         out: Array | None = None,
         memory_input: MemoryInput | None = None,
+        resultants: Array | None = None,
     ) -> Array:
         """Evaluate a kernel on all parts and add up the results (T, width)."""
         if len(theta) != len(self.constants):
@@ -462,7 +464,12 @@ class Discretisation(ConstantsModel):
         for k, evaluate in enumerate(self._evaluators[name]):
             values = self.point_constants(k, theta)
             if not self.parts[k].prony or name == "energy":
-                point_data = self.point_data(k, theta, with_second_derivatives=name == "curvature")
+                point_data = self.point_data(
+                    k,
+                    theta,
+                    internal_variables=resultants,
+                    with_second_derivatives=name == "curvature",
+                )
                 evaluate(
                     fields,
                     values,
@@ -501,6 +508,8 @@ class Discretisation(ConstantsModel):
             "element_force": 3 * self.cells.size,
             "linearisation": (1 + k) * size + entries,
             "curvature": 2 * k * size + entries + k * (k + 1),
+            "resultants": RESULTANTS * len(self.cells),
+            "resultant_stiffness": self.pattern.entry_count,
         }[name]
 
     def _batch(self, name: str, number: int) -> KernelBatch:
@@ -539,6 +548,7 @@ class Discretisation(ConstantsModel):
             dofs = 3 * self.element.nodes
             nodal = dofs * part.cells[:, None] + np.arange(dofs), self._width(name)
         matrix = lower, self.pattern.entry_count
+        of_cells = RESULTANTS * part.cells[:, None] + np.arange(RESULTANTS)
         nodal_by_theta = by_theta, total * self.pattern.size
         theta = np.broadcast_to(columns, (count, len(columns))), total
         theta_theta = np.broadcast_to(square, (count, len(square))), total**2
@@ -556,6 +566,7 @@ class Discretisation(ConstantsModel):
             "gradient_theta": theta,
             "by_position_skew": matrix,
             "position_velocity_skew": matrix,
+            "resultants": (of_cells, self._width(name)),
         }
         positions: dict[str, Index] = {}
         start = 0
@@ -582,6 +593,8 @@ class Discretisation(ConstantsModel):
         part = self.parts[number]
         count = len(part.cells)
         columns = [np.zeros((count, points, 0), dtype=np.int64)]
+        if name == "resultant_stiffness":
+            return (RESULTANTS * part.cells[:, None] + np.arange(RESULTANTS))[:, None]
         width = 0
         if part.prony and name != "energy":
             own = self.memory.part_columns(number)

@@ -37,7 +37,7 @@ from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
 from .laws.materials import DampingLaw, Material, damped_psi
 from .laws.mean_dilatation import averaging_kernel
 from .rest_point_layout import RestPointLayout
-from .rods import RodMaterial
+from .rods import RESULTANTS, RodMaterial
 
 # Number of kernels of each kind kept in memory, shared by bodies of the same law and element.
 CACHED_KERNELS = 64
@@ -371,9 +371,43 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
     return kernel_from_outputs("curvature", point, outputs=outputs)
 
 
+def _resultants(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX]:
+    """Return the strains and stresses per volume of a rod, see `RodMaterial.resultants`."""
+    assert isinstance(law.material, RodMaterial)
+    rate = (
+        point.gradients["v"] if "v" in point.gradients else ca.SX(point.gradients["x"].numel(), 1)
+    )
+    gamma_r_s = point.theta[len(law.material.constants)] if law.damping.stress else ca.SX(0)
+    return law.material.resultants(
+        point.compute_material_gradient(), rate, _material_constants(point, law), gamma_r_s
+    )
+
+
+@lru_cache(CACHED_KERNELS)
+def resultants_kernel(element: Element, law: PointLaw) -> ElementKernel:
+    """Return the kernel of the stresses times volume [J] of an element of a rod."""
+    point = quadrature_point(element, law, "x", "v")
+    _, stress = _resultants(point, law)
+    outputs: Outputs = {"resultants": (Derivative(point.compute_volume() * stress, ()),)}
+    return kernel_from_outputs("resultants", point, outputs)
+
+
+@lru_cache(CACHED_KERNELS)
+def resultant_stiffness_kernel(element: Element, law: PointLaw) -> ElementKernel:
+    """Return the kernel of Σ s ∂²ε/∂x² of an element of a rod, with stresses times volume s that
+    are data of its point.
+    """
+    point = quadrature_point(element, law, "x", internal_variable_count=RESULTANTS)
+    strain, _ = _resultants(point, law)
+    outputs: Outputs = {"by_position": (Derivative(ca.dot(point.point_data, strain), ("x", "x")),)}
+    return kernel_from_outputs("resultant_stiffness", point, outputs)
+
+
 KERNELS: dict[str, Callable[[Element, PointLaw], ElementKernel]] = {
     "energy": energy_kernel,
     "force": force_kernel,
     "linearisation": linearisation_kernel,
     "curvature": curvature_kernel,
+    "resultants": resultants_kernel,
+    "resultant_stiffness": resultant_stiffness_kernel,
 }

@@ -51,6 +51,7 @@ _ANGLES = 2 * np.pi / 3 * np.arange(3)
 _DIRECTORS = np.stack([np.full(3, 1 / 3), 2 / 3 * np.cos(_ANGLES), 2 / 3 * np.sin(_ANGLES)])
 # Of the rest shape a point has half the length of its element, then the strains.
 COLUMNS, STRAINS = ROD.columns, ROD.rest_values - 1
+RESULTANTS = STRAINS + 6  # with those of both sections
 
 
 @dataclass(frozen=True)
@@ -449,19 +450,8 @@ class RodMaterial(Material):
         """Return the energy per volume [J/m³] at G (3, 5), from the constants, then half the
         length, the strains at rest (6,) and the volume of the element.
         """
-        stiffness, strain = self._stiffness(values), self._strain(F, values)
-        d1, d2, _, d1_slope, d2_slope = ca.horzsplit(F)
-        half = values[len(self.constants)]  # not from the volume, by which stiffness is scaled
-        energy = ca.dot(stiffness, strain**2) / 2
-        for offset in (-half, half):
-            first, second = d1 + offset * d1_slope, d2 + offset * d2_slope
-            change = (
-                (ca.dot(first, first) - 1) ** 2 / 4
-                + (ca.dot(second, second) - 1) ** 2 / 4
-                + ca.dot(first, second) ** 2 / 2
-            )
-            energy += SECTION_STIFFNESS * stiffness[2] * change / 4
-        return energy / self.section.area_m2
+        stiffness, strain = self._all_strains(F, values)
+        return ca.dot(stiffness, strain**2) / (2 * self.section.area_m2)
 
     def viscous_stress(
         self, F: ca.SX, rate: ca.SX, values: ca.SX, gamma_r_s: ca.SX
@@ -473,6 +463,19 @@ class RodMaterial(Material):
         viscosity = gamma_r_s * ca.diag(self._stiffness(values)) / self.section.area_m2
         stress = slopes.T @ viscosity @ slopes @ rate
         return stress, ca.jacobian(stress, F)
+
+    def resultants(
+        self, F: ca.SX, rate: ca.SX, values: ca.SX, gamma_r_s: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return strains at G (3, 5), with those of both sections (12,), and the elastic stresses
+        per volume that are conjugate to them, with the viscous ones at the rate (15,).
+        """
+        G = ca.SX.sym("G", 3, COLUMNS)
+        stiffness, strain = self._all_strains(G, values)
+        damped = ca.vertcat(ca.jtimes(strain[:STRAINS], ca.vec(G), rate), ca.SX(STRAINS, 1))
+        stress = stiffness * (strain + gamma_r_s * damped) / self.section.area_m2
+        strain, stress = ca.substitute([strain, stress], [G], [F])
+        return strain, stress
 
     @cached_property
     def lame(self) -> ca.Function:
@@ -510,6 +513,22 @@ class RodMaterial(Material):
             young * about_2,
             shear * self.section.torsion_m4,
         )
+
+    def _all_strains(self, G: ca.SX, values: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return the stiffnesses (12,) and strains (12,) whose energy per length is ½ Σ stiffness ·
+        strain²: those of the rod, then Green's strains of both sections.
+        """
+        stiffness, strain = self._stiffness(values), self._strain(G, values)
+        section = SECTION_STIFFNESS * stiffness[2] / 2 * ca.SX([1, 1, 2])
+        d1, d2, _, d1_slope, d2_slope = ca.horzsplit(G)
+        half = values[len(self.constants)]  # not from the volume, by which stiffness is scaled
+        for offset in (-half, half):
+            first, second = d1 + offset * d1_slope, d2 + offset * d2_slope
+            own = ca.vertcat(
+                ca.dot(first, first) - 1, ca.dot(second, second) - 1, ca.dot(first, second)
+            )
+            stiffness, strain = ca.vertcat(stiffness, section), ca.vertcat(strain, own / 2)
+        return stiffness, strain
 
     def _strain(self, G: ca.SX, values: ca.SX) -> ca.SX:
         rest = values[values.numel() - STRAINS - 1 : values.numel() - 1]

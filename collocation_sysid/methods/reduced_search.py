@@ -43,6 +43,9 @@ DECREASE = 1e-3
 # With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
 # simulated. Where a body strikes or slips, forces change within a small part of any step.
 SMALL_IMPACT_STRAIN = 1e-4
+# The same for slender bodies without impacts: forces along them that are wrong by their weight are
+# perhaps compression, with which the linearised motion grows without limit.
+SLENDER_STRAIN = 1e-2
 # Steps longer than so many times the one that is expected to leave as much are simulated at once.
 LONGEST_SWEPT = 2.0
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With
@@ -95,10 +98,6 @@ ACCURACY_SHARE = 0.01
 FINAL_ACCURACY_SHARE = 0.1
 # Largest number of new associations of the measurements.
 REREADINGS = 40
-# Largest number of feasibility steps after a step of a slender body, which end at a share of an edge.
-CORRECTIONS = 8
-CORRECTED = 1e-11
-DIVERGENCE = 4.0
 # Larger than any loss.
 UNLIMITED = 1e100
 
@@ -197,6 +196,9 @@ class ReducedSearch:
         Whether such measurements do not state which points of the body they are.
     has_impacts : bool
         Whether a body may strike an obstacle: the trajectory is then not smooth in the parameters.
+    largest_strain : float or None
+        Largest infeasibility of a trial over an edge of the mesh, above which it is simulated; None
+        if trials are never simulated.
     is_associated : bool
         Whether cameras of unknown position have been associated with trajectories of
         sufficient length.
@@ -204,8 +206,8 @@ class ReducedSearch:
         Whether the last `minimise` ended because new correspondences changed the loss by more than
         short steps did, while a full step was longer than a standard error of a parameter.
     feasible_length : float
-        Step of the parameters whose sweep is expected to leave as much infeasibility as is allowed with
-        impacts.
+        Step of the parameters whose sweep is expected to leave as much infeasibility as
+        `largest_strain` allows.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
     most_measurements : int
@@ -250,7 +252,10 @@ class ReducedSearch:
             not transcription.experiment.is_static and transcription.experiment.obstacles
             for transcription in collocation.transcriptions
         )
-        self.is_slender = any(each.body.is_slender for each in collocation.transcriptions)
+        is_slender = any(each.body.is_slender for each in collocation.transcriptions)
+        self.largest_strain = (
+            SMALL_IMPACT_STRAIN if self.has_impacts else SLENDER_STRAIN if is_slender else None
+        )
         self.largest_trust = SEEING if self.has_unlabelled else WIDEST
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
@@ -535,7 +540,7 @@ class ReducedSearch:
         return with_curvature(point.fit, curvature).minimiser(low, high)
 
     def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
-        """Return the point after a step, with impacts perhaps simulated; None if that fails."""
+        """Return the point after a step, perhaps simulated; None if that fails."""
         p = np.clip(point.p + step, self.lower, self.upper)
         length = self._step_length(step)
         trial = None
@@ -544,9 +549,8 @@ class ReducedSearch:
             with suppress(SimulationError):
                 accuracy = self._accuracy_after(length)
                 trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
-                trial = self._corrected(horizon, trial) if self.is_slender else trial
-        if self.has_impacts:
-            limit_m = SMALL_IMPACT_STRAIN * self.edge_m
+        if self.largest_strain is not None:
+            limit_m = self.largest_strain * self.edge_m
             if trial is not None and not trial.feasibility_m <= limit_m:
                 # Infeasibility is of second order in the step.
                 share = np.sqrt(limit_m / np.fmin(trial.feasibility_m, self.edge_m))
@@ -554,20 +558,6 @@ class ReducedSearch:
                 trial = None
             trial = trial or self._simulated(horizon, p, point)
         return trial if trial is not None and trial.is_finite else None
-
-    def _corrected(self, horizon: Horizon, trial: Iterate) -> Iterate:
-        """Return a trial after further feasibility steps, at most `CORRECTIONS`.
-
-        A slender body hardly stretches, so that what is linear in the step stretches it.
-        """
-        for _ in range(CORRECTIONS):
-            if not trial.feasibility_m > CORRECTED * self.size_m:
-                break
-            corrected = horizon.evaluate_step(trial.p, trial, step=np.zeros(len(trial.p)))
-            if not corrected.feasibility_m <= DIVERGENCE * trial.feasibility_m:
-                break
-            trial = corrected
-        return trial
 
     def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:
         """Return the point with a simulated trajectory, one sweep; None if that fails."""

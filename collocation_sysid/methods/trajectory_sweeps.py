@@ -17,6 +17,7 @@ from ..common.array_types import Array
 from ..errors import SimulationError
 from ..program.collocation import ExperimentIterate
 from ..program.forward.loss_of_stability import explain_failure
+from ..program.forward.newton_linearisation import LaggedStress
 from ..program.forward.newton_solver import NewtonOptions
 from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
@@ -109,6 +110,7 @@ def sweep(
     known_sweep: LinearisedTrajectory | None = None,
     previous: LinearisedTrajectory | None = None,
     accuracy: float = ACCURACY,
+    resultants: Array | None = None,
 ) -> LinearisedTrajectory:
     """Return the result of one sweep at parameters p and given positions: the feasibility step, the
     sensitivities, and the measurement residuals linearised after that step.
@@ -130,6 +132,8 @@ def sweep(
         sensitivities are the first guess of solutions that are refined.
     accuracy : float
         Relative accuracy of the solution of each time step, see `Sweep.forward`.
+    resultants : array, optional
+        See `Sweep.forward`.
 
     Raises
     ------
@@ -143,7 +147,12 @@ def sweep(
     return _linearised_trajectory(
         part,
         solver.forward(
-            part.x, part.equations, known=known_sweep, accuracy=accuracy, similar=previous
+            part.x,
+            part.equations,
+            known=known_sweep,
+            accuracy=accuracy,
+            similar=previous,
+            resultants=resultants,
         ),
         previous=previous,
         times_s=solver.stopwatch.read_and_reset(),
@@ -200,7 +209,12 @@ def sweep_after_step(
         return x if failure is None else None
 
     if not dynamics.is_static:
-        return sweep_from(part.x)
+        resultants = None
+        if dynamics.body.is_slender:
+            dynamics = dynamics.truncated_to(len(part.x))
+            stress = LaggedStress(dynamics.forces, dynamics.evaluation_states)
+            resultants = stress.after(previous.x, part.x - previous.x) - stress.at(part.x)
+        return sweep_from(part.x, resultants=resultants)
     x = equilibria(SETTLED)
     if x is None:
         return sweep_from(part.x)

@@ -255,6 +255,14 @@ class Forces:
             memory_input=self.memory_state,
         )
 
+    def resultants(self, xi: Array, nu: Array, velocity_slope: float = 0.0) -> Array:
+        """Return the resultants (T, any) [J] of the elements of a rod at states ξ, ν, (T, 3n) each,
+        see `Body.resultants`.
+        """
+        states = self.states_of_terms(xi, nu)(self.weight)
+        slope = 0.0 if self.is_static else velocity_slope
+        return self.body.resultants(states.xi, states.nu, self.theta, slope)
+
     def linearise(self, xi: Array, nu: Array, out: Array | None = None) -> Linearisation:
         """Return the forces and their first derivatives by state and inputs; columns of `by_theta`
         are those of θ, then of the inputs of each term.

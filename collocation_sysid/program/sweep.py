@@ -328,6 +328,7 @@ class Sweep:
         known: SweepResult | None = None,
         accuracy: float = ACCURACY,
         similar: SweepResult | None = None,
+        resultants: Array | None = None,
     ) -> SweepResult:
         """Compute the feasibility step p and the sensitivities Z at all grid times of this sweep.
 
@@ -346,6 +347,9 @@ class Sweep:
         similar : SweepResult, optional
             Result at other parameters and positions, not modified. Its sensitivities are the first
             guess of solutions that are refined, which need fewer corrections then.
+        resultants : (N − first row, any) array, optional
+            Changes of the resultants of a rod [J] in the derivatives by position, see
+            `newton_linearisation`.
 
         Raises
         ------
@@ -362,6 +366,7 @@ class Sweep:
             grasp_forces=grasp_forces,
             accuracy=accuracy,
             similar=None if similar is None else similar.by_p,
+            resultants=resultants,
         )
         if known is not None:
             done = len(known.step)
@@ -588,6 +593,7 @@ class Sweep:
         first: int = 0,
         histories: Sequence[AnyHistory] = (),
         accuracy: float = ACCURACY,
+        resultants: Array | None = None,
     ) -> Iterator[tuple[slice, Linearisation, list[FactorisedStep]]]:
         """Iterate over the linearised and factorised time steps, a few at a time, using threads:
         their grid times, their forces and derivatives, and an entry for each row, ascending.
@@ -609,6 +615,8 @@ class Sweep:
             History variables at x; empty if there are none.
         accuracy : float
             Relative accuracy of solutions that are refined.
+        resultants : (N − first row, any) array, optional
+            See `forward`.
 
         Raises
         ------
@@ -636,6 +644,11 @@ class Sweep:
                 at = dynamics.forces_with_histories(histories, here).linearise(
                     xi[evaluations], nu[evaluations]
                 )
+                if resultants is not None:
+                    change = self.body.resultant_stiffness(
+                        xi[evaluations], resultants[evaluations], dynamics.theta
+                    )
+                    at.by_position[:] -= dynamics.forces.joint_pattern.expand(change)
             with self.stopwatch.solving():
                 rows = [StencilRow.from_dynamics(dynamics, t) for t in range(start, here.stop)]
                 matrix = partial(
@@ -754,6 +767,8 @@ class ForwardSubstitution:
         Relative accuracy of the solution of each row where it is refined.
     similar : (N, 3n, m) array, optional
         Sensitivities at other parameters, as a guess of the last m columns; not modified.
+    resultants : (N − first row, any) array, optional
+        See `Sweep.forward`.
     """
 
     def __init__(
@@ -764,8 +779,10 @@ class ForwardSubstitution:
         grasp_forces: GraspForces | None = None,
         accuracy: float = ACCURACY,
         similar: Array | None = None,
+        resultants: Array | None = None,
     ) -> None:
         self.solver = solver
+        self._resultants = resultants
         self.accuracy = accuracy
         self._similar = similar
         # Solutions of the last rows minus similar ones, latest first.
@@ -838,7 +855,12 @@ class ForwardSubstitution:
             self.past.appendleft(start)
             yield np.zeros(self.shape) if columns.start_m is None else start
         for rows, linearisation, steps in solver.chunks(
-            x, setting, first=done, histories=histories, accuracy=self.accuracy
+            x,
+            setting,
+            first=done,
+            histories=histories,
+            accuracy=self.accuracy,
+            resultants=self._resultants,
         ):
             residual = None
             if columns.has_step:

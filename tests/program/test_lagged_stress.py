@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from kit.problems import nodes_where
+from kit.rods import cable, ends, straight
 
 from collocation_sysid import (
     Body,
@@ -16,6 +17,7 @@ from collocation_sysid import (
     box_mesh,
     simulate,
 )
+from collocation_sysid.fem.rods import CrossSection
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.newton_linearisation import LaggedStress
@@ -109,6 +111,76 @@ def test_the_stresses_change_the_way_to_a_solution_and_not_the_solution(monkeypa
     with_stresses_m = moved("rayleigh", 0.49)
     monkeypatch.setattr(LaggedStress, "replace_stress", lambda self, at, x, stress_pa: at)
     np.testing.assert_allclose(moved("rayleigh", 0.49), with_stresses_m, atol=1e-9)
+
+
+# Slender bodies ----------------------------------------------------------------------------------
+
+
+def whip(step_s: float = 0.01) -> Experiment:
+    """A cable of 0.6 m that hardly stretches, moved to and fro by a hand."""
+    body = cable(straight(0.6, CrossSection.round(0.006), 16, (0, 0, -1)))
+    t_s = np.arange(0, 0.4 + step_s / 2, step_s)
+    sway_m = np.outer(0.08 * (1 - np.cos(12 * t_s)), [1.0, 0.5, 0.3])
+    poses = PoseSequence(t_s, sway_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)))
+    return Experiment(
+        body,
+        t_s,
+        [Grasp(ends(body)[0], poses)],
+        Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[body.mesh.place_m(0.6)]),
+        nuisance=Nuisance.none(),
+        air_density_kg_m3="none",
+    )
+
+
+STIFF = {"bending_n_m2": 1e-3, "torsion_n_m2": 3e-4, "axial_n": 5e4} | {
+    "gamma_r_s": 2e-3,
+    "gamma_m_1_s": 0.3,
+}
+
+
+def test_steps_of_a_cable_that_hardly_stretches_take_few_factorisations(monkeypatch):
+    solutions = []
+    factorised = []
+    factorise = Factoriser.factorise
+    monkeypatch.setattr(
+        Factoriser, "factorise", lambda *a, **k: factorised.append(a) or factorise(*a, **k)
+    )
+    solutions.append(simulate(whip(), STIFF, "midpoint", substeps=1).positions_m)
+    assert len(factorised) <= 4 * 40
+    few = len(factorised)
+    monkeypatch.setattr(LaggedStress, "replace_stress", lambda self, at, x, stress_pa: at)
+    solutions.append(simulate(whip(), STIFF, "midpoint", substeps=1).positions_m)
+    assert len(factorised) > 3 * few
+    np.testing.assert_allclose(*solutions, atol=1e-8)
+
+
+def test_a_free_cable_that_hardly_stretches_tumbles():
+    """About two axes, by 0.06 rad a step, with the steps of a solve."""
+    body = cable(straight(1.0, CrossSection.round(0.004), 11))
+    t_s = np.arange(0, 1.005, 0.01)
+    thrown = Experiment(
+        body,
+        t_s,
+        [],
+        Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[body.mesh.place_m(0.0)]),
+        gravity_m_s2=(0.0, 0.0, 0.0),
+        start="undeformed",
+        start_spin_rad_s=(3.0, 5.0, 10.0),
+        start_velocity_m_s=(1.0, 0.3, 0.0),
+        air_density_kg_m3="none",
+        nuisance=Nuisance.none(),
+    )
+    values = STIFF | {"bending_n_m2": 0.02, "gamma_r_s": 5e-4, "gamma_m_1_s": 0.0}
+    x = simulate(thrown, values, "midpoint", substeps=2).positions_m
+    middle, rate = (x[1:] + x[:-1]) / 2, np.diff(x, axis=0) / 0.01
+    mass_kg = body.node_mass[:, None]
+    momentum = (mass_kg * rate).sum(axis=1)
+    np.testing.assert_allclose(momentum, momentum[:1].repeat(len(rate), axis=0), atol=1e-9)
+    centre_m = (mass_kg * middle).sum(axis=1, keepdims=True) / mass_kg.sum()
+    spin = (mass_kg * np.cross(middle - centre_m, rate)).sum(axis=1)
+    assert np.abs(spin - spin[0]).max() < 2e-3 * np.linalg.norm(spin[0])
+    energy_j = (mass_kg * rate**2).sum(axis=(1, 2)) / 2
+    np.testing.assert_allclose(energy_j, energy_j[0], rtol=0.01)
 
 
 def test_elastic_and_viscous_stresses_that_cancel_are_no_instability():

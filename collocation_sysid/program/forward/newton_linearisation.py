@@ -44,7 +44,9 @@ class NewtonLinearisation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LaggedStress:
-    """Mean stresses of the elements as functions of the positions of Newton's method."""
+    """Mean stresses of the elements as functions of the positions of Newton's method; of a rod all
+    resultants, with which the same holds for stretch and shear, and the rigidity of sections.
+    """
 
     forces: Forces  # forces in the residual
     # Positions ξ [m] and velocities ν [m/s], (1, 3n) each, at which they are evaluated, of the
@@ -54,9 +56,11 @@ class LaggedStress:
     velocity_slope: float = 0.0  # derivative of ν by ξ [1/s]
 
     def at(self, x: Array) -> Array:
-        """Return the mean stresses (E,) [Pa] at x (3n,) [m]; zero for a rod, which has no volume."""
+        """Return the mean stresses (E,) [Pa] at x (3n,) [m]; of a rod the resultants [J] (T, any) in
+        each of T states.
+        """
         if self.forces.body.is_slender:
-            return np.zeros(len(self.forces.body.cells))
+            return self.forces.resultants(*self.states(x), self.velocity_slope)
         return self.forces.mean_stresses(*self.states(x), self.velocity_slope)
 
     def after(self, x: Array, step: Array) -> Array:
@@ -78,11 +82,15 @@ class LaggedStress:
         self, at: NewtonLinearisation, x: Array, stress_pa: Array
     ) -> NewtonLinearisation:
         """Return the linearisation at x (3n,) [m] with the mean stresses `stress_pa` (E,) in place
-        of those of x in its derivative.
+        of those of x in its derivative; for a rod with its resultants.
         """
-        if self.forces.body.is_slender:
-            return at
         (xi,), _ = self.states(x)
-        change = self.weight * self.forces.body.volume_stiffness(xi, stress_pa - self.at(x))
-        spread = self.forces.joint_pattern.expand(change[None])[0]
+        change = stress_pa - self.at(x)
+        body = self.forces.body
+        stiffness = (
+            body.resultant_stiffness(xi[None], change, self.forces.theta)[0]
+            if body.is_slender
+            else body.volume_stiffness(xi, change)
+        )
+        spread = self.forces.joint_pattern.expand(self.weight * stiffness[None])[0]
         return at._replace(symmetric=at.symmetric + spread)

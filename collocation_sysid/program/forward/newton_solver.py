@@ -178,6 +178,9 @@ class NewtonSolver:
         self.last_factor: Factor | None = None
         self.compliance: Compliance | None = None
         self.definite_factor: Factor | None = None
+        # Number of time steps until chord steps with the factor of the one before are tried again, and
+        # by how many they were postponed when they failed last: as many more each time.
+        self._wait = self._pause = 0
         # Mean stresses of the elements in the last time step, and its solution (3n,) [m].
         self._last_step: tuple[LaggedStress, Array] | None = None
 
@@ -282,9 +285,13 @@ class NewtonSolver:
                 return improved
         self._require_upright(x)
         # If they do not converge, the search begins at x: their last state may be far off.
-        improved, done = self._simplified_newton(x, _CompleteIteration(self, equations))
-        if done:
-            return improved
+        if not self._wait:
+            improved, done = self._simplified_newton(x, _CompleteIteration(self, equations))
+            if done:
+                self._pause = 0
+                return improved
+            self._wait = self._pause = 2 * self._pause + 1
+        self._wait -= 1
         linearise = equations.linearise
         if self._last_step is not None:
             stress, before = self._last_step
