@@ -7,13 +7,14 @@ from functools import cache
 
 import numpy as np
 import pytest
-from kit.depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar, camera_residuals
+from kit.depth import MATRIX, NOISE_M, POSE, SHAPE, TRUTH, bar, camera_residuals, moved
 from kit.problems import smooth_poses, times
 from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
 from collocation_sysid.extras.studies.model_choice import reserve_test_data
 from collocation_sysid.methods.starts.continuation import first_samples
+from collocation_sysid.methods.starts.stiffness_scan import scan_stiffness
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.runs.check import check_problem
@@ -127,3 +128,23 @@ def test_a_delay_does_not_extrapolate_between_fine_time_steps(late_s):
         assert np.isnan(off_m[~within]).all()
         if share == 1.0:
             assert np.sqrt(np.nanmean(off_m**2)) < 2 * NOISE_M
+
+
+def test_a_scan_sees_the_motion_in_depth_images_of_a_late_camera():
+    late_s, pose = 0.02, moved(np.array([0.0, 0.0, 0.02]), np.array([0.003, 0.002, 0.0]))
+    camera, at_s = cs.DepthCamera(MATRIX, pose=POSE), times(SAMPLES)[[0, 2, 4, 6, 8, 10, 12]]
+    still = {"gravity_m_s2": (0.0, 0.0, 0.0)}
+    blind = cs.Depth("none", at_s, [np.zeros((1, 3))] * len(at_s), 1e-3)
+    made = replace(swung(blind), **still)
+    skin = VisibleSurface.from_body(bar(), blind)
+    x = CubicSpline(made.t_s, cs.simulate(made, MADE).positions_m)(at_s + late_s)
+    seen = [skin.subdivided_triangles(each[skin.nodes], 2) for each in x]
+    images_m = [cs.depth_image(camera, SHAPE, (e - POSE[:3, 3]) @ POSE[:3, :3]) for e in seen]
+    images_m += NOISE_M * np.random.default_rng(0).normal(size=np.shape(images_m))
+    stated = cs.DepthCamera(MATRIX, pose=pose)
+    depth = cs.Depth.of_images("front", images_m, stated, NOISE_M, at_s, spacing_m=0.008)
+    nuisance = cs.Nuisance.none(depth_turn_rad=0.02, depth_shift_m=0.005, depth_time_s=late_s)
+    experiment = replace(swung(depth), **still, nuisance=nuisance)
+    unknown = {**MADE, "young_pa": cs.Unknown()}
+    scan = scan_stiffness(cs.Problem([experiment], unknown).collocation())
+    assert 0.5 < scan.young_pa[scan.best] / MADE["young_pa"] < 2

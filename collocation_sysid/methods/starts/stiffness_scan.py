@@ -76,6 +76,8 @@ CLEARLY_BETTER = 1.2
 LARGEST_ERROR = 3.0
 # Change of the errors, in the same unit, that ends the steps to those that fit best.
 SMALL_ERROR = 1e-3
+# Change of an error, in the same unit, for derivatives of distances without correspondences.
+DIFFERENCE = 1e-3
 # Most steps to the errors that fit best: a turned camera takes about six.
 NUISANCE_STEPS = 10
 
@@ -409,7 +411,12 @@ def _residuals(iterate: ExperimentIterate) -> Iterator[tuple[Array, Array]]:
         # Cameras are compared by `rough_residuals`, which need no correspondences.
         rough = kind.rough_residuals(moved.x, phi)
         if rough is not None:
-            yield rough, np.zeros((len(rough), len(phi)))
+            slopes = np.zeros((len(rough), len(phi)))
+            for place in kind.own_parameters[0]:
+                other = kind.rough_residuals(moved.x, phi + DIFFERENCE * np.eye(len(phi))[place])
+                slopes[:, place] = (other - rough) / DIFFERENCE
+            is_seen = np.isfinite(rough)
+            yield rough[is_seen], slopes[is_seen]
             continue
         for place, other in zip(grasp, others, strict=True):
             slope[..., place] += kind.residuals(other.observables[k], phi) - residual

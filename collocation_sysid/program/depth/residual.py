@@ -49,6 +49,8 @@ NEIGHBOURS = 4
 FEWEST_FOR_SPLINE = 4
 # Largest number of patches that statistics combine the points into.
 PATCHES = 60
+# Most images that are compared with a surface without correspondences.
+ROUGH_IMAGES = 10
 # Factor by which patches grow until there are few enough.
 GROWING = 1.2
 
@@ -143,20 +145,18 @@ class DepthResidual(CorrespondenceResidual):
     @cached_property
     def _neighbour_times(self) -> NDArray[np.int64]:
         """Indices (S, k) of the observable's times around each image; k = 1 if at its time."""
-        return self._times_around(self.correspondences.taken_s)
+        return self._times_around(self.correspondences.taken_s, self.observable_s)
 
-    def _times_around(self, taken_s: Array) -> NDArray[np.int64]:
-        nearest = np.abs(self.observable_s - taken_s[:, None]).argmin(axis=1)
-        is_off_grid = (
-            np.abs(self.observable_s[nearest] - taken_s).max(initial=0.0) > TIME_TOLERANCE_S
-        )
+    def _times_around(self, taken_s: Array, at_s: Array) -> NDArray[np.int64]:
+        nearest = np.abs(at_s - taken_s[:, None]).argmin(axis=1)
+        is_off_grid = np.abs(at_s[nearest] - taken_s).max(initial=0.0) > TIME_TOLERANCE_S
         clock = self.nuisance.indices_of_rows(
             DEPTH_TIME, component=self.correspondences.camera.camera_index
         )
-        if not (is_off_grid or len(clock)) or len(self.observable_s) < 2:
+        if not (is_off_grid or len(clock)) or len(at_s) < 2:
             return nearest[:, None]
-        used = min(NEIGHBOURS, len(self.observable_s))
-        return neighbouring_times(self.observable_s, taken_s + TIME_TOLERANCE_S, count=used)
+        used = min(NEIGHBOURS, len(at_s))
+        return neighbouring_times(at_s, taken_s + TIME_TOLERANCE_S, count=used)
 
     @cached_property
     def _stencil(self) -> RowStencil:
@@ -236,12 +236,23 @@ class DepthResidual(CorrespondenceResidual):
         return ca.dot(normal, surface) - ca.dot(in_camera, corrected) - normal_motion
 
     def rough_residuals(self, x: Array, phi: Array) -> Array:
-        """Return distances (P,) of the surface to the first image, in standard deviations."""
-        shapes = self.surface_shapes(x, phi)
-        return (
-            self.correspondences.distance_to_cloud_m(shapes[0], phi)
-            / self.correspondences.camera.depth.sigma_m
-        )
+        """Return distances of the surface to the first images, at most `ROUGH_IMAGES` of them evenly,
+        in standard deviations; NaN for parts that the camera does not see.
+        """
+        pairs = self.correspondences
+        seen_from = pairs.with_start_values(phi)
+        shapes, seen = self.surface_shapes(x, phi), self.surface_shapes(x, seen_from)
+        useful = np.flatnonzero(pairs.measured.presence["points"][: len(shapes)])
+        images = np.linspace(0, len(useful) - 1, min(len(useful), ROUGH_IMAGES)).astype(int)
+        away_m = [
+            np.where(
+                pairs.is_facing(seen[k], seen_from, k),
+                pairs.distance_to_cloud_m(shapes[k], phi, k),
+                np.nan,
+            )
+            for k in useful[images].tolist()
+        ]
+        return np.concatenate([*away_m, np.zeros(0)]) / pairs.camera.depth.sigma_m
 
     @property
     def uncompared_count(self) -> int:
@@ -385,19 +396,18 @@ class DepthResidual(CorrespondenceResidual):
 
     def surface_shapes(self, x: Array, phi: Array) -> Array:
         """Return the surface nodes (s, n, 3) [m] at the times of those first s images for which the
-        first rows x (rows, 3n) [m] suffice, with the clock shift of φ (k,); s may be 0. The first and
-        last shapes are those of images before and after the motion.
+        first rows x (rows, 3n) [m] suffice, with the clock shift of φ (k,); s may be 0. Images
+        before and after these rows have their first and last shape.
         """
+        known = int((self._neighbour_times[:, -1] < len(x)).sum())
+        at_s = self.observable_s[: len(x)]
         late_s = self.correspondences.camera.clock_shift_s(phi)
-        taken_s = np.clip(self.t_s + late_s, self.observable_s[0], self.observable_s[-1])
-        around = self._times_around(taken_s)
-        known = int((around[:, -1] < len(x)).sum())
+        taken_s = np.clip(self.t_s[:known] + late_s, at_s[0], at_s[-1])
+        around = self._times_around(taken_s, at_s)
         nodes = x.reshape(len(x), -1, 3)[:, self.correspondences.surface.nodes]
         return np.array(
             [
-                np.tensordot(
-                    lagrange_weights(t, self.observable_s[times].tolist()), nodes[times], 1
-                )
-                for t, times in zip(taken_s[:known], around[:known], strict=True)
+                np.tensordot(lagrange_weights(t, at_s[times].tolist()), nodes[times], 1)
+                for t, times in zip(taken_s, around, strict=True)
             ]
         ).reshape(known, *nodes.shape[1:])

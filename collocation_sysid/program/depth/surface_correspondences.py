@@ -303,17 +303,18 @@ class SurfaceCorrespondences(Correspondences):
             settled=self.has_converged,
         )
 
-    def distance_to_cloud_m(self, x: Array, phi: Array) -> Array:
-        """Return the distances (P,) [m] to the points of the first image from the middles of those
-        flat triangles of a shape x (n, 3) [m] that the camera sees at φ (k,), not at a grazing
-        angle.
-
-        Distances are limited to `initial_gate_m` of the body.
+    def is_facing(self, x: Array, phi: Array, image: int) -> NDArray[np.bool_]:
+        """Return which flat triangles (P,) of a shape x (n, 3) [m] the camera sees in an image at φ
+        (k,), not at a grazing angle.
         """
-        view = self.camera
-        is_facing = self.surface.is_facing(x, self.camera.eye_m(phi, 0), minimum_cosine=GRAZING)
-        middles = x[self.surface.plane_triangles[is_facing]].mean(axis=1)
-        distances_m, _ = KDTree(view.world_points(phi, 0)).query(middles)
+        return self.surface.is_facing(x, self.camera.eye_m(phi, image), minimum_cosine=GRAZING)
+
+    def distance_to_cloud_m(self, x: Array, phi: Array, image: int) -> Array:
+        """Return the distances (P,) [m] of the middles of all flat triangles of a shape x (n, 3) [m]
+        from the points of an image at φ (k,), limited to `initial_gate_m` of the body.
+        """
+        middles = x[self.surface.plane_triangles].mean(axis=1)
+        distances_m, _ = KDTree(self.camera.world_points(phi, image)).query(middles)
         return np.minimum(distances_m, initial_gate_m(self.body.nodes_m))
 
     def next_gate_m(self, shapes_m: Array, phi: Array) -> float:
