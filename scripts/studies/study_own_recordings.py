@@ -23,6 +23,7 @@ import numpy as np
 from depth_twins import MATRIX as DEPTH_MATRIX
 from depth_twins import SHAPE_PX, upright_pose
 from filmed_twins import DISTORTION, MATRIX, SIZE_PX
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from script_arguments import make_parser
 
@@ -81,7 +82,7 @@ CASES = {
     "stiff-cast": Case(5e6, "cast", 120, cs.Unknown(), "front side", log_hz=240.0),
     "light-foam": Case(2e4, "foam", 30, cs.Unknown(), density_kg_m3=80.0),
     "stiff-foam": Case(2e5, "foam", 120, cs.Unknown(1e6), density_kg_m3=200.0),
-    "markers": Case(5e5, "cast", 120, cs.Unknown(), "markers"),
+    "markers": Case(5e5, "cast", 120, cs.Unknown(), "markers", log_hz=120.0),
     "depth": Case(8e4, "cast", 30, cs.Unknown(), "depth"),
 }
 
@@ -95,9 +96,14 @@ def bar(case: Case, divisions: tuple[int, int, int]) -> cs.Body:
     return cs.Body(mesh, density_kg_m3=density, element="tet10-p0", made=case.made, mesh_from="cad")
 
 
+def times(step_s: float) -> Array:
+    """Return the times of the robot's log [s]."""
+    return np.arange(0.0, END_S + LATE_S + step_s, step_s)
+
+
 def experiment(body: cs.Body, step_s: float, **seen) -> cs.Experiment:
     """Return the recording of a body with instruments `seen`, at the times of the robot's log."""
-    t_s = np.arange(0.0, END_S + LATE_S + step_s, step_s)
+    t_s = times(step_s)
     share = np.sin(np.pi * np.clip((t_s - REST_S) / SHAKEN_S, 0, 1)) ** 2
     angle = 6 * np.pi * (t_s - REST_S)
     turns = Rotation.from_rotvec(np.outer(share * np.sin(angle), [0.15, 0.1, 0.2])) * HANGING
@@ -139,9 +145,9 @@ def tracks(
     )
 
 
-def markers(case: Case, late_s: float, positions_m: Array | None = None) -> cs.Markers:
-    """Return markers on the front."""
-    t_s = late_s + np.arange(0.0, END_S, 1 / case.rate_hz)
+def markers(step_s: float, positions_m: Array | None = None) -> cs.Markers:
+    """Return markers on the front, at the times of the robot's log."""
+    t_s = times(step_s)
     positions_m = np.zeros((len(t_s), 10, 3)) if positions_m is None else positions_m
     return cs.Markers(t_s, positions_m, NOISE_M, places_m=PLACES_M["front"])
 
@@ -167,15 +173,19 @@ def simulated(name: str, keep: Path | None) -> list[Array]:
     body = bar(case, SIMULATED)
     cameras = [each for each in case.seen_by.split() if each in EYES_M]
     readings = [tracks(case, each, LATE_S, None, pose_of(each)) for each in cameras]
-    seen = {} if cameras or case.seen_by == "depth" else {"markers": markers(case, LATE_S)}
-    made = experiment(body, 1 / 240, readings=readings, **seen)
+    step_s = 1 / 240
+    t_s = times(step_s)
+    nothing = Depth("none", t_s, [np.zeros((1, 3))] * len(t_s), DEPTH_NOISE_M)
+    without = {"markers": {"markers": markers(step_s)}, "depth": {"depths": [nothing]}}
+    made = experiment(body, step_s, readings=readings, **without.get(case.seen_by, {}))
     run = cs.simulate(made, case.truth, "midpoint", substeps=1)
     if cameras:
         numbers = [each.reshape(len(each), -1, 2) for each in run.custom_sensor_values]
     elif case.seen_by == "markers":
-        numbers = [run.markers_m]
+        late = CubicSpline(t_s, run.markers_m, extrapolate=False)
+        numbers = [late(LATE_S + times(1 / case.log_hz))]
     else:
-        numbers = [*images(case, body, run.positions_m, made.t_s)]
+        numbers = [*images(case, body, run.positions_m, t_s)]
     if file:
         np.savez(file, *numbers)
     return numbers
@@ -192,7 +202,7 @@ def problem(name: str, keep: Path | None = None) -> cs.Problem:
         turned = wrong(np.eye(4), rng)[:3, :3]
         positions_m = (numbers[0] + NOISE_M * rng.normal(size=numbers[0].shape)) @ turned.T
         nuisance = cs.Nuisance(time_shift_s=LATE_S)
-        seen = {"markers": markers(case, 0.0, positions_m), "nuisance": nuisance}
+        seen = {"markers": markers(1 / case.log_hz, positions_m), "nuisance": nuisance}
     elif case.seen_by == "depth":
         noisy_m = numbers[0] + DEPTH_NOISE_M * rng.normal(size=numbers[0].shape)
         camera = DepthCamera(DEPTH_MATRIX, pose=wrong(pose_of("front"), rng))
@@ -205,7 +215,7 @@ def problem(name: str, keep: Path | None = None) -> cs.Problem:
         poses = [wrong(pose_of(each), rng) for each in names]
         pairs = zip(names, noisy, poses, strict=True)
         seen = {"readings": [tracks(case, each, 0.0, px, pose) for each, px, pose in pairs]}
-    return cs.Problem([experiment(body, 1 / case.log_hz, **seen)], unknown, substeps=1)
+    return cs.Problem([experiment(body, 1 / case.log_hz, **seen)], unknown)
 
 
 # Studies ------------------------------------------------------------------------------------------
