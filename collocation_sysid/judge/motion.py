@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,8 @@ WIDE_LAYER = 0.5
 BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
 # Factors by which films of phones are slower than the motion.
 SLOW_MOTIONS = (4.0, 8.0)
+# Change of a marker, in standard deviations of its noise, from which on it moves.
+BEYOND_NOISE = 10.0
 # Share of χ² that remains of which linear steps come before mirrored meshes.
 UNMEASURED = 0.9
 
@@ -90,19 +93,41 @@ def _clock(fit: TestedFit) -> Iterator[Doubt]:
 
 def _slow_motions(experiment: Experiment) -> Iterator[Doubt]:
     """Yield the rows of markers with the times of a film that is slower than the motion, where no
-    moving grasp contradicts these times.
+    moving grasp and no table of forces contradicts these times. The times at which grasps, masses and
+    forces begin and end were read from the film if the markers begin to move then.
     """
     moves = any(np.ptp(each.poses.positions_m, axis=0).any() for each in experiment.grasps)
+    moves |= any(each.t_s is not None for each in experiment.forces)
     if experiment.is_static or moves or not experiment.markers.sample_count:
         return
     for factor in SLOW_MOTIONS:
 
         def correct(experiment: Experiment, _: Array, factor: float = factor) -> Correction:
-            t_s, markers = experiment.t_s, experiment.markers
-            real_s = t_s[0] + (t_s - t_s[0]) / factor
-            own_s = t_s[0] + (markers.t_s - t_s[0]) / factor
+            first_s, markers = experiment.t_s[0], experiment.markers
+
+            def real(t_s: Any) -> Any:
+                return first_s + (t_s - first_s) / factor
+
+            tracks_m, far_m = markers.positions_m, BEYOND_NOISE * markers.sigma_m[:, None]
+            moves = (np.nan_to_num(np.abs(tracks_m - tracks_m[0])) > far_m).any(axis=(1, 2))
+            onset_s = markers.t_s[np.argmax(moves)]
+
+            def in_real_time(each: Any) -> Any:
+                ends = {name: getattr(each, name) for name in ("from_s", "until_s")}
+                read_from_film = {
+                    name: real(v)
+                    for name, v in ends.items()
+                    if abs(v - onset_s) < abs(first_s + factor * (v - first_s) - onset_s)
+                }
+                return replace(each, **read_from_film)
+
+            windows = {
+                kind: [in_real_time(each) for each in getattr(experiment, kind)]
+                for kind in ("grasps", "masses", "forces")
+            }
+            seen = replace(markers, t_s=real(markers.t_s))
             try:
-                other = replace(experiment, t_s=real_s, markers=replace(markers, t_s=own_s))
+                other = replace(experiment, t_s=real(experiment.t_s), markers=seen, **windows)
             except InputError:
                 return None
             return other, {"factor": factor}

@@ -63,6 +63,11 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "times of the markers.* 8 times too long",
         "none explains it",
     ),
+    "slow motion, release seen in the film": (
+        lambda: wrong.ring_down(4.0, left_s=0.8),
+        "times of the markers.* 4 times too long",
+        "none explains it",
+    ),
     "rolling shutter": (lambda: wrong.rolling_shutter(0.0), "line[_ ]delay", "none explains it"),
     "mirrored mesh": (lambda: wrong.mirrored_mesh(True), "mirror image", "First compare laws"),
     "round rod meshed square": (
