@@ -2007,6 +2007,8 @@ def tilt(at) -> ca.SX:
 UPRIGHT = cs.PathCost(tilt, 0.02, points_m=((0.01, 0.01, 0.03), (0.01, 0.01, 0.0)))
 # Of a liquid on the tip: the square of its acceleration.
 CALM = cs.PathLimit(lambda at: ca.sumsqr(at.acceleration_m_s2), upper=1.2**2)
+DETOUR = {"point": "tip", "t_s": [0.25, 0.5], "relative": True,
+          "position_m": [(0.015, 0.02, np.nan), (0.03, 0.0, np.nan)]}  # fmt: skip
 CORRIDOR = cs.PathLimit(lambda at: at.position_m[1], upper=0.018, lower=0.0)
 
 
@@ -2072,10 +2074,8 @@ def test_a_tip_stays_upright():
 
 @pytest.mark.long
 def test_a_corridor_is_kept():
-    way = {"point": "tip", "t_s": [0.25, 0.5], "relative": True,
-           "position_m": [(0.015, 0.02, np.nan), (0.03, 0.0, np.nan)]}  # fmt: skip
     free, kept = (
-        plan_motion(hung_bar(), away(reference=[way], limits=each), LIMITS, solver="interior-point")
+        plan_motion(hung_bar(), away(reference=[DETOUR], limits=each), LIMITS)
         for each in ([], [CORRIDOR])
     )
     assert kept.is_complete
@@ -2100,12 +2100,37 @@ def test_an_acceleration_is_limited():
     assert not kept.exceeds_body_limits
 
 
-def test_limits_that_are_functions_are_planned_by_ipopt_alone():
-    with pytest.raises(InputError, match=r'reduced-space cannot .* solver = "interior-point"'):
-        plan_motion(hung_bar(), away(limits=[CALM]), LIMITS)
+def test_ipopt_refuses_a_limit_of_the_stretch_beside_a_function():
     stretched = away(limits=[CALM], avoid={"largest_stretch": 2.0})
-    with pytest.raises(InputError, match=r"avoid.*expected a task without limits of its own"):
+    with pytest.raises(InputError, match=r"avoid.*expected reduced-space"):
         plan_motion(hung_bar(), stretched, LIMITS, solver="interior-point")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "terms",
+    [
+        {"limits": [CALM]},
+        {"limits": [CORRIDOR], "reference": [DETOUR]},
+        {"limits": [CALM, CORRIDOR], "costs": [UPRIGHT]},
+    ],
+)
+def test_both_solvers_find_the_same_motion_within_limits_that_are_functions(terms):
+    planned = bound(**terms)
+    reduced = solve_reduced(planned, tolerances=replace(TIGHT, path=1e-6))
+    assert reduced.status == "converged"
+    assert not planned.exceeds_path_limits(reduced.x)
+    full = solve_full(planned, solve_reduced(planned))
+    assert full.status == "converged"
+    assert planned.objective(full.c, full.x) == pytest.approx(reduced.history[-1], rel=1e-5)
+    assert np.abs(full.x - reduced.x).max() < 1e-5 * np.ptp(reduced.x)
+
+
+@pytest.mark.long
+def test_a_stretch_is_limited_beside_a_function():
+    plan = plan_motion(hung_bar(), away(limits=[CALM], avoid={"largest_stretch": 1.05}), LIMITS)
+    assert plan.is_complete
+    assert not plan.exceeds_body_limits
 
 
 @pytest.mark.long

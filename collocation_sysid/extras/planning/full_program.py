@@ -337,11 +337,10 @@ def require_full_program(program: PlannedProgram) -> None:
         "where the largest or nearest one changes": program.body_limits is not None,
         "the task has [information], which has no second derivatives": program.criterion is not None,
     }  # fmt: skip
-    remedy = "a task without limits of its own" if program.task.limits else "reduced-space"
     for reason, applies in reasons.items():
         if applies:
             raise InputError(
-                f"interior-point cannot plan this: {reason}; expected {remedy}",
+                f"interior-point cannot plan this: {reason}; expected reduced-space",
                 None,
                 where="--solver",
             )

@@ -446,7 +446,7 @@ def plan_motion(
         frame of the poses, such as limits of joints; by default those of the task.
     solver : {"reduced-space", "interior-point"}
         Gauss–Newton steps in the space of the hand's unknowns, or IPOPT after these, with the
-        positions of all nodes as variables. Only IPOPT keeps a `PathLimit`.
+        positions of all nodes as variables.
     robust : bool
         Whether the objective is its mean over the noise of the constants; a run is needed.
     tolerances : ReducedTolerances, optional
@@ -486,13 +486,6 @@ def plan_motion(
             "a robust plan needs a run with uncertainties, and the solver reduced-space",
             None,
             where="--robust",
-        )
-    if task.limits and solver != "interior-point":
-        raise InputError(
-            "reduced-space cannot keep limits that are functions of the motion; expected "
-            'solver = "interior-point"',
-            None,
-            where="limits",
         )
     began_s = time.perf_counter()
 

@@ -222,6 +222,15 @@ class PathValues:
         curvature = self.function.weighted_hessian(self._inputs_at(x), self.t_s, weights)
         return sp.csr_array(self.matrix.T @ _at_each_sample(curvature) @ self.matrix)
 
+    def convex_rows(self, x: Array, weights: Array) -> sp.csr_array:
+        """Return a matrix Q (rows, N · 3n): Qᵀ Q is the part with positive eigenvalues, of each
+        sample, of `weighted_hessian`.
+        """
+        curvature = self.function.weighted_hessian(self._inputs_at(x), self.t_s, weights)
+        values, vectors = np.linalg.eigh(np.moveaxis(curvature, -1, 0))
+        roots = np.sqrt(np.maximum(values, 0.0))[..., None] * np.swapaxes(vectors, -1, -2)
+        return sp.csr_array(_at_each_sample(np.moveaxis(roots, 0, -1)) @ self.matrix)
+
     @property
     def value_count(self) -> int:
         """Number m · T of the values."""
@@ -238,6 +247,49 @@ class PathValues:
             for each in (self.function.jacobian_pattern, self.function.hessian_pattern)
         )
         return sp.csr_array(by_inputs @ sizes), sp.csr_array(sizes.T @ twice @ sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentedCosts:
+    """Residuals of costs, and of limits g ≤ 0 in an augmented Lagrangian, √w max(0, g + λ / w).
+
+    `evaluate` and `linearise` are those of `PathValues`. The convex part of the limits' curvature
+    enters as rows whose values are zero.
+    """
+
+    costs: PathValues | None
+    limits: PathValues
+    multipliers: Array  # (m, T): λ
+    weight: float  # w
+
+    def evaluate(self, x: Array) -> Array:
+        """Return the residuals (k,)."""
+        return self._stacked(x, self._violations(self.limits.evaluate(x)))
+
+    def linearise(self, x: Array) -> tuple[Array, sp.csr_array]:
+        """Return the residuals (k,), and their derivatives (k, N · 3n) by the motion."""
+        values, by_x = self.limits.linearise(x)
+        violations = self._violations(values)
+        active = sp.diags_array(np.sqrt(self.weight) * (violations.ravel() > 0))
+        convex = self.limits.convex_rows(x, self.weight * violations)
+        parts = [active @ by_x, convex]
+        if self.costs is not None:
+            parts.insert(0, self.costs.linearise(x)[1])
+        return (
+            np.concatenate([self._stacked(x, violations), np.zeros(convex.shape[0])]),
+            sp.csr_array(sp.vstack(parts)),
+        )
+
+    def updated(self, x: Array) -> Array:
+        """Return the multipliers (m, T) after a search that ended with the motion x (N, 3n)."""
+        return self.weight * self._violations(self.limits.evaluate(x))
+
+    def _violations(self, values: Array) -> Array:
+        return np.maximum(0.0, values + self.multipliers / self.weight)
+
+    def _stacked(self, x: Array, violations: Array) -> Array:
+        costs = np.zeros(0) if self.costs is None else self.costs.evaluate(x).ravel()
+        return np.concatenate([costs, np.sqrt(self.weight) * violations.ravel()])
 
 
 def keyed_entries(matrix: Any) -> tuple[Index, Array]:

@@ -20,6 +20,7 @@ information in the task, its criterion takes the place of the first two terms, s
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, cast
@@ -39,7 +40,7 @@ from ...recording import Experiment, PoseSequence
 from .body_limits import BodyLimits
 from .hand_limits import WITHIN, HandBounds, Limits
 from .information import InformationCriterion
-from .path_terms import PathCost, PathLimit, PathValues
+from .path_terms import AugmentedCosts, PathCost, PathLimit, PathValues
 from .planned_body import PlannedBody
 from .signals import Signal, task_signals
 from .spline_motion import HAND, LIMIT_POINTS, HandFrame, HandLimits, PoseLimit, SplineSpace
@@ -434,6 +435,12 @@ class PlannedProgram:
     def path_costs(self) -> PathValues | None:
         """Residuals of the costs that the task states as functions; None if there are none."""
         return self._path_values(self.task.costs)
+
+    def with_path_costs(self, costs: AugmentedCosts) -> PlannedProgram:
+        """Return the program with other residuals in place of `path_costs`."""
+        other = copy(self)
+        vars(other)["path_costs"] = costs
+        return other
 
     @cached_property
     def path_limits(self) -> PathValues | None:

@@ -10,6 +10,7 @@ near; iterates respect them once they do so. A step counts only if the simulated
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from ...common.array_types import Array
 from ...errors import SimulationError
 from .body_limits import NEAR
 from .hand_limits import WITHIN
+from .path_terms import AugmentedCosts
 from .planned_program import LinearisedLimits, PlannedProgram
 
 # Tolerance of the conic program of a step, relative.
@@ -35,6 +37,9 @@ RANDOM_MOTIONS = 8
 # Largest share of a limit that an iterate may use: limits are tightened by `WITHIN`, so that it
 # respects the limits themselves.
 LARGEST_SHARE = 1 + 0.5 * (1 / WITHIN - 1)
+# Augmented Lagrangian of limits that are functions of the motion: first weight over the objective,
+# its growth if an iteration leaves more than this share of the excess, and most iterations.
+FIRST_WEIGHT, WEIGHT_GROWTH, SLOW_EXCESS, MOST_MULTIPLIERS = 0.01, 10.0, 0.25, 30
 # Called with the iteration and the objective.
 Watch = Callable[[int, float], None]
 
@@ -54,6 +59,7 @@ class ReducedTolerances:
     progress: float = 1e-2
     iterations: int = 60  # largest number of iterations
     failures: int = 12  # largest number of steps in a row that are not better
+    path: float = 1e-3  # largest excess of a limit of the path, relative to its scale
 
 
 # A search for information ends when three iterations make the intervals narrower by less than 5 %.
@@ -240,6 +246,64 @@ def solve_reduced(
     limits = tolerances or usual
     c = smoothest_motion(program) if start is None else start
     programs = scenarios or (program,)
+    if program.path_limits is None:
+        return _search(program, c, programs, limits, watch)
+    return _within_path_limits(program, c, programs, limits, watch)
+
+
+def _within_path_limits(
+    program: PlannedProgram,
+    c: Array,
+    programs: Sequence[PlannedProgram],
+    limits: ReducedTolerances,
+    watch: Watch | None,
+) -> PlanAnswer:
+    """Return the plan within limits that are functions of the motion, by an augmented Lagrangian."""
+    path = program.path_limits
+    assert path is not None
+    motions = [each.simulate(c) for each in programs]
+    multipliers = [np.zeros_like(path.evaluate(x)) for x in motions]
+    # The first search shall leave the start: limits of squares have no slope at rest.
+    weight = FIRST_WEIGHT * _mean_objective(programs, c, motions) or 1.0
+    history: list[float] = []
+    excess, before = np.inf, np.inf
+    numbers = itertools.count()
+
+    def count(_: int, value: float) -> None:
+        if watch is not None:
+            watch(next(numbers), value)
+
+    while True:
+        terms = [
+            AugmentedCosts(p.path_costs, path, m, weight)
+            for p, m in zip(programs, multipliers, strict=True)
+        ]
+        augmented = [p.with_path_costs(t) for p, t in zip(programs, terms, strict=True)]
+        answer = _search(program, c, augmented, limits, count)
+        motions = [each.simulate(answer.c) for each in programs]
+        history.append(_mean_objective(programs, answer.c, motions))
+        answer.history = history
+        updated = [each.updated(x) for each, x in zip(terms, motions, strict=True)]
+        changes = np.abs(np.array(updated) - np.array(multipliers))
+        before, excess = excess, float(changes.max()) / weight
+        if excess <= limits.path or answer.status == "interrupted":
+            return answer
+        if len(history) == MOST_MULTIPLIERS:
+            answer.status = "iteration limit"
+            return answer
+        c, multipliers = answer.c, updated
+        if excess > SLOW_EXCESS * before:
+            weight *= WEIGHT_GROWTH
+
+
+def _search(
+    program: PlannedProgram,
+    c: Array,
+    programs: Sequence[PlannedProgram],
+    limits: ReducedTolerances,
+    watch: Watch | None,
+) -> PlanAnswer:
+    """Return the plan without limits that are functions of the motion."""
     drive = program.drive(c)
     motions = [each.simulate(c, drive=drive) for each in programs]
     value = _mean_objective(programs, c, motions)
