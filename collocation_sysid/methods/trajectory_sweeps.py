@@ -30,8 +30,8 @@ from ..program.transcription import Transcription
 # Rows are marched to this accuracy of a Newton step over the body's size: Newton's next one is
 # part of the first sweep.
 MARCHED = NewtonOptions(tolerance=1e-6)
-# Options for trials, whose losses are compared with others: with impacts they repeat to 1e-8, and
-# with the tolerance of a start to 4e-3.
+# Options for trials with impacts, whose losses are compared with others: they repeat to 1e-8, and with
+# the tolerance of a start to 4e-3.
 COMPARED = NewtonOptions(tolerance=1e-8)
 # Of equilibria near known ones. Those that are not found at once are too far for it.
 # Their stability is decided by the sweep along them, which factorises the same matrices.
@@ -300,7 +300,7 @@ def simulate_rows(
         transcription.experiment,
         part.equations.dynamics.truncated_to(solver.dynamics.row_count),
         known=part.x if len(part.x) else None,
-        options=MARCHED if guess is None else COMPARED,
+        options=COMPARED if guess is not None and transcription.experiment.obstacles else MARCHED,
         stopwatch=solver.stopwatch,
         approximate_solution=None if guess is None else guess.x,
     )

@@ -128,6 +128,18 @@ def test_either_instrument_alone_is_sufficient(instrument, problem):
     assert solution.parameters["gamma_r_s"] == pytest.approx(2e-3, rel=0.05)
 
 
+@pytest.mark.long
+def test_a_guess_that_is_wrong_by_a_factor_takes_few_sweeps(problem):
+    changed(problem, "sections = 41", "sections = 31")
+    changed(problem, "bending_n_m2 = {} ", "bending_n_m2 = { guess = 2e-3 } ")
+    changed(problem, "gamma_r_s    = {}", "gamma_r_s = { guess = 1e-3 }")
+    changed(problem, "gamma_m_1_s  = {}", "gamma_m_1_s = { guess = 0.1 }")
+    solution = cs.solve(cs.Problem.read(problem))
+    assert solution.status.converged
+    assert solution.history[-1].number <= 16
+    assert solution.parameters["bending_n_m2"] == pytest.approx(1e-3, rel=0.02)
+
+
 def test_a_place_that_is_estimated_moves_along_the_centreline(problem):
     changed(problem, "s_m = { middle = 0.3, tip = 0.6 }", "s_m = { tip = 0.6 }")
     collocation = cs.Problem.read(problem).collocation()

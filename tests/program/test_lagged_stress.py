@@ -118,7 +118,8 @@ def test_the_stresses_change_the_way_to_a_solution_and_not_the_solution(monkeypa
 
 def whip(step_s: float = 0.01) -> Experiment:
     """A cable of 0.6 m that hardly stretches, moved to and fro by a hand."""
-    body = cable(straight(0.6, CrossSection.round(0.006), 16, (0, 0, -1)))
+    mesh = straight(0.6, CrossSection.round(0.006), 16, (0, 0, -1))
+    body = cable(mesh)
     t_s = np.arange(0, 0.4 + step_s / 2, step_s)
     sway_m = np.outer(0.08 * (1 - np.cos(12 * t_s)), [1.0, 0.5, 0.3])
     poses = PoseSequence(t_s, sway_m, np.tile([0.0, 0.0, 0.0, 1.0], (len(t_s), 1)))
@@ -126,7 +127,7 @@ def whip(step_s: float = 0.01) -> Experiment:
         body,
         t_s,
         [Grasp(ends(body)[0], poses)],
-        Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[body.mesh.place_m(0.6)]),
+        Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[mesh.place_m(0.6)]),
         nuisance=Nuisance.none(),
         air_density_kg_m3="none",
     )
@@ -156,13 +157,14 @@ def test_steps_of_a_cable_that_hardly_stretches_take_few_factorisations(monkeypa
 
 def test_a_free_cable_that_hardly_stretches_tumbles():
     """About two axes, by 0.06 rad a step, with the steps of a solve."""
-    body = cable(straight(1.0, CrossSection.round(0.004), 11))
+    mesh = straight(1.0, CrossSection.round(0.004), 11)
+    body = cable(mesh)
     t_s = np.arange(0, 1.005, 0.01)
     thrown = Experiment(
         body,
         t_s,
         [],
-        Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[body.mesh.place_m(0.0)]),
+        Markers(t_s, np.zeros((len(t_s), 1, 3)), 1e-3, places_m=[mesh.place_m(0.0)]),
         gravity_m_s2=(0.0, 0.0, 0.0),
         start="undeformed",
         start_spin_rad_s=(3.0, 5.0, 10.0),

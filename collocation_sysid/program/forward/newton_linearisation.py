@@ -84,13 +84,18 @@ class LaggedStress:
         """Return the linearisation at x (3n,) [m] with the mean stresses `stress_pa` (E,) in place
         of those of x in its derivative; for a rod with its resultants.
         """
+        stiffness = self.weight * self.stiffness(x, stress_pa - self.at(x))
+        return at._replace(symmetric=at.symmetric + stiffness)
+
+    def stiffness(self, x: Array, stress_pa: Array) -> Array:
+        """Return the lower triangle (m,) [N/m] of the part of the stiffness by ξ that mean stresses
+        (E,) [Pa], or resultants (1, any) [J] of a rod, have at x (3n,) [m].
+        """
         (xi,), _ = self.states(x)
-        change = stress_pa - self.at(x)
         body = self.forces.body
-        stiffness = (
-            body.resultant_stiffness(xi[None], change, self.forces.theta)[0]
+        own = (
+            body.resultant_stiffness(xi[None], stress_pa, self.forces.theta)
             if body.is_slender
-            else body.volume_stiffness(xi, change)
+            else body.volume_stiffness(xi, stress_pa)[None]
         )
-        spread = self.forces.joint_pattern.expand(self.weight * stiffness[None])[0]
-        return at._replace(symmetric=at.symmetric + spread)
+        return np.asarray(self.forces.joint_pattern.expand(own)[0])

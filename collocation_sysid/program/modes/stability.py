@@ -20,6 +20,7 @@ from ...common.array_types import Array, Index
 from ...fem.pattern import SymmetricPattern
 from ...model.forces import Forces
 from ..collocation import Collocation, ExperimentIterate
+from ..forward.newton_linearisation import LaggedStress
 from ..linear_algebra.factorisation import Factoriser
 
 # Number of states of a motion that are examined.
@@ -138,12 +139,15 @@ def growth_rate_1_s(forces: Forces, x: Array, free_dofs: Index, v: Array | None 
 
 
 def _viscous_volume_stiffness(forces: Forces, x: Array, v: Array) -> Array:
-    """Return the lower triangle [N/m] that viscous mean stresses of the elements add to K."""
-    state = x.reshape(1, -1)
-    moving = forces.mean_stresses(state, v.reshape(1, -1))
-    still = forces.mean_stresses(state, np.zeros_like(state))
-    change = forces.body.volume_stiffness(x, moving - still)
-    return np.asarray(forces.joint_pattern.expand(change[None])[0])
+    """Return the lower triangle [N/m] that viscous mean stresses of the elements, or the resultants
+    of a rod, add to K.
+    """
+
+    def stresses(rate: Array) -> LaggedStress:
+        return LaggedStress(forces, lambda state: (state[None], rate.reshape(1, -1)))
+
+    moving, still = stresses(v), stresses(np.zeros_like(v))
+    return moving.stiffness(x, moving.at(x) - still.at(x))
 
 
 def _is_definite(lower: Array, pattern: SymmetricPattern, free_dofs: Index, mass: Array) -> bool:
