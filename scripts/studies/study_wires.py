@@ -3,8 +3,10 @@
 The folder has the points of five photographs for each wire, black_0.csv to white_4.csv, with the
 columns point, x_m and z_m. Each photograph is an equilibrium between two clamps whose directions
 are unknown; the points are drawn along the wire, so that their places on it are unknown, too. The
-natural curvature is constant in each of ten parts of the wire, with a prior. GJ/EI is that with
-which the loop leaves its plane at the measured twist of one clamp.
+scale of a photograph is that with which the smooth curve through its points is as long as the wire.
+The natural curvature is constant in each of twenty parts of the wire, with a prior; it belongs to one
+photograph, or to all of a wire. GJ/EI is that with which the loop leaves its plane at the measured
+twist of one clamp.
 
     python scripts study_wires FOLDER
 """
@@ -29,19 +31,21 @@ from collocation_sysid.result.figure_style import RESOLUTION_DPI
 
 Array = NDArray[np.float64]
 PHOTOGRAPHS = 5
-SECTIONS = 61
+LENGTH_M = 1.5
+SECTIONS = 121
 # Axial stiffness [N] of both wires: their weight of at most 0.4 N stretches them by less than 0.8 %,
 # and half of it gives the same critical twist.
 AXIAL_N = 50.0
 # Diameter of the section [m], which only places its nodes: stiffnesses and mass are stated.
 DIAMETER_M = 3e-3
 # Standard deviations: of drawn points across the wire and along it [m], of the direction of a clamp
-# [rad], and of the natural curvature of each part of the wire [1/m].
+# [rad], of the scale of a photograph, and of the natural curvature of each part of the wire [1/m].
 SIGMA_M = 1.5e-3
 ALONG_M = 1e-2
 CLAMP_RAD = 0.5
+SCALE = 3e-3
 CURVATURE_1_M = 2.0
-PARTS = 10
+PARTS = 20
 # Ratios GJ/EI between which is interpolated, and twists [°].
 RATIOS = (0.5, 0.7, 1.0, 1.4, 2.0)
 TWIST_STEP_DEG = 10.0
@@ -67,9 +71,13 @@ WIRES = (
 
 
 def read_loop(file: Path) -> Array:
-    """Return the points (k, 3) [m] of a photograph, in the plane y = 0."""
+    """Return the points (k, 3) [m] of a photograph, in the plane y = 0, with the scale that makes the
+    smooth curve through them as long as the wire.
+    """
     table = np.loadtxt(file, delimiter=",", skiprows=1)
-    return np.column_stack([table[:, 1], np.zeros(len(table)), table[:, 2]])
+    points_m = np.column_stack([table[:, 1], np.zeros(len(table)), table[:, 2]])
+    curve = cs.rod_mesh(points_m, cs.CrossSection.round(DIAMETER_M))
+    return points_m * LENGTH_M / curve.s_m[-1]
 
 
 def hanging_wire(points_m: Array, mass_per_length_kg_m: float, parts: Sequence[str] = ()) -> Body:
@@ -119,7 +127,9 @@ def photograph(body: Body, points_m: Array, name: str) -> cs.Experiment:
         places_m=np.array([mesh.place_m(s) for s in along_m[inner]]),
         places_sigma_m=ALONG_M,
     )
-    nuisance = cs.Nuisance.none(clamp_turn_rad=CLAMP_RAD, gravity_rad=np.radians(1.0))
+    nuisance = cs.Nuisance.none(
+        clamp_turn_rad=CLAMP_RAD, gravity_rad=np.radians(1.0), calibration_scale=SCALE
+    )
     return cs.Experiment(
         body,
         [0.0],
@@ -194,7 +204,9 @@ def values_of(bending_n_m2: float, ratio: float) -> dict[str, float]:
 def critical_twist_deg(
     loop_m: Array, mass_per_length_kg_m: float, bending_n_m2: float, ratio: float
 ) -> float:
-    """Return the twist [°] at which a loop loses its stability, to `TWIST_STEP_DEG`."""
+    """Return the twist [°] at which a loop loses its stability, to `TWIST_STEP_DEG`; NaN if it is not
+    found.
+    """
     twists = np.arange(0.0, LARGEST_TWIST_DEG, TWIST_STEP_DEG)
     try:
         cs.simulate(
@@ -202,7 +214,7 @@ def critical_twist_deg(
         )
     except cs.SimulationError as error:
         if error.stability_loss is None:
-            raise
+            return np.nan
         return error.time_s - TWIST_STEP_DEG / 2
     return np.inf
 
@@ -231,6 +243,29 @@ def fitted(problem: cs.Problem) -> tuple[cs.Run, str]:
     )
 
 
+def mean_of_shapes(runs: Sequence[cs.Run]) -> Array:
+    """Return the mean of EI [N m²] and its 95 % interval (3,), from fits of single shapes; χ² of the
+    values and the correlation of the natural curvatures are printed.
+
+    The error of a value is that of the natural curvature, mainly. Between two shapes it is as
+    correlated as the estimated curvatures are.
+    """
+    values = np.log(np.array([each.parameters["bending_n_m2"] for each in runs]))
+    bounds = np.log(np.array([each.interval("bending_n_m2") for each in runs]))
+    errors = (bounds[:, 1] - bounds[:, 0]) / 3.92
+    weights = errors**-2 / np.sum(errors**-2)
+    mean = weights @ values
+    names = [name for name in runs[0].parameters if name.endswith(".curvature_1_1_m")]
+    curvatures = np.array([[each.parameters[name] for name in names] for each in runs])
+    correlations = np.atleast_2d(np.corrcoef(curvatures))
+    shared = np.mean(correlations[np.triu_indices(len(runs), 1)])
+    print(f"chi2 {np.sum(((values - mean) / errors) ** 2):.2f} of {len(runs)} values")
+    print(f"correlation of natural curvatures {shared:.2f}:\n{correlations.round(2)}", flush=True)
+    covariance = np.outer(errors, errors) * (shared + (1 - shared) * np.eye(len(runs)))
+    half = 1.96 * np.sqrt(weights @ covariance @ weights)
+    return np.exp(mean + half * np.array([0.0, -1.0, 1.0]))
+
+
 def draw(loops: dict[str, tuple[Array, Array, Array]]) -> None:
     """Draw for each wire the drawn points, the fitted shape, and the shape without natural curvature."""
     figure, axes = plt.subplots(
@@ -238,7 +273,7 @@ def draw(loops: dict[str, tuple[Array, Array, Array]]) -> None:
     )
     for axis, (name, (points, fit, straight)) in zip(axes, loops.items(), strict=True):
         axis.plot(1e3 * straight[:, 0], 1e3 * straight[:, 2], "--", label="no natural curvature")
-        axis.plot(1e3 * fit[:, 0], 1e3 * fit[:, 2], label="natural curvature of ten parts")
+        axis.plot(1e3 * fit[:, 0], 1e3 * fit[:, 2], label="natural curvature of twenty parts")
         axis.plot(
             1e3 * points[:, 0], 1e3 * points[:, 2], "k.", ms=4, label="points of the photograph"
         )
@@ -286,25 +321,23 @@ def main() -> None:
                 "| shape | EI mN m² and RMS mm, without natural curvature | EI | 95 % | RMS mm | verdict |"
             )
             print("|---|---|---|---|---|---|")
-            found = []
+            runs = []
             for k, loop in enumerate(loops):
                 plain = cs.solve(loops_problem([loop], density, guess, parts=0))
                 run, cells = fitted(loops_problem([loop], density, guess))
                 value = 1e3 * plain.parameters["bending_n_m2"]
                 print(f"| {k} | {value:.3f}, {1e3 * plain.rms_m:.1f} | {cells} |", flush=True)
-                # Of shapes whose natural curvatures have nothing in common.
-                if run.trust.verdict != "doubtful":
-                    low, high = run.interval("bending_n_m2")
-                    estimate = run.estimates["bending_n_m2"].value
-                    found.append((np.log(estimate), np.log(high / low) / 3.92))
+                runs.append(run)
                 if k == 0:
                     shapes[wire.name] = (loop, shape_m(run.solution), shape_m(plain))
-            known = np.array([item for item in found if np.isfinite(item[1])])
-            weights = 1 / known[:, 1] ** 2
-            middle = np.average(known[:, 0], weights=weights)
-            half = 1.96 / np.sqrt(weights.sum())
-            bending = [float(np.exp(middle + k * half)) for k in (0, -1, 1)]
-            print("| all of them | |", " to ".join(f"{1e3 * value:.3f}" for value in bending), "|")
+            bending = mean_of_shapes(runs).tolist()
+            print("| mean | |", " to ".join(f"{1e3 * value:.3f}" for value in bending), "|")
+            joint = loops_problem(loops, density, guess)
+            found = cs.solve(joint)
+            cells = f"{found.status.value}, {1e3 * found.rms_m:.2f} mm"
+            if found.status.converged:
+                _, cells = fitted(joint)
+            print(f"| all with the same natural curvature | | {cells} |", flush=True)
         for value in bending:
             measured = np.array([np.mean(wire.twist_deg), min(wire.twist_deg), max(wire.twist_deg)])
             ratios = ratio_at(loops[0], density, value, measured)
