@@ -207,6 +207,45 @@ def test_a_delay_does_not_extrapolate_between_fine_time_steps() -> None:
     assert np.nanmax(np.abs(predicted - expected)[within]) < 0.1
 
 
+def test_a_rolling_shutter_does_not_extrapolate_between_fine_time_steps() -> None:
+    line_s, still_px = 2e-4, projected(filming("front"), motion_m())
+    in_time, pixels = CubicSpline(T_S, still_px), still_px
+    for _ in range(8):
+        exposed_s = T_S[:, None] + line_s * pixels[..., 1]
+        shown = in_time(exposed_s)
+        pixels = np.stack([shown[:, k, k] for k in range(len(NAMES))], axis=1)
+    tracks = replace(tracks_of(**EXACT), line_delay_s=line_s, pixels=pixels)
+    program = cs.Problem([swung([tracks])], parameters=unknown_young(), substeps=8).collocation()
+    fine_s = np.linspace(T_S[0], T_S[-1], 8 * (len(T_S) - 1) + 1)
+    nodes_m = CubicSpline(T_S, simulated_m())(fine_s)
+    nodes_m += 1e-5 * np.random.default_rng(4).normal(size=nodes_m.shape)
+    program, p = program.follow_estimates(program.guess_p, [nodes_m])
+    part = program.transcriptions[0]
+    (residual,) = part.residuals_of(ImageTrackResidual)
+    phi = p[part.nuisance_indices.indices]
+    values = residual.observable.evaluate_positions(nodes_m, phi)
+    predicted = residual.numbers(residual.predict(values, phi)).reshape(-1, len(NAMES), 2)
+    within = exposed_s <= T_S[-1]
+    assert np.isnan(predicted[~within]).all()
+    assert np.nanmax(np.abs(predicted - pixels)[within]) < 0.1
+
+
+def test_a_rolling_shutter_changes_nothing_where_nothing_moves() -> None:
+    held = cs.Grasp(np.flatnonzero(bar().nodes_m[:, 0] < 1e-9), cs.PoseSequence.fixed())
+    pixels = projected(filming("front"), motion_m())[:1]
+    tracks = replace(tracks_of(**EXACT), t_s=T_S[:1], pixels=pixels)
+    found = []
+    for line_s in (0.0, 2e-5):
+        readings = [replace(tracks, line_delay_s=line_s)]
+        still = cs.Experiment(bar(), [0.0], [held], kind="static", readings=readings)
+        part = cs.Problem([still], parameters=unknown_young()).collocation().transcriptions[0]
+        (residual,) = part.residuals_of(ImageTrackResidual)
+        values = residual.observable.evaluate_positions(simulated_m()[:1], part.guess_phi)
+        found.append(residual.residuals(values, part.guess_phi)[residual.is_compared])
+    assert len(found[0])
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_clock_of_markers_needs_no_markers() -> None:
     experiment = swung([tracks_of()], nuisance=cs.Nuisance())
     program = cs.Problem([experiment], parameters=unknown_young()).collocation()

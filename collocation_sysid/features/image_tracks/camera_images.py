@@ -7,12 +7,15 @@ does so, and otherwise considered in the budget and tested, see the rows `IMAGE_
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...common.checked_arrays import read_only_floats, unconverted
@@ -22,7 +25,7 @@ from ...errors import InputError
 from ...program.association import SAMPLES_OFF
 from ...program.correspondences import Correspondences
 from ...program.custom_sensor_residual import CorrespondingSensorResidual
-from ...program.measurement_residual import GROUP, lagrange_weights
+from ...program.measurement_residual import GROUP, RowStencil, lagrange_weights, neighbouring_times
 from ...recording.camera import Camera
 from ...recording.custom_sensor import CustomSensor
 from ...recording.deviation import Deviation
@@ -38,7 +41,7 @@ from ...recording.nuisance import (
     IMAGE_TURN,
     cayley_rotation,
 )
-from ...recording.sample_times import first_unordered_time
+from ...recording.sample_times import TIME_TOLERANCE_S, first_unordered_time
 
 # Row and axis of each error of a camera, by the name of its unknown.
 CAMERA_UNKNOWNS: dict[str, tuple[Deviation, str]] = {
@@ -176,13 +179,22 @@ class CameraImages(CustomSensor):
         row, axis = CAMERA_UNKNOWNS[name]
         return f"{row.label.format(which=self.camera_name, axis=axis)} [{row.unit}]"
 
-    def exposed_s(self, errors: Mapping[str, float]) -> Array:
-        """Return when the middle row of each image was exposed [s], with errors of the camera."""
-        row = self.camera.require_matrix()[1, 2]
-        line_s = self.line_delay_s + errors.get("line_delay_error_s", 0.0)
+    def line_delay_in(self, experiment: Experiment) -> float:
+        """Return the time from row to row [s]; zero in a static experiment, in which nothing moves."""
+        return 0.0 if experiment.is_static else self.line_delay_s
+
+    def exposed_s(
+        self, experiment: Experiment, errors: Mapping[str, float], rows: Array | None = None
+    ) -> Array:
+        """Return when the middle row of each image (S,), or rows (S, P), were exposed [s], with errors
+        of the camera.
+        """
+        line_s = self.line_delay_in(experiment) + errors.get("line_delay_error_s", 0.0)
         t_s = self.sample_times_s
         late_s = errors.get("delay_s", 0.0) + errors.get("clock_rate", 0.0) * (t_s - t_s[0])
-        return t_s + late_s + line_s * row
+        if rows is None:
+            return t_s + late_s + line_s * self.camera.require_matrix()[1, 2]
+        return (t_s + late_s)[:, None] + line_s * rows
 
     def camera_rows(
         self, experiment: Experiment, reach: float
@@ -214,9 +226,30 @@ class CameraImagesResidual(CorrespondingSensorResidual):
     experiment: Experiment
     correspondences: ImageCorrespondences
 
+    def exposed_s(self, errors: Mapping[str, float], rows: Array | None = None) -> Array:
+        return self.sensor.exposed_s(self.experiment, errors, rows)
+
     @property
     def at_s(self) -> Array:
-        return self.sensor.exposed_s(self.correspondences.clock)
+        return self.exposed_s(self.correspondences.clock)
+
+    @property
+    @abstractmethod
+    def rows(self) -> Array:
+        """Rows (S, P) of the images in which the points appear."""
+
+    @cached_property
+    def point_times(self) -> NDArray[np.int64]:
+        """Indices (S, P, k) of the grid times around the exposure of each point's row."""
+        at_s = self.exposed_s(self.correspondences.clock, self.rows)
+        used = self._times.shape[1]
+        times = neighbouring_times(self.observable_s, at_s.ravel() + TIME_TOLERANCE_S, count=used)
+        return times.reshape(*at_s.shape, used)
+
+    def stencil(self, phi: Array, known: int) -> RowStencil:
+        last = np.maximum.accumulate(self.point_times[..., -1].max(axis=1))
+        samples = int(np.count_nonzero(last < known))
+        return RowStencil(self._stencil.indices[:samples], self._stencil.data[:, :samples])
 
     def errors_at(self, phi: Array) -> dict[str, float]:
         """Return the errors of the camera that are estimated at φ (k,), by name."""
@@ -228,7 +261,7 @@ class CameraImagesResidual(CorrespondingSensorResidual):
         """Return correspondences with other errors of the camera if the images have left the grid
         times around them.
         """
-        off_s = np.abs(self.sensor.exposed_s(errors) - self.sensor.exposed_s(found.clock)).max()
+        off_s = np.abs(self.exposed_s(errors) - self.exposed_s(found.clock)).max()
         is_near = off_s <= SAMPLES_OFF * np.diff(self.observable_s).max(initial=0.0)
         return found if is_near else replace(found, clock=errors)
 
@@ -242,22 +275,24 @@ class CameraImagesResidual(CorrespondingSensorResidual):
         return np.repeat(sigmas * away_m / focal_px, GROUP)
 
     def camera_data(self, rotations: Array, translations: Array) -> Array:
-        """Return the data (S, k + 14) of the images for `projected`: distances of the k
+        """Return the data (S, P, k + 14) of the points for `projected`: distances of the k
         neighbouring times from the image [s], the time since the first image over that of the last
         one, and the duration [s], the rotation (S, 3, 3) of the camera by rows, its translation [m].
         """
         first_s, last_s = self.sensor.sample_times_s[[0, -1]]
         since_s = self.t_s - first_s
         duration_s = max(float(last_s - first_s), 1e-12)
-        return np.column_stack(
+        common = np.column_stack(
             [
-                self.observable_s[self._times] - self.t_s[:, None],
                 since_s / duration_s,
                 np.full(len(since_s), duration_s),
                 rotations.reshape(-1, 9),
                 translations,
             ]
         )
+        offsets_s = self.observable_s[self.point_times] - self.t_s[:, None, None]
+        of_points = np.broadcast_to(common[:, None], (*offsets_s.shape[:2], common.shape[1]))
+        return np.concatenate([offsets_s, of_points], axis=2)
 
     def known_errors(self, own: ca.SX) -> Callable[..., ca.SX]:
         """Return a function from names of unknowns of the camera to their values; `own` are those
@@ -288,7 +323,7 @@ class CameraImagesResidual(CorrespondingSensorResidual):
             Row of the image in which the point appears.
         """
         offsets, share, duration, rotation, translation = data
-        line_s = self.sensor.line_delay_s + known("line_delay_error_s")
+        line_s = self.sensor.line_delay_in(self.experiment) + known("line_delay_error_s")
         late = known("delay_s") + known("clock_rate") * share * duration + line_s * row
         weights = lagrange_weights(late, ca.vertsplit(offsets))
         # Stored by rows, so that this is the transpose: from the world to the camera.

@@ -48,15 +48,15 @@ class ImageTrackResidual(CameraImagesResidual):
     @cached_property
     def _stencil(self) -> RowStencil:
         """Data are those of `camera_data`, and the row of the point in the image."""
-        times = self._times
-        count = self.observable.vector_count
-        samples = len(times)
-        places = times[:, None] * count + np.arange(count)[:, None]
-        rows = np.nan_to_num(self.measured[..., 1])
+        places = self.point_times * self.observable.vector_count
+        places += np.arange(self.observable.vector_count)[:, None]
         found = self.correspondences
-        common = self.camera_data(found.rotations, found.translations)
-        data = np.broadcast_to(common.T[..., None], (common.shape[1], samples, count))
-        return RowStencil(places, np.concatenate([data, rows[None]]))
+        data = self.camera_data(found.rotations, found.translations)
+        return RowStencil(places, np.moveaxis(np.dstack([data, self.rows]), 2, 0))
+
+    @property
+    def rows(self) -> Array:
+        return np.nan_to_num(self.measured[..., 1])
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return the pixel (u, v) of one point, and zero."""
@@ -104,7 +104,7 @@ class ImageTrackResidual(CameraImagesResidual):
         lines with NaN after each, at rows x (rows, 3n) and φ (k,); hidden pieces are contained.
         """
         errors = self.errors_at(phi)
-        at_s = self.sensor.exposed_s(errors)[k]
+        at_s = self.exposed_s(errors)[k]
         times = self.observable_s[: len(x)]
         after = int(np.clip(np.searchsorted(times, at_s), 1, max(len(times) - 1, 1)))
         before, after = after - 1, min(after, len(times) - 1)
@@ -239,7 +239,8 @@ class ImageTracksModel(CorrespondenceModel):
         if tracks.pixels is not None:
             measured[..., :2] = tracks.pixels
         seen = tracks.is_seen & places.is_visible & places.is_placed
-        seen &= is_within(tracks.exposed_s(places.clock), grid.t_s)[:, None]
+        exposed_s = tracks.exposed_s(grid.experiment, places.clock, np.nan_to_num(measured[..., 1]))
+        seen &= is_within(exposed_s.ravel(), grid.t_s).reshape(seen.shape)
         return self.image_residual(
             ImageTrackResidual,
             observable=PointPositions(

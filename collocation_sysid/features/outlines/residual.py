@@ -202,12 +202,11 @@ class OutlinesResidual(CameraImagesResidual):
     @cached_property
     def _stencil(self) -> RowStencil:
         """Nodes at neighbouring times; data of the camera, shape functions, normal and edge."""
-        pairs, times = self.correspondences, self._times
+        pairs, times = self.correspondences, self.point_times
         samples, points = pairs.is_compared.shape
-        places = times[:, None, :, None] * self.observable.vector_count + pairs.nodes[:, :, None]
-        common = self.camera_data(pairs.rotations, pairs.translations)
+        places = times[..., None] * self.observable.vector_count + pairs.nodes[:, :, None]
         parts = [
-            np.broadcast_to(common[:, None], (samples, points, common.shape[1])),
+            self.camera_data(pairs.rotations, pairs.translations),
             pairs.weights,
             pairs.outwards,
             pairs.edges,
@@ -215,6 +214,10 @@ class OutlinesResidual(CameraImagesResidual):
         return RowStencil(
             places.reshape(samples, points, -1), np.moveaxis(np.concatenate(parts, axis=2), 2, 0)
         )
+
+    @property
+    def rows(self) -> Array:
+        return self.correspondences.edges[..., 1]
 
     def expression(self, values: ca.SX, phi: ca.SX, data: ca.SX) -> ca.SX:
         """Return how far the point is outside of the edge [pixels], and two zeros."""
@@ -254,7 +257,7 @@ class OutlinesResidual(CameraImagesResidual):
         """
         pairs, errors = self.correspondences, self.errors_at(phi)
         contours = []
-        for k, shape_m in enumerate(self._shapes(x, self.sensor.exposed_s(errors))):
+        for k, shape_m in enumerate(self._shapes(x, self.exposed_s(errors))):
             used, view = pairs.is_compared[k], pairs._view(k, errors)
             at_m = np.einsum("pa,pai->pi", pairs.weights[k, used], shape_m[pairs.nodes[k, used]])
             contours.append(view.camera.distorted_pixels(view.to_camera_m(at_m)))
@@ -262,7 +265,7 @@ class OutlinesResidual(CameraImagesResidual):
 
     def reassociated(self, x: Array, phi: Array) -> OutlinePairs:
         errors = self.errors_at(phi)
-        shapes_m = self._shapes(x, self.sensor.exposed_s(errors))
+        shapes_m = self._shapes(x, self.exposed_s(errors))
         return self.with_clock(self.correspondences.in_shapes(shapes_m, errors), errors)
 
     def aligned_correspondences(
@@ -272,7 +275,7 @@ class OutlinesResidual(CameraImagesResidual):
         if only_pose:
             return self.correspondences
         errors = self.errors_at(phi)
-        shapes_m = self._shapes(x, self.sensor.exposed_s(errors))
+        shapes_m = self._shapes(x, self.exposed_s(errors))
         if not len(shapes_m):
             shapes_m = x[-1:].reshape(1, -1, 3)
         return self.correspondences.in_shapes(shapes_m, errors)
@@ -280,15 +283,16 @@ class OutlinesResidual(CameraImagesResidual):
     def correspondences_of(self, measured: Outlines, x: Array, phi: Array) -> OutlinePairs:
         errors = self.errors_at(phi)
         own = replace(self.correspondences, outlines=measured)
-        return own.in_shapes(self._shapes(x, self.sensor.exposed_s(errors)), errors)
+        return own.in_shapes(self._shapes(x, self.exposed_s(errors)), errors)
 
 
 def compared(pairs: OutlinePairs, at_s: Array) -> NDArray[np.bool_]:
     """Return the mask (S, E, 3) of the distances from an edge, which are the first of three numbers,
     in images within the times `at_s`.
     """
-    within = is_within(pairs.outlines.exposed_s(pairs.clock), at_s)
-    is_used = pairs.is_compared & within[:, None]
+    exposed_s = pairs.outlines.exposed_s(pairs.experiment, pairs.clock, pairs.edges[..., 1])
+    within = is_within(exposed_s.ravel(), at_s).reshape(exposed_s.shape)
+    is_used = pairs.is_compared & within
     return np.stack([is_used, *[np.zeros_like(is_used)] * 2], axis=2)
 
 

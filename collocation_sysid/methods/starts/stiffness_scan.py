@@ -413,7 +413,8 @@ def _residuals(iterate: ExperimentIterate) -> Iterator[tuple[Array, Array]]:
         if rough is not None:
             slopes = np.zeros((len(rough), len(phi)))
             for place in kind.own_parameters[0]:
-                other = kind.rough_residuals(moved.x, phi + DIFFERENCE * np.eye(len(phi))[place])
+                error = DIFFERENCE * np.eye(len(phi))[place]
+                other = np.asarray(kind.rough_residuals(moved.x, phi + error))
                 slopes[:, place] = (other - rough) / DIFFERENCE
             is_seen = np.isfinite(rough)
             yield rough[is_seen], slopes[is_seen]
