@@ -275,8 +275,9 @@ class AugmentedCosts:
         parts = [active @ by_x, convex]
         if self.costs is not None:
             parts.insert(0, self.costs.linearise(x)[1])
+        curved = np.zeros(convex.indptr.size - 1)
         return (
-            np.concatenate([self._stacked(x, violations), np.zeros(convex.shape[0])]),
+            np.concatenate([self._stacked(x, violations), curved]),
             sp.csr_array(sp.vstack(parts)),
         )
 
