@@ -187,6 +187,16 @@ def test_a_table_that_needs_a_surface_is_refused_with_exit_code_2(key, tmp_path)
     assert not (tmp_path / "run").exists()
 
 
+def test_points_of_a_rod_in_images_need_places():
+    t_s = 0.02 * np.arange(11)
+    camera = cs.Camera(np.diag([800.0, 800.0, 1.0]) + 0.0, pose=np.eye(4), size_px=(640, 480))
+    tracks = cs.ImageTracks("front", camera, t_s, np.full((11, 1, 2), 100.0), ["middle"])
+    with pytest.raises(InputError, match="no place is stated of middle in 'front'"):
+        cs.Problem(
+            [swung(readings=[tracks])], VALUES | {"bending_n_m2": cs.Unknown(1e-3)}
+        ).collocation()
+
+
 def floor() -> cs.Obstacle:
     return cs.Obstacle(shape=cs.Plane((0, 0, 1), (0, 0, -1)), name="floor")
 

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
-from ...errors import InputError
+from ...errors import InputError, listed
 from ...fem.body import Body
 from ...program.correspondences import Correspondences
 from ...program.markers.association import MarkerAssociation
@@ -101,13 +101,15 @@ def find_places(
     Raises
     ------
     InputError
-        If the pose of a camera is unknown, and fewer than four points of it have a stated place; or
-        if a stated place is far from the body.
+        If the pose of a camera is unknown, and fewer than four points of it have a stated place; if a
+        stated place is far from the body; or if a place on a rod is not stated.
     """
     cameras = [each for each in experiment.readings if isinstance(each, ImageTracks)]
     rest = LocatedBody(experiment.body.nodes_m, experiment.body)
     stated = {name: place for name, (place, _) in stated_places(experiment).items()}
     _require_on_body(stated, rest)
+    if experiment.body.is_slender:
+        _require_stated(cameras, stated)
     poses, mirrored = {}, {}
     for tracks in cameras:
         poses[tracks.name] = tracks.camera.pose
@@ -126,6 +128,17 @@ def find_places(
         for name in tracks.names:
             places.setdefault(name, np.full(3, np.nan))
     return poses, mirrored, places, errors
+
+
+def _require_stated(cameras: Sequence[ImageTracks], stated: Mapping[str, Array]) -> None:
+    """Places on a rod move along its surface in two directions, and not along its centreline alone."""
+    for tracks in cameras:
+        unknown = [name for name in tracks.names if name not in stated]
+        if unknown:
+            raise InputError(
+                f"no place is stated of {listed(unknown)} in '{tracks.name}'; expected places_m of all "
+                "points on a rod, because places in images of a rod are not estimated"
+            )
 
 
 def _require_on_body(places: Mapping[str, Array], rest: LocatedBody) -> None:
