@@ -289,9 +289,11 @@ class InteriorPoint(MethodOptions):
             settings["ipopt.hessian_approximation"] = "limited-memory"
         sharpness = _largest_curvature(program)
         settings |= {
-            # Rows of pressures are nearly dependent where a surface lies on another.
+            # Rows of pressures are nearly dependent where a surface lies on another. With the
+            # rigid sections of a rod the multipliers are too large for the constant.
             "ipopt.perturb_always_cd": "no"
             if lifted_count(complete_program(program), "pressure")
+            or any(each.body.is_slender for each in program.transcriptions)
             else "yes",
             "ipopt.jacobian_regularization_exponent": 0.0,
             "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),

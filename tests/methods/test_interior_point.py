@@ -27,6 +27,7 @@ from kit.problems import (
     relative_errors,
     released_cube,
 )
+from kit.rods import cable, ends, straight
 from kit.wrenches import sensed, wristed_cube
 from scipy.spatial.transform import Rotation
 from synthetic import Swing
@@ -34,6 +35,7 @@ from synthetic import Swing
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.fem.rods import CrossSection
 from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
@@ -51,7 +53,7 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.lifted.collocation import with_lifted_variables
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance
+from collocation_sysid.recording import Experiment, Grasp, Markers, Nuisance, PoseSequence
 from collocation_sysid.runs.warm_start import WarmStart
 
 PRECISE = InteriorPoint(tolerance=1e-11)
@@ -583,3 +585,24 @@ def test_the_history_counts_iterations_and_ends_at_the_answer():
     np.testing.assert_allclose([*seen[-1].parameters.values()], solution.theta)
     loss = cube().objective(solution.z) * cube().measurement_count
     assert seen[-1].loss == pytest.approx(loss)
+
+
+@pytest.mark.long
+def test_the_constants_of_a_cable_are_those_of_reduced_space():
+    mesh = straight(0.6, CrossSection.round(0.006), 11, (0, 0, -1))
+    body = cable(mesh)
+    t_s = np.arange(31) * 0.01
+    sway_m = np.outer(0.05 * (1 - np.cos(10 * t_s)), [1, 0.5, 0.2])
+    hand = PoseSequence(t_s, sway_m, np.tile([0, 0, 0, 1.0], (31, 1)))
+    markers = Markers(t_s, np.zeros((31, 1, 3)), 5e-4, places_m=[mesh.place_m(0.6)])
+    grasp = Grasp(ends(body)[0], hand)
+    swing = Experiment(
+        body, t_s, [grasp], markers, nuisance=Nuisance.none(), air_density_kg_m3="none"
+    )
+    truth = {"bending_n_m2": 1e-3, "torsion_n_m2": 3e-4, "axial_n": 200.0}
+    truth |= {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
+    seen = with_markers(swing, simulate(swing, truth, "midpoint", substeps=1).markers_m)
+    problem = Problem([seen], truth | {"bending_n_m2": Unknown(1.5e-3)}, substeps=1)
+    found = solve(problem, InteriorPoint())
+    assert found.status.converged
+    assert found.parameters["bending_n_m2"] == pytest.approx(1e-3, rel=1e-6)
