@@ -216,6 +216,13 @@ class Solution:
     evaluations: int = 0
     scan: Scan | None = None
 
+    def __repr__(self) -> str:
+        free = [item.name for item in self.collocation.parameters.free_scalars]
+        values = ", ".join(f"{name} = {self.parameters[name]:.5g}" for name in free)
+        loss = f"loss {self.history[-1].loss:.5g}, " if self.history else ""
+        work = f"{loss}{self.iterations} iterations in {self.timing.total:.2g} s"
+        return f"Solution({self.method}, {self.status.value}: {values}; {work})"
+
     def unless_interrupted(self) -> Solution:
         """Return the solution, or raise `KeyboardInterrupt` if the user interrupted the solve.
 

@@ -10,7 +10,7 @@ that are too small.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -98,13 +98,13 @@ class Trajectory:
     """
 
     experiment: Experiment
-    positions_m: Array
-    velocities_m_s: Array
-    reactions: tuple[ReactionGrid, ReactionForces]
-    predicted: tuple[Any, ...] = ()
+    positions_m: Array = field(repr=False)
+    velocities_m_s: Array = field(repr=False)
+    reactions: tuple[ReactionGrid, ReactionForces] = field(repr=False)
+    predicted: tuple[Any, ...] = field(default=(), repr=False)
     steps_per_sample: int = 1
     step_error_m: float | None = None
-    equilibria: Dynamics | None = None
+    equilibria: Dynamics | None = field(default=None, repr=False)
 
     @property
     def t_s(self) -> Array:

@@ -152,6 +152,10 @@ def test_a_run_reports_parameters_with_standard_uncertainties():
     assert run.derived["poisson"] == pytest.approx(0.2, abs=0.05)
     assert "μ Pa" in run.table()
     assert f"mu_pa = {run.parameters['mu_pa']:.5g} ±" in repr(run)
+    solution = repr(run.solution)
+    assert f"mu_pa = {run.solution.parameters['mu_pa']:.5g}" in solution
+    assert "iterations" in solution
+    assert len(solution) < 300
     with pytest.raises(cs.InputError, match=r"no parameter 'mu'; .* did you mean 'mu_pa'?"):
         run.interval("mu")
 
