@@ -124,6 +124,11 @@ def _fault_message(fault: Fault, content: dict[str, Any], root: type[BaseModel])
         inside = _table_model(table.annotation) if table else None
         if SPECIMEN_TAG in fault["loc"] and inside is not None and len(key) == 3:
             inside = SpecimenSection
+        outer, _ = _schema_field(key[:-2], root)
+        around = _table_model(outer.annotation) if outer else None
+        if around is not None and key[-1] in _fields_by_key(around):
+            names = [str(part) for part in key[:-1] if isinstance(part, str)]
+            return f"unknown key; it belongs to {names[-2]}, above the table {names[-1]}"
         known = list(_fields_by_key(inside or root))
         hint = hint_at(str(key[-1]), known)
         return f"unknown key{hint or '; expected one of ' + ', '.join(known)}"

@@ -130,6 +130,12 @@ def test_unlikely_pixels_are_missing(filmed: Path) -> None:
         ),
         ("sigma_px = 0.3", "sigma_px = -1.0", WIDE, r"image_tracks.0.sigma_px: found -1"),
         ("sigma_px = 0.3", "sigma = 0.3", WIDE, r"image_tracks.0.sigma: unknown key"),
+        (
+            'file = "front.yaml"',
+            'file = "front.yaml"\npose_sigma = { turn_deg = 1.0 }',
+            WIDE,
+            r"camera.pose_sigma: unknown key; it belongs to image_tracks, above the table camera",
+        ),
     ],
 )
 def test_faulty_tables_are_refused(
