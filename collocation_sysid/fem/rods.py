@@ -174,8 +174,7 @@ class RodMesh(TetMesh):
         if not 0 <= s_m <= self.s_m[-1] * (1 + 1e-9):
             raise InputError(
                 f"found the arc length {s_m:g} m; expected 0 to {self.s_m[-1]:g} m, the length of the "
-                "rod",
-                where="s_m",
+                "rod"
             )
         centres = self.centres_of_sections_m
         return np.array([np.interp(s_m, self.s_m, centres[:, axis]) for axis in range(3)])
@@ -284,6 +283,14 @@ def rod_mesh(
     steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
     if not steps_m.min() > 0:
         raise InputError("found two equal points one after another", where="centreline_m")
+    chords = np.diff(points, axis=0) / steps_m[:, None]
+    cosines = np.sum(chords[1:] * chords[:-1], axis=1)
+    if cosines.min(initial=1.0) < -1e-9:
+        raise InputError(
+            f"found a turn of {np.degrees(np.arccos(max(cosines.min(), -1.0))):.0f}° at point "
+            f"{np.argmin(cosines) + 2}; expected at most 90°: more points where the rod bends",
+            where="centreline_m",
+        )
     curve, s_known = _by_arc_length(points, steps_m)
     s_m = _stations(float(s_known[-1]), sections, stations_m)
     tangents = curve(s_m, 1)
@@ -590,7 +597,7 @@ def _stations(length_m: float, count: int, stated_m: Sequence[float]) -> Array:
             where="s_m",
         )
     knots = np.concatenate([[0.0], stated, [length_m]])
-    knots = knots[np.concatenate([[True], np.diff(knots) > tolerance])]
+    knots = knots[np.concatenate([[True], np.diff(knots) > 1e-6 * length_m])]  # or one section
     spans = np.diff(knots)
     counts = np.maximum(1, np.round((count - 1) * spans / length_m)).astype(int)
     parts = [

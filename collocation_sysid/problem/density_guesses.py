@@ -39,9 +39,10 @@ def with_guessed_densities(section: ObjectSection, parameters: Sections) -> Obje
         known = {name: guess for name, guess in guesses.items() if guess is not None}
         if len(known) != 1:
             names = " and ".join(known) or f"no {MASS.name} or {DENSITY.name}"
+            of_rod = "mass_per_length_kg_m, " if section.is_rod else ""
             raise InputError(
-                f"found {names}; expected exactly one of {MASS.name}, {DENSITY.name}, here or with "
-                "a guess in [parameters]"
+                f"found {names}; expected exactly one of {of_rod}{MASS.name}, {DENSITY.name}, here "
+                "or with a guess in [parameters]"
             )
         changes |= known
     return section.model_copy(update=changes)

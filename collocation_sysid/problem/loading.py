@@ -241,6 +241,8 @@ class SpecimenCells:
 
 def _generated_counts(section: ObjectSection) -> tuple[int, int] | None:
     """Return corner nodes and elements of a generated mesh; None from files."""
+    if section.is_rod:
+        return 3 * section.sections, 3 * section.sections
     length_m = section.edge_length_m
     if length_m is None:
         return None
@@ -336,14 +338,39 @@ def _load_rod(section: ObjectSection, folder: Path, stations_m: Sequence[float])
         points = points * length_in_metres(section.length_unit)
     else:
         points = np.array([[0.0, 0.0, 0.0], [section.length_m or 0.0, 0.0, 0.0]])
-    return rod_mesh(
-        points,
-        cross,
-        sections=section.sections,
-        stations_m=stations_m,
-        first_director=section.first_director,
-        is_straight_at_rest=section.rest_shape == "straight",
-    )
+    thickness_m = 2 * max(cross.extent_m)
+    try:
+        length_m = float(rod_mesh(points, cross, sections=section.sections).s_m[-1])
+        if thickness_m > length_m / 2:
+            raise InputError(
+                f"found a thickness of {thickness_m:g} m; expected at most half of the length, "
+                f"{length_m:g} m; likely {thickness_m / 1e3:g} m, if it was in mm",
+                where="section",
+            )
+        return rod_mesh(
+            points,
+            cross,
+            sections=section.sections,
+            # Others are refused where they are read.
+            stations_m=[s for s in stations_m if 0 <= s <= length_m],
+            first_director=section.first_director,
+            is_straight_at_rest=section.rest_shape == "straight",
+        )
+    except InputError as error:
+        where, message = error.where, error.message
+        if where == "centreline_m":
+            where = "centreline"
+        elif where is None:  # the mesh of such sections
+            apart = np.linalg.norm(np.diff(points, axis=0), axis=1).sum() / section.sections
+            where, message = (
+                "sections",
+                (
+                    f"found {section.sections}, which are {apart:.3g} m apart, "
+                    f"{apart / thickness_m:.0f} times the thickness; expected more sections, or a "
+                    "length_unit if the centreline is not in m"
+                ),
+            )
+        raise InputError(message, None, where=where) from error
 
 
 def _load_mesh(section: ObjectSection, folder: Path, stations_m: Sequence[float]) -> TetMesh:

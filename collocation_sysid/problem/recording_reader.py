@@ -91,7 +91,7 @@ def _with_places_on_rod(section: ExperimentSection, body: Body) -> ExperimentSec
             "found arc lengths for a body that is not a rod; expected reference_m",
             where="markers.s_m",
         )
-    with located(where="markers"):
+    with located(where="markers.s_m"):
         known = {name: body.mesh.place_m(s).tolist() for name, s in section.markers.s_m.items()}
     reference_m = {**known, **section.markers.reference_m}
     markers = section.markers.model_copy(update={"reference_m": reference_m})

@@ -84,15 +84,38 @@ def test_the_rest_shape_of_a_curved_centreline_is_as_stated(rest_shape, problem)
         ),
         ("s_m = [0.0, 0.05] }", 'face = "top" }', "expected whole sections"),
         ('material = "cable"', 'material = "cable"\nelement = "tet10"', "element for a rod"),
-        ("tip = 0.6 }", "tip = 0.7 }", "0.7"),
+        ("tip = 0.6 }", "tip = 0.7 }", "markers.s_m: found the arc length 0.7 m"),
+        ("s_m = [0.0, 0.05]", "s_m = [0.0, 0.7]", "grasp.nodes: found [0, 0.7]"),
+        ("diameter_m = 0.006", "diameter_m = 6", "object.section.* likely 0.006 m"),
+        ("mass_per_length_kg_m = 0.034", "", "expected exactly one of mass_per_length_kg_m"),
+        ("diameter_m = 0.006", "diameter_m = 1e-5", "object.sections: found 41, which are"),
+        ("sections = 41", "sections = 100000000", "memory"),
         ("length_m = 0.6  ", "length_m = 600.0  ", "likely 0.6, if it was in mm"),
         ("s_m = [0.0, 0.05]", "s_m = [0.05, 0.0]", "the first arc length"),
         ("mass_per_length_kg_m = 0.034", "mass_per_length_kg_m = 0.034\nmass_kg = 1.0", "mass_kg"),
     ],
 )
 def test_a_wrong_description_is_refused_with_the_expected_one(old, new, message, problem):
-    with pytest.raises(InputError, match=message.replace("(", r"\(").replace(")", r"\)")):
+    for bracket in "()[]":
+        message = message.replace(bracket, "\\" + bracket)
+    with pytest.raises(InputError, match=message):
         cs.Problem.read(changed(problem, old, new))
+
+
+@pytest.mark.parametrize(
+    ("rows", "found"),
+    [
+        (["0,0,0"], "one point"),
+        (["0,0,0", "0.3,0,0", "0.3,0,0", "0.6,0,0"], "two equal points"),
+        (["0,0,0", "0.6,0,0", "0,0,0"], "a turn of 180° at point 2"),
+        (["0,0,0", "0.3,0,0", "1e-4,1e-4,0", "0.6,0,0"], "a turn of 180° at point"),
+    ],
+)
+def test_points_that_are_no_smooth_curve_are_refused(rows, found, problem):
+    table = "\n".join(["x_m,y_m,z_m", *rows, ""])
+    (problem.parent / "arc.csv").write_text(table, encoding="utf-8")
+    with pytest.raises(InputError, match=rf"object\.centreline: found {found}"):
+        cs.Problem.read(changed(problem, "length_m = 0.6  ", 'centreline = "arc.csv"'))
 
 
 def test_arc_lengths_of_a_solid_body_are_refused(tmp_path):

@@ -141,7 +141,7 @@ def models(
     if len(compared) < 2:
         options = {
             "--materials": (materials, "neo-hookean,yeoh"),
-            "--damping": (dampings, "kelvin-voigt,material"),
+            "--damping": (dampings, "kelvin-voigt,rayleigh"),
             "--prony": (branches or (0,), "0,1"),
         }
         option, example = next((o, e) for o, (is_declared, e) in options.items() if is_declared)

@@ -226,6 +226,12 @@ class Along:
                 where="s_m",
             )
         slack = _tolerance_m(mesh.points_m)
+        length_m = mesh.arc_lengths_m[-1]
+        if self.first_m < -slack or self.last_m > length_m + slack:
+            raise InputError(
+                f"found [{self.first_m:g}, {self.last_m:g}]; expected arc lengths from 0 to "
+                f"{length_m:g} m, the length of the rod"
+            )
         inside = mesh.arc_lengths_m >= self.first_m - slack
         return np.asarray(inside & (mesh.arc_lengths_m <= self.last_m + slack))
 

@@ -14,6 +14,7 @@ from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import edge_lengths, mean_ratios
 from ...fem.meshes.mesh import TetMesh
+from ...fem.rods import RodMesh
 from ...fem.spatial_field import FieldResolution
 from ...recording.experiment import Experiment
 from ...recording.grasp import Grasp
@@ -182,7 +183,8 @@ class BodyCheck:
     mass_kg: float
     # mapping of str to float: sum of the point masses of each experiment that has any, by its name.
     point_masses_kg: Mapping[str, float]
-    size_m: tuple[float, float, float]  # (x, y, z) extents of the mesh along the axes
+    # Extents (x, y, z) of the mesh along the axes; length and two widths of a rod.
+    size_m: tuple[float, float, float]
     edges_m: tuple[float, float, float]
     # Mean ratio, see `ElementShape`.
     smallest_element_quality: float
@@ -253,6 +255,8 @@ def check_body(
     worst = () if body.is_slender else worst_elements(mesh)
     shape = slenderness(mesh)
     x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
+    if isinstance(mesh, RodMesh):
+        x, (y, z) = float(mesh.s_m[-1]), (2 * half for half in mesh.section.extent_m)
     return BodyCheck(
         experiments,
         nodes=len(body.nodes.points_m),
