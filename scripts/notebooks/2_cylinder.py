@@ -225,6 +225,23 @@ columns = collocation.variable_count
 print(f"{rows} × {columns}, {100 * jacobian.nnz / rows / columns:.2f} % nonzero")
 
 # %% [markdown]
+# `collocation.casadi()` is the same program as a CasADi function, for `casadi.nlpsol` and programs
+# of your own; the page [For optimal-control users](../../docs/howto/optimal_control.md) continues
+# here. At the solution the equations of motion hold, $g = 0$, and with the multipliers $y$ the
+# derivatives $\nabla f + g_z^T y$ by all variables vanish that no bounds prescribe.
+
+# %%
+nlp = collocation.casadi()
+z, multipliers = solution.z, solution.multipliers
+violation = np.abs(nlp.g(z, []).full()).max()
+is_free = np.ravel(nlp.arguments["lbx"]) < np.ravel(nlp.arguments["ubx"])
+gradient = (nlp.grad_f(z, []) + nlp.jac_g(z, []).T @ multipliers).full().ravel()
+stationarity = np.abs(gradient[is_free]).max()
+print(f"largest |g| {violation:.1e}, largest |∇f + g_zᵀy| {stationarity:.1e}")
+assert violation < 1e-8
+assert stationarity < 1e-4
+
+# %% [markdown]
 # ## 2.3 Verification by forward simulation
 #
 # The RMS distance between fitted and measured markers should be $\sqrt3$ times the standard
