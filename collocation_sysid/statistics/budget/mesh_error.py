@@ -120,7 +120,7 @@ def _effect(
     held = np.zeros(iterate.x.shape[1], dtype=bool)
     held[transcription.prescribed_dofs] = True
     given = _given_dofs(by_dof)
-    is_corner = np.zeros(by_dof.shape[0], dtype=bool)
+    is_corner = np.zeros(dynamics.pattern.size, dtype=bool)
     is_corner[given[: body.mesh.points_m.size]] = True
     is_corner[given[body.nodes.points_m.size :]] = True  # frames
     moving = np.flatnonzero((abs(by_dof) @ ~held > 0) & (at.dynamics.is_static | ~is_corner))
