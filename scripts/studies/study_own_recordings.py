@@ -35,7 +35,7 @@ from collocation_sysid.recording.depth_camera import depth_image
 from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 SIZE_M = (0.02, 0.02, 0.11)
-FIT, SIMULATED = (2, 2, 4), (2, 2, 8)
+FIT, SIMULATED = (2, 2, 4), (4, 4, 8)
 END_S, REST_S, SHAKEN_S, LATE_S = 1.3, 0.4, 0.5, 0.02
 NOISE_PX, NOISE_M, DEPTH_NOISE_M = 0.3, 2e-4, 5e-4
 HANGING = Rotation.from_euler("x", 180, degrees=True)
