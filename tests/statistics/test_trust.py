@@ -377,7 +377,7 @@ def test_the_verdict_is_shown_stored_and_fed():
     caused = replace(found, causes=(Hypothesis("sensor-sign", "the wrench", strength=9.0),))
     assert caused.trust.verdict == "doubtful"
     assert caused.trust.reasons[0].startswith(
-        "likely: the wrench: the sensor was probably zeroed while it carried the body"
+        "likely: the wrench: its values fit with the opposite sign"
     )
 
 
