@@ -87,7 +87,7 @@ def run_row(run: PlannedRun, record: Record | None, yardstick: SuccessCriterion)
         "status": record["outcome"] if is_timeout or not fit else fit["status"],
         "converged": converged,
         "success": converged and is_accurate,
-        **{f"guess_{name}": guess for name, guess in run.guess.items()},
+        **{f"guess_{name}": guess for name, guess in (run.guess | fit.get("guess", {})).items()},
         **values,
         **errors,
         **{name: reached.get(name) for name in NUMBERS},

@@ -97,6 +97,7 @@ def _answer_of_method(problem: Problem, solution: Solution) -> dict[str, Any]:
         "status": solution.status.value,
         "converged": solution.status.converged,
         "parameters": solution.parameters,
+        "guess": {item.name: item.guess for item in collocation.parameters.free},
         "loss": collocation.objective(solution.z) / collocation.loss_scale,
         "violation_n": solution.max_violation_n,
         "iterations": solution.iterations,
