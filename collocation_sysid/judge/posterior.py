@@ -339,7 +339,7 @@ class Posterior:
         is_kept = [name.partition(" ")[0] not in left_out for name in self.effects.names]
         kept = [*range(first), *(first + np.flatnonzero(is_kept))]
         fit = self.fit.only(kept, effect_count=len(kept) - first)
-        alone = self.fit.only(range(first), effect_count=0)
+        alone = self.fit.only(range(first))
         considered = self.considered.without(left_out)
         learnt = self.effects.without(left_out)
         definition = self.definition[np.ix_(kept, kept)]
