@@ -27,6 +27,7 @@ from .certificate import certify
 from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
 from .options import MethodOptions
+from .ordering import METIS, cheaper_ordering
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
 from .starts.initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
@@ -282,9 +283,12 @@ class InteriorPoint(MethodOptions):
                 "ipopt.warm_start_mult_bound_push": WARM_MULTIPLIER,
                 "ipopt.mu_init": WARM_BARRIER * self.tolerance,
             }
-        if self.linear_solver == "mumps":  # METIS's ordering as it is: IPOPT refines
-            settings |= {"ipopt.mumps_pivot_order": 5, "ipopt.mumps_scaling": 0}
-            settings |= {"ipopt.mumps_pivtol": PIVOT_TOLERANCE}
+        if self.linear_solver == "mumps":  # the matrix as it is: IPOPT refines
+            settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_pivtol": PIVOT_TOLERANCE}
+            settings["ipopt.mumps_pivot_order"] = METIS
+            if not is_warm and "mumps_pivot_order" not in self.ipopt:
+                with_hessian = self.hessian != "limited-memory"
+                settings["ipopt.mumps_pivot_order"] = cheaper_ordering(program, with_hessian)
         if self.hessian == "limited-memory":
             settings["ipopt.hessian_approximation"] = "limited-memory"
         sharpness = _largest_curvature(program)

@@ -2127,6 +2127,37 @@ def test_both_solvers_find_the_same_motion_within_limits_that_are_functions(term
 
 
 @pytest.mark.long
+def test_a_robust_plan_keeps_limits_that_are_functions_for_all_its_constants():
+    covariance = np.diag([0.15, 1e-5, 0.3, 1e-5]) ** 2
+    body = replace(PlannedBody.read(hung_bar()), statistical_covariance=covariance)
+    planned = PlannedProgram.from_task(body, away(limits=[CALM]), LIMITS)
+    scenarios = planned.scenarios()
+    usual, robust = solve_reduced(planned), solve_reduced(planned, scenarios=scenarios)
+    exceeds_usual, exceeds_robust = (
+        [each.exceeds_path_limits(each.simulate(answer.c)) for each in scenarios]
+        for answer in (usual, robust)
+    )
+    assert any(exceeds_usual)
+    assert not any(exceeds_robust)
+    assert robust.status in ("converged", "flat")
+    # With constants that are alike, the plan is that of both solvers.
+    tight = replace(TIGHT, path=1e-6)
+    alike = solve_reduced(planned, scenarios=(planned, planned), tolerances=tight)
+    full = solve_full(planned, usual)
+    assert full.status == "converged"
+    assert np.abs(planned.simulate(alike.c) - full.x).max() < 1e-5 * np.ptp(full.x)
+
+
+def test_ipopt_refuses_a_robust_plan(monkeypatch):
+    known = replace(PlannedBody.read(hung_bar()), statistical_covariance=np.eye(4))
+    monkeypatch.setattr(PlannedBody, "read", lambda *_, **__: known)
+    with pytest.raises(
+        InputError, match=r"^--robust: a robust plan needs .* solver reduced-space$"
+    ):
+        plan_motion(hung_bar(), away(limits=[CALM]), LIMITS, robust=True, solver="interior-point")
+
+
+@pytest.mark.long
 def test_a_stretch_is_limited_beside_a_function():
     plan = plan_motion(hung_bar(), away(limits=[CALM], avoid={"largest_stretch": 1.05}), LIMITS)
     assert plan.is_complete
