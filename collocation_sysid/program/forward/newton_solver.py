@@ -80,8 +80,8 @@ class NewtonOptions:
     max_backtracks : int
         Largest number of halvings of a Newton step.
     max_halvings : int
-        Largest number of halvings of a time step (Newmark) or of the increment of the grasps in it
-        (schemes).
+        Largest number of halvings of a time step (Newmark) or of the increment of forces and grasps
+        in it (schemes).
     checks_stability : bool
         Whether the stiffness of an equilibrium is factorised at the equilibrium itself. If false,
         it may be known to be positive definite only at a near state, from which chord steps led

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -279,18 +280,33 @@ class RowEquations(StepEquations):
         past_forces = forces[first:t][::-1]
         self.xi = weighted_sum_of_past(row.p, past, shape=shape)
         self.nu = weighted_sum_of_past(row.q, past, shape=shape)
-        self.known = weighted_sum_of_past(row.w, past_forces, shape=shape)
-        self.known -= row.mass_kg * weighted_sum_of_past(row.s, past, shape=shape)
-        self.known -= row.mass_kg * row.r * dynamics.start_velocity_m_s
+        self.inertia = -row.mass_kg * weighted_sum_of_past(row.s, past, shape=shape)
+        self.inertia -= row.mass_kg * row.r * dynamics.start_velocity_m_s
+        self.known = self.inertia + weighted_sum_of_past(row.w, past_forces, shape=shape)
 
     def with_load_step(self, share: float) -> RowEquations:
-        """Return a copy of the row with loads between those of the previous sample (share 0) and
-        its own (share 1); rows of a motion have their complete loads.
+        """Return a copy of a static row with loads between those of the previous sample (share 0)
+        and its own (share 1), or of a row of a motion with this share of all forces.
         """
+        if share == 1:
+            return self
         scaled = copy(self)
-        if self.rest_before is not None and share < 1:
+        if self.rest_before is not None:
             scaled.rest = interpolate_in_time(self.rest_before, self.rest, share=share)
+        else:
+            scaled.row = replace(self.row, w=(share * self.row.w[0], *self.row.w[1:]))
+            scaled.known = self.inertia + share * (self.known - self.inertia)
+            scaled.local_weight = share * self.local_weight
+            scaled.stress = replace(self.stress, weight=share * self.stress.weight)
         return scaled
+
+    def without_forces(self, free: Index, previous: Array) -> Array:
+        """Return x_t (3n,) [m] of a motion without forces, with the dofs that are not `free` as in
+        `previous` (3n,) [m].
+        """
+        x = previous.copy()
+        x[free] = self.inertia[free] / (self.row.s[0] * self.row.mass_kg[free])
+        return x
 
     def force(self, x: Array) -> Array:
         """Return the force F_t (3n,) [N] at the evaluation state that follows from x_t = `x` (3n,)
@@ -323,7 +339,9 @@ def solve_row(
     solver: NewtonSolver, row: RowEquations, guess: Array, previous: Array, prescribed_m: Array
 ) -> Array:
     """Return the solution x_t (3n,) [m] of one row; where Newton's method fails, the grasps'
-    displacement (and a static load) is applied in smaller increments.
+    displacement is applied in smaller increments, with the change of static loads, or with all
+    forces of a motion. A motion without forces is known, and the stiff stresses of a thin plate that
+    moves so far that Newton's method fails are then small beside the inertia of its nodes.
 
     Static rows stay on the branch of stable equilibria.
 
@@ -344,14 +362,16 @@ def solve_row(
         If an increment fails after all halvings.
     """
     origin = previous[solver.is_prescribed]
-    path = SolutionPath(previous, halvings=solver.options.max_halvings, guess=guess)
+    is_static = row.dynamics.is_static
+    first = previous if is_static else row.without_forces(solver.free, previous)
+    path = SolutionPath(first, halvings=solver.options.max_halvings, guess=guess)
     while path.share < 1.0:
         start, share = path.next_guess()
         # Exact at the end, because bounds of the collocation program are.
         goal = prescribed_m if share == 1 else origin + share * (prescribed_m - origin)
         equations = row.with_load_step(share)
         try:
-            if row.dynamics.is_static:
+            if is_static:
                 solution = solver.solve_equilibrium(
                     start, equations.residual, linearise=equations.linearise, prescribed_m=goal
                 )
