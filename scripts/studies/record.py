@@ -28,8 +28,9 @@ SHOWN = 3
 TESTED = {
     "frames": ("problem/test_recording_frames.py", 2),
     "clock/slow": ("judge/test_first_reasons.py", 2),
+    "image-tracks": ("statistics/test_wrong_tracks.py", 1),
     "law": ("statistics/test_body_causes.py", 1),
-    "mesh-section": ("judge/test_first_reasons.py", 1),
+    "mesh-section": ("judge/test_first_reasons.py", 2),
     "sign": ("statistics/test_wrong_descriptions.py", 2),
     "sensor-sign": ("statistics/test_sensor_causes.py", 2),
     "sensor-unit": ("statistics/test_sensor_causes.py", 2),

@@ -75,6 +75,11 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "section of the body is round",
         "compare the laws first",
     ),
+    "round rod meshed square, stiffer and heavier": (
+        lambda: wrong.round_rod("square", 4e5, 1400.0),
+        "section of the body is round",
+        "compare the laws first",
+    ),
 }
 
 

@@ -210,7 +210,7 @@ def mirrored_mesh(is_mirrored: bool) -> cs.Problem:
     return _problem(replace(real, body=_bent(is_mirrored), markers=markers))
 
 
-def round_rod(section: str) -> cs.Problem:
+def round_rod(section: str, young_pa: float = 2e5, density_kg_m3: float = 1000.0) -> cs.Problem:
     """A round rod of known density with a sensor at its end, meshed with a round or a square section
     of the same width.
     """
@@ -225,10 +225,10 @@ def round_rod(section: str) -> cs.Problem:
             polygon = cs.cylinder_mesh(0.01, 0.1, 2, 3)
             wider = np.sqrt(np.pi / 4 * mesh.volume_m3 / polygon.volume_m3)
             mesh = cs.TetMesh(polygon.points_m * [wider, wider, 1], polygon.tetrahedra)
-        body = cs.Body(mesh, density_kg_m3=1000.0)
+        body = cs.Body(mesh, density_kg_m3=density_kg_m3)
         return _swung(body, t_s, places_m, wrench=cs.Wrench(t_s, loads, *sigma))
 
-    stiff = SOFT | {"young_pa": 2e5}
+    stiff = SOFT | {"young_pa": young_pa}
     real = cs.simulate(swung("round", np.zeros((21, 6))), stiff)
     noise = rng()
     tracks_m = real.markers_m + 3e-4 * noise.normal(size=real.markers_m.shape)
