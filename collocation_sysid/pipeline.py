@@ -5,7 +5,7 @@ errors.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -20,8 +20,7 @@ from .common.step_counting import StepUnit, counted_phase
 from .common.time_limit import TimeLimitReached, time_limit
 from .common.validated_classes import validated
 from .errors import InputError, SimulationError
-from .features.specimens.notes import one_kind_notes
-from .features.specimens.offsets import stress_offset_notes
+from .features.specimens.notes import one_kind_notes, stress_offset_notes
 from .fem.schemes import as_scheme
 from .methods.experiment_executors import connect_executor
 from .methods.reduced_space import ReducedSpace
@@ -261,8 +260,10 @@ def _with_problem_notes(answer: Run) -> Run:
             *impact_step_concerns(experiment, substeps),
         )
     )
-    tests = one_kind_notes(problem.experiments, problem.parameters)
+    tests: Iterable[str] = ()
     impacts = ()
+    if all(each.specimen for each in problem.experiments):
+        tests = one_kind_notes(problem.experiments, problem.parameters)
     may_strike = any(each.obstacles for each in problem.experiments)
     if may_strike and problem.substeps == "auto" and problem.choose_first_substeps() > 1:
         impacts = (IMPACT_NOTE.format(substeps),)
@@ -326,7 +327,9 @@ def _with_added_measurements(answer: Run, say: Log) -> Run:
 
 def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:
     fitted = [each.experiment for each in answer.solution.collocation.transcriptions]
-    offsets = stress_offset_notes(fit, fitted)
+    if not all(each.specimen for each in fitted):
+        return answer
+    offsets = stress_offset_notes(fit)
     return replace(answer, notes=(*answer.notes, *offsets))
 
 

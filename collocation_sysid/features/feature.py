@@ -1,7 +1,7 @@
 """Concerns and notes of one kind of measurement or force.
 
-Runs and checks iterate over `features.registry.FEATURES` and call the functions of each `Feature`;
-they name no feature. A function that a feature does not set contributes nothing.
+Runs and checks iterate over those of `features.registry.FEATURES` whose kind the recordings have, and call
+their functions; they name no feature. A function that a feature does not set contributes nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ class Feature:
 
     Attributes
     ----------
+    kind : type
+        Class of the measurements, or of the obstacles.
     topics : mapping of str to Topic
         Topics of concerns that only this feature has, with their messages, by key.
     messages : mapping of str to str
@@ -42,6 +44,7 @@ class Feature:
         ``notes(part)``: notes on the fit of one experiment.
     """
 
+    kind: type
     topics: Mapping[str, Topic] = field(default_factory=dict)
     messages: Mapping[str, str] = field(default_factory=dict)
     require_valid: Callable[[Experiment], object] = _nothing

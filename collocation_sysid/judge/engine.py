@@ -12,6 +12,7 @@ import numpy as np
 
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
+from ..features.registry import present
 from ..methods.reduced_search import UNLIMITED
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
@@ -71,9 +72,10 @@ def find_misspecifications(
     What the data show by themselves comes first: nothing is fitted again if it is nearly certain
     (`CERTAIN`), or if the residuals are noise.
     """
+    sources = present(SOURCES, [part.transcription.experiment for part in solution.parts])
     if is_consistent:
-        return rank(each for source in SOURCES for each in source.consistent(solution))
-    found = [each for source in SOURCES for each in source.fitted(solution)]
+        return rank(each for source in sources for each in source.consistent(solution))
+    found = [each for source in sources for each in source.fitted(solution)]
     for part, fitted_m in zip(solution.parts, solution.readings_m, strict=True):
         experiment = part.transcription.experiment
         found += [*same_tracks(experiment), *filtered_tracks(experiment, fitted_m)]
@@ -121,7 +123,8 @@ def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
     if stated is None:
         return []
     fit = TestedFit(solution, stated)
-    candidates = [each for source in SOURCES for each in source.candidates(fit)]
+    sources = present(SOURCES, [each.experiment for each in solution.collocation.transcriptions])
+    candidates = [each for source in sources for each in source.candidates(fit)]
     if not is_specimen:
         candidates += [*fit.screened(motion_rows(fit)), *motion_candidates(fit)]
     candidates.sort(key=lambda each: each[0])

@@ -21,6 +21,8 @@ class Source:
 
     Attributes
     ----------
+    kind : type
+        Class of the measurements, of the obstacles or of the specimens.
     described : callable
         ``described(experiment)``: likely mistakes that the description shows without a fit.
     fitted : callable
@@ -31,6 +33,7 @@ class Source:
         ``consistent(solution)``: those that a consistent fit does not exclude.
     """
 
+    kind: type
     described: Callable[[Experiment], Iterable[Hypothesis]] = _nothing
     fitted: Callable[[Solution], Iterable[Hypothesis]] = _nothing
     candidates: Callable[[TestedFit], Iterable[Candidate]] = _nothing

@@ -16,7 +16,7 @@ from ..common.time_limit import TimeLimitReached, time_limit
 from ..common.validated_classes import validated
 from ..errors import InputError
 from ..features.measurements import lost_samples
-from ..features.registry import FEATURES
+from ..features.registry import FEATURES, present
 from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..methods.best_iterate import answers_as, best_iterate, keep
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
@@ -365,7 +365,7 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
         lost_samples(experiment)
     collocation = problem.collocation()
     for experiment in collocation.experiments:
-        for feature in FEATURES:
+        for feature in present(FEATURES, [experiment]):
             feature.require_valid(experiment)
     if warm_start is not None and problem.substeps == "auto":
         collocation = replace(collocation, substeps=warm_start.substeps)
@@ -394,7 +394,8 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
 def _feature_notes(solution: Solution) -> list[str]:
     parts = solution.parts
     lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
-    return lost + [note for part in parts for feature in FEATURES for note in feature.notes(part)]
+    features = present(FEATURES, [part.transcription.experiment for part in parts])
+    return lost + [note for part in parts for feature in features for note in feature.notes(part)]
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:

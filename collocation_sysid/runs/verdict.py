@@ -8,7 +8,7 @@ import numpy as np
 
 from ..common.array_types import Array, root_mean
 from ..errors import SimulationError
-from ..features.registry import FEATURES
+from ..features.registry import FEATURES, present
 from ..features.specimens.concerns import as_specimen_concerns
 from ..fem.schemes import as_scheme
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION
@@ -96,6 +96,7 @@ def solution_concerns(
     if ENDED_BY_ASSOCIATION in solution.notes:
         yield Concern("solve/jump")
     transcriptions = solution.collocation.transcriptions
+    fitted_experiments = [each.experiment for each in transcriptions]
     collocation = solution.collocation
     unknowns = unknown_concerns(solution, phi)
     if not solution.collocation.nq:
@@ -103,27 +104,26 @@ def solution_concerns(
     if uncertainty is not None:
         misfits = fit_concerns(uncertainty)
         of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
-        yield from as_specimen_concerns(
-            [*misfits, *of_parameters, *unknowns], [each.experiment for each in transcriptions]
-        )
+        of_fit = [*misfits, *of_parameters, *unknowns]
+        are_specimens = all(each.specimen for each in fitted_experiments)
+        yield from as_specimen_concerns(of_fit, fitted_experiments) if are_specimens else of_fit
     else:
         if solution.collocation.nq:
             yield Concern("solve/no-error-bars", "doubtful")
         yield from unknowns
     yield from allowance_concerns(solution)
-    fitted_experiments = [each.experiment for each in solution.collocation.transcriptions]
     yield from (each.concern() for each in copied_measurements(fitted_experiments))
     yield from outlier_share_concerns(*_outlier_counts(solution))
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)
     yield from branch_concerns(solution.parts)
-    for feature in FEATURES:
+    for feature in present(FEATURES, fitted_experiments):
         yield from feature.concerns(solution.parts)
     fitted = fit_misfits(solution)
     static = [each.experiment.name for each in transcriptions if each.experiment.is_static]
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation):
-            for feature in FEATURES:
+            for feature in present(FEATURES, [rollout.trajectory.experiment]):
                 yield from feature.simulation_concerns(name, rollout)
         yield from _forward_concerns(name, rollout, fitted, is_static=name in static)
     for transcription in collocation.transcriptions:

@@ -10,6 +10,7 @@ import pytest
 import collocation_sysid
 from collocation_sysid.features.feature import Feature
 from collocation_sysid.features.registry import FEATURES
+from collocation_sysid.recording.markers import Markers
 from collocation_sysid.statistics.concerns import TOPICS, declare_messages, declare_topics
 
 PACKAGE = Path(collocation_sysid.__file__).parent
@@ -46,5 +47,5 @@ def test_no_message_is_declared_twice():
 
 
 def test_a_feature_without_functions_contributes_nothing():
-    nothing = Feature()
+    nothing = Feature(Markers)
     assert not [*nothing.concerns(None)]

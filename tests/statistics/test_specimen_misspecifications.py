@@ -209,7 +209,6 @@ def test_concerns_of_specimens_name_no_markers():
     assert "sigma_pa seems 2 times too large" in text
     for word in ("marker", "reference_m", "sigma_m", "motion", "over time"):
         assert word not in text
-    assert as_specimen_concerns(general, []) == general
 
 
 # Curves that fit with several kinds of test ---------------------------------------------------------

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from ...judge.source import Source
 from ...methods.solution import Solution
+from ...recording.depth_camera import Depth
 from ...statistics.hypothesis import Hypothesis
 from .poses import camera_hypotheses
 
@@ -16,4 +17,4 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
         yield from camera_hypotheses(part.transcription.experiment)
 
 
-CAMERAS = Source(described=camera_hypotheses, fitted=fit_hypotheses)
+CAMERAS = Source(Depth, described=camera_hypotheses, fitted=fit_hypotheses)

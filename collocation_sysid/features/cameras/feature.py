@@ -9,6 +9,7 @@ import numpy as np
 from ...common.array_types import Array
 from ...program.collocation import ExperimentIterate
 from ...program.depth.comparison import depth_residuals, outline_distances_px
+from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...statistics.concerns import Concern, concern_if
 from ..feature import Feature
@@ -162,6 +163,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
 
 
 CAMERAS = Feature(
+    Depth,
     messages=MESSAGES,
     require_valid=require_depth_units,
     concerns=concerns,

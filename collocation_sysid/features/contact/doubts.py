@@ -1,14 +1,10 @@
-"""Likely mistakes that loads of obstacles show: contact without adhesion only pushes. Also parts of a
-mesh that nothing holds.
-"""
+"""Likely mistakes that loads of obstacles show: contact without adhesion only pushes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...common.array_types import Array
 from ...judge.source import Source
@@ -89,31 +85,6 @@ def _load_along_motion_n(
     return load_n[np.isfinite(load_n)]
 
 
-def _loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """No grasp holds some of the parts; nothing is known without grasps, or with tendons."""
-    cells = experiment.body.cells
-    count = len(experiment.body.nodes_m)
-    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
-    edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
-    _, labels = connected_components(edges, directed=False)
-    parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
-    grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
-    loose = (
-        ~np.isin(parts, np.concatenate(grasped_labels))
-        if grasped_labels
-        else np.zeros(len(parts), dtype=bool)
-    )
-    if loose.any() and not experiment.tendons:
-        data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
-        yield Hypothesis("mesh-parts", f"'{experiment.name}'", data=data, strength=float(count))
-
-
-def hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield likely errors of the mesh, and of the obstacles and their loads."""
-    yield from _loose_parts(experiment)
-    yield from obstacle_hypotheses(experiment)
-
-
 def obstacle_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield hypotheses about the obstacles of an experiment; mostly none."""
     for obstacle in experiment.obstacles:
@@ -128,4 +99,4 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
         yield from obstacle_hypotheses(transcription.experiment)
 
 
-CONTACT = Source(described=hypotheses, fitted=fit_hypotheses)
+CONTACT = Source(Obstacle, described=obstacle_hypotheses, fitted=fit_hypotheses)

@@ -13,6 +13,7 @@ from ...methods.solution import Solution
 from ...model.contact.summary import ContactSummary, contact_summaries, surface_gaps_and_pressures
 from ...program.collocation import ExperimentIterate
 from ...recording.experiment import Experiment
+from ...recording.obstacle import Obstacle
 from ...statistics.concerns import Concern, Topic, concern_if
 from ..feature import Feature
 
@@ -118,12 +119,10 @@ def contact_fields(
     experiment: Experiment, solution: Solution, positions_m: Array
 ) -> dict[str, Any]:
     """Return the fields of `MotionRecord` with gap [m] and pressure [Pa] on the boundary triangles
-    at positions (T, n, 3) [m], (T, F) each; nothing without obstacles.
+    at positions (T, n, 3) [m], (T, F) each, of an experiment with obstacles.
 
     Poses are corrected by the nuisance parameters if the experiment was fitted.
     """
-    if not experiment.obstacles:
-        return {}
     if (part := solution.part_of(experiment.name)) is not None:
         experiment = part.transcription.corrected_experiment(part.phi)
     theta = experiment.body.theta_from_values(solution.parameters)
@@ -133,4 +132,4 @@ def contact_fields(
     return {"gaps_m": gaps_m, "pressures_pa": pressures_pa}
 
 
-CONTACT = Feature(topics=TOPICS, guess_concerns=guess_concerns, concerns=concerns)
+CONTACT = Feature(Obstacle, topics=TOPICS, guess_concerns=guess_concerns, concerns=concerns)

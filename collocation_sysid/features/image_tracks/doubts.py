@@ -14,6 +14,7 @@ from ...methods.solution import Solution
 from ...statistics.hypothesis import Hypothesis
 from . import stated_cameras
 from .residual import ImageTrackResidual
+from .tracks import ImageTracks
 
 # Standard deviations of residuals from which a track is suspicious, and over those of the others.
 SUSPICIOUS = 5.0
@@ -57,4 +58,4 @@ def track_hypotheses(
             yield Hypothesis("image-track", of, data=data, strength=strength)
 
 
-IMAGE_TRACKS = Source(described=stated_cameras.hypotheses, fitted=fit_hypotheses)
+IMAGE_TRACKS = Source(ImageTracks, described=stated_cameras.hypotheses, fitted=fit_hypotheses)

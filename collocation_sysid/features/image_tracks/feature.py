@@ -12,6 +12,7 @@ from ...program.collocation import ExperimentIterate
 from ..feature import Feature
 from .places import SIMILAR_POSES
 from .residual import ImageTrackResidual
+from .tracks import ImageTracks
 
 
 def notes(part: ExperimentIterate) -> Iterator[str]:
@@ -59,4 +60,4 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             )
 
 
-IMAGE_TRACKS = Feature(notes=notes)
+IMAGE_TRACKS = Feature(ImageTracks, notes=notes)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...program.collocation import ExperimentIterate
 from ..feature import Feature
+from .outlines import Outlines
 from .residual import OutlinesResidual
 
 
@@ -27,4 +28,4 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
         )
 
 
-OUTLINES = Feature(notes=notes)
+OUTLINES = Feature(Outlines, notes=notes)

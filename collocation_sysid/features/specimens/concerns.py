@@ -51,8 +51,7 @@ LITTLE_DILATATION = 0.1
 def as_specimen_concerns(
     concerns: Iterable[Concern], experiments: Sequence[Experiment]
 ) -> list[Concern]:
-    """Return concerns about a fit, replaced by those of `SPECIMEN_CODES` if all experiments are
-    specimens; else as they are.
+    """Return concerns about a fit of specimens alone, replaced by those of `SPECIMEN_CODES`.
 
     The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
     too simple is the most frequent cause of the others, unless one sample makes nearly all of them;
@@ -66,8 +65,6 @@ def as_specimen_concerns(
     concerns : iterable of Concern
         Concerns from the residuals, the error bars and the unknowns of the fit.
     """
-    if not experiments or any(each.specimen is None for each in experiments):
-        return list(concerns)
     strains = [specimen_strains(each)[0] for each in experiments]
     keys = ["relative_sigma" if is_harmonic(strain) else "sigma_pa" for strain in strains]
     has_fibres = any(part.axes is not None for each in experiments for part in each.body.parts)

@@ -1,12 +1,26 @@
-"""Notes on material tests of one kind, which do not test the law that is fitted to them."""
+"""Notes on material tests: tests of one kind do not test the law that is fitted to them, and constant
+offsets of the stresses may explain residuals above the noise.
+
+The zero of a load cell is not estimated by default (`stress_zero_pa = "none"`). Offsets join the
+linearised fit as one more column for each specimen, and an F test compares the residuals.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
+from ...common.array_types import Array
+from ...common.display import short
+from ...errors import listed
 from ...fem.laws.constants import without_region
 from ...model.parameters import Parameters
 from ...recording.experiment import Experiment
+from ...recording.specimen import STRESS_NAME
+from ...statistics.distributions import f_sf
+from ...statistics.linearised import LinearisedFit
+from ...statistics.thresholds import GROSS_MISFIT, NAMED_ERRORS, NOTEWORTHY, OFFSET_FALSE_ALARMS
 
 # Moduli of small strain, whose meaning does not depend on the law.
 MODULI = frozenset({"young_pa", "poisson", "lambda_pa", "mu_pa", "kappa_pa"})
@@ -19,12 +33,10 @@ FEWEST_CONSTANTS = 2
 def one_kind_notes(experiments: Sequence[Experiment], parameters: Parameters) -> Iterator[str]:
     """Yield one note if a law with several constants is fitted to specimens of one kind of test.
 
-    Nothing is yielded if another kind of test is predicted, if another recording is fitted, for
-    biaxial tests, or unless at least `FEWEST_CONSTANTS` elastic constants are estimated, of which
-    one belongs to the law and is no usual modulus (`MODULI`).
+    Nothing is yielded if another kind of test is predicted, for biaxial tests, or unless at least
+    `FEWEST_CONSTANTS` elastic constants are estimated, of which one belongs to the law and is no
+    usual modulus (`MODULI`).
     """
-    if any(each.specimen is None for each in experiments):
-        return
     tests = {each.specimen.test for each in experiments if each.specimen is not None}
     if len(tests) != 1 or tests & GENERAL_TESTS:
         return
@@ -40,3 +52,106 @@ def one_kind_notes(experiments: Sequence[Experiment], parameters: Parameters) ->
         "one kind of test cannot show, and predictions of other deformations may be far off; add "
         "another kind of test, fitted or with validation = true"
     )
+
+
+# Standard deviation of the prior of an offset, over sigma of the stress: without a prior, errors of
+# the law appear as offsets that no load cell has.
+PRIOR_SIGMAS = 10.0
+
+
+def stress_offset_notes(fit: LinearisedFit) -> list[str]:
+    """Return one note, as a list, if constant offsets of the stresses explain residuals above the
+    noise; else empty.
+
+    Empty if the offset of each stress is estimated already, the residuals are up to `NOTEWORTHY` or
+    above `GROSS_MISFIT` times sigma, or the F test has a
+    probability above `OFFSET_FALSE_ALARMS`.
+
+    Parameters
+    ----------
+    fit : LinearisedFit
+        Fit of specimens, linearised at its answer.
+    """
+    offsets = [
+        k
+        for k, block in enumerate(fit.blocks)
+        if block.marker_names == (STRESS_NAME,)
+        and block.measurement_count
+        and not any(
+            name.startswith(f"{block.name}: stress_zero of {STRESS_NAME}") for name in fit.names
+        )
+    ]
+    residual, slopes, columns = _stacked(fit, offsets)
+    measured = sum(block.measurement_count for block in fit.blocks)
+    level = np.sqrt(fit.chi_squared / max(1, measured))
+    count = len(offsets)
+    priors = int(np.count_nonzero(fit.prior_jacobian))
+    free = measured + priors - slopes.shape[1]
+    if not count or free < 1 or not NOTEWORTHY < level <= GROSS_MISFIT:
+        return []
+    complete = np.concatenate([slopes, columns], axis=1)
+    before = _remaining_squares(slopes, residual)
+    after = _remaining_squares(complete, residual)
+    statistic = (before - after) / count / max(after / free, 1e-300)
+    if f_sf(statistic, count, freedom=free) > OFFSET_FALSE_ALARMS:
+        return []
+    estimates, errors = _offsets(complete, residual, count=count)
+    errors = errors * np.sqrt(after / free)
+    named = [k for k in range(count) if abs(estimates[k]) > NAMED_ERRORS * errors[k]] or [
+        int(np.argmax(np.abs(estimates) / errors))
+    ]
+    sizes = [
+        f"{short(estimates[k])} ± {short(errors[k])} Pa in '{fit.blocks[offsets[k]].name}'"
+        for k in named
+    ]
+    prior_pa = float(f"{np.abs(estimates[named]).max():.1g}")
+    return [
+        f"a constant offset of the stress explains part of the residuals: {listed(sizes)}, and χ² "
+        f"decreases from {before:.3g} to {after:.3g}. If the zero of the load cell is not known "
+        f"better, estimate it: stress_zero_pa = {prior_pa:g} in the [[experiment]]; a law that does "
+        "not fit has a similar effect"
+    ]
+
+
+def _stacked(fit: LinearisedFit, offsets: Sequence[int]) -> tuple[Array, Array, Array]:
+    """Return residuals (n,), derivatives (n, f) by the f parameters that are not at a bound, and
+    derivatives (n, k) by the k offsets [1/Pa], of all measurements and then of the priors, which
+    the offsets have too (`PRIOR_SIGMAS`).
+    """
+    residuals = []
+    slopes = []
+    columns = []
+    for index, block in enumerate(fit.blocks):
+        mask = block.is_measured
+        residuals.append(block.residual[mask])
+        slopes.append(block.jacobian[mask])
+        sigmas = block.sigma_m[:, None] * block.sigma_ratios
+        weights = block.compute_root_weight() / sigmas * mask
+        here = np.zeros((int(mask.sum()), len(offsets)))
+        if index in offsets:
+            here[:, offsets.index(index)] = weights[mask]
+        columns.append(here)
+    is_free = ~fit.at_bound
+    residuals += [fit.prior_residual, np.zeros(len(offsets))]
+    slopes.append(np.diag(fit.prior_jacobian))
+    slopes.append(np.zeros((len(offsets), len(fit.names))))
+    columns.append(np.zeros((len(fit.names), len(offsets))))
+    priors_pa = [PRIOR_SIGMAS * fit.blocks[k].sigma_m[0] for k in offsets]
+    columns.append(np.diag(1 / np.array(priors_pa)))
+    return (np.concatenate(residuals), np.concatenate(slopes)[:, is_free], np.concatenate(columns))
+
+
+def _remaining_squares(matrix: Array, residual: Array) -> float:
+    """Return the squares (n,) that no combination of columns explains."""
+    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    step = -np.linalg.pinv(matrix / scale) @ residual
+    return float(np.sum((residual + (matrix / scale) @ step) ** 2))
+
+
+def _offsets(matrix: Array, residual: Array, count: int) -> tuple[Array, Array]:
+    """Return offsets (k,) [Pa], measured less predicted, and standard errors at unit noise."""
+    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    inverse = np.linalg.pinv(matrix / scale)
+    step = -(inverse @ residual) / scale
+    errors = np.linalg.norm(inverse, axis=1) / scale
+    return step[-count:], errors[-count:]

@@ -20,7 +20,7 @@ from ...common.serialisation import content
 from ...common.time_limit import TimeLimitReached, time_limit
 from ...errors import SimulationError
 from ...features.measurements import lost_samples
-from ...features.registry import FEATURES
+from ...features.registry import FEATURES, present
 from ...fem.schemes import as_scheme
 from ...methods.best_iterate import best_iterate
 from ...methods.reduced_space import ReducedSpace
@@ -296,7 +296,7 @@ def check_problem(
         at_guess += strain_stability_concerns(parts)
         if not start_notes:  # forces on a body that was only carried by its grasps mean nothing
             at_guess += branch_concerns(parts)
-            for feature in FEATURES:
+            for feature in present(FEATURES, problem.experiments):
                 at_guess += feature.guess_concerns(parts, simulated is not first)
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
@@ -540,6 +540,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     InputError
         For a size or a density that no body can have.
     """
+    from ...judge.bodies import loose_parts
     from ...judge.modes import find_misspecifications_by_modes
     from ...judge.registry import SOURCES
 
@@ -551,6 +552,9 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         for cause in find_misspecifications_by_modes(e, constants)
     )
     by_feature = (
-        cause for source in SOURCES for e in problem.experiments for cause in source.described(e)
+        cause
+        for e in problem.experiments
+        for found in (loose_parts, *(each.described for each in present(SOURCES, [e])))
+        for cause in found(e)
     )
     return (*odd, *rank((*by_feature, *doubtful)))
