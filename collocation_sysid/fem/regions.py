@@ -23,6 +23,7 @@ from .laws.constants import DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, TAU, Cons
 from .laws.damping_admissibility import require_admissible_damping
 from .laws.fibres import Fibres, reinforced
 from .laws.materials import (
+    DAMPINGS,
     DampingLaw,
     Energy,
     Material,
@@ -239,7 +240,7 @@ def parts_from_regions(
 
 
 def _require_damping(damping: DampingLaw, material: Material) -> None:
-    if not isinstance(material, RodMaterial):
+    if not isinstance(material, RodMaterial) and damping not in DAMPINGS.values():
         require_admissible_damping(damping, material)
 
 

@@ -31,7 +31,7 @@ from ..fem.schemes import QUASI_STATIC, SLIDING, Scheme, as_scheme
 from ..recording.experiment import Experiment
 from .force_internal_variables import ForceHistory
 from .forces import Forces
-from .internal_variables import AnyHistory, histories_of_trajectory, insert_histories
+from .internal_variables import AnyHistory, histories_of_trajectory
 from .weight import DofMasses
 
 
@@ -336,7 +336,10 @@ class Dynamics:
             Indices of the rows; by default all from `first_row` on.
         """
         rows = slice(self.first_row, self.row_count) if rows is None else rows
-        return insert_histories(at_times(self.forces, rows), histories, rows=rows)
+        forces = at_times(self.forces, rows)
+        for history in histories:
+            forces = history.insert_into(forces, rows)
+        return forces
 
     def combine(self, table: Array, rows: Array) -> Array:
         """Return Σ_i table[t, i] rows[t − i] for every t, from coefficients (N, lags) and `rows`

@@ -25,14 +25,8 @@ from ..recording.experiment import Experiment
 from .contact.force import contact_terms
 from .force_term import AssemblyIndices, ForceTerm, Potential, States
 from .local_force import LocalForces
-from .point_forces import (
-    ComplementarityForce,
-    CustomForce,
-    Pointwise,
-    air_drag_terms,
-    custom_force_terms,
-)
-from .stiffness_change import stiffness_change_terms
+from .point_forces import ComplementarityForce, CustomForce, Pointwise
+from .stiffness_change import StiffnessChange
 from .weight import DofMasses, Weight
 
 
@@ -88,22 +82,24 @@ class Forces:
             pressures at each state.
         """
         times = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
-        potentials = tuple(
+        further: list[ForceTerm] = [
             Potential(actuator.require_measure(), actuator.energy_amplitude_at(times)[:, None])
             for actuator in experiment.actuators
-        )
-        further = (
-            *potentials,
-            *contact_terms(experiment, step_s),
-            *air_drag_terms(experiment, times),
-            *stiffness_change_terms(experiment, times),
-            *custom_force_terms(experiment.body, times),
-        )
+        ]
+        if experiment.obstacles:
+            further += contact_terms(experiment, step_s)
+        if experiment.has_air_drag:
+            density = experiment.air_density_kg_m3
+            further.append(CustomForce(experiment.body.unit_air_drag, times, factor=density))
+        if experiment.stiffness_deviations:
+            share = experiment.known_stiffness_change(times)[:, None]
+            further.append(StiffnessChange(experiment.body, share, is_static=experiment.is_static))
+        further += [CustomForce(placed, times) for placed in experiment.body.placed_forces]
         unknown = np.full(len(experiment.body.constants), np.nan)
         still = experiment.is_static
         forces = cls(
             Weight.from_experiment(experiment, times),
-            further,
+            tuple(further),
             joint_pattern=experiment.build_coupled_graph(),
             theta=unknown,
             is_static=still,

@@ -67,24 +67,6 @@ def histories_of_trajectory(
     return tuple(collected)
 
 
-def insert_histories(forces: Forces, histories: Sequence[AnyHistory], rows: slice) -> Forces:
-    """Return the forces of some evaluations with the internal variables of the histories; without
-    histories, the forces themselves.
-
-    Parameters
-    ----------
-    forces : Forces
-        Forces at the evaluations `rows` alone.
-    histories : sequence of histories
-        Histories of the complete motion.
-    rows : slice
-        Indices of the evaluations.
-    """
-    for history in histories:
-        forces = history.insert_into(forces, rows)
-    return forces
-
-
 def start_states(forces: Forces, x: Array, v: Array, loaded_s: float) -> tuple[PreviousState, ...]:
     """Return the internal variables in the start state: positions x [m] and velocities v [m/s],
     (3n,) each.

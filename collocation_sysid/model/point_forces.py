@@ -22,11 +22,10 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..common.time_dependence import LOAD, over_time
 from ..fem.air import unit_drag
-from ..fem.body import Body, Linearisation, SecondDerivatives
+from ..fem.body import Linearisation, SecondDerivatives
 from ..fem.force_points import ForcePoints
 from ..fem.node_force import CONTEXT_SIZE, LocatedForce, NodeForce
 from ..fem.pattern import SymmetricPattern
-from ..recording.experiment import Experiment
 from .force_term import AssemblyIndices, ForceTerm, States
 from .generated_functions import GeneratedFunction
 
@@ -448,25 +447,3 @@ def law_function(force: NodeForce, dofs: int) -> GeneratedFunction:
         data_size=CONTEXT_SIZE,
         is_compiled=force.is_compiled,
     )
-
-
-def air_drag_terms(experiment: Experiment, t_s: Array) -> tuple[CustomForce, ...]:
-    """Return the drag of the air on the body of an experiment; empty if there is none.
-
-    Drag is linear in the density of the air, which is the factor of the drag at a density of 1
-    kg/m³.
-
-    Parameters
-    ----------
-    t_s : (T,)
-        Times [s].
-    """
-    if not experiment.has_air_drag:
-        return ()
-    placed = experiment.body.unit_air_drag
-    return (CustomForce(placed, t_s, factor=experiment.air_density_kg_m3),)
-
-
-def custom_force_terms(body: Body, t_s: Array) -> tuple[CustomForce, ...]:
-    """Return the custom forces declared for a body, at times (T,) [s]; empty if there are none."""
-    return tuple(CustomForce(placed, t_s) for placed in body.placed_forces)

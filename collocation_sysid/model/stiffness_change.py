@@ -6,7 +6,6 @@ share s(t) is the only input.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -16,17 +15,7 @@ from ..common.array_types import Array
 from ..common.time_dependence import over_time
 from ..fem.body import Body, Linearisation, SecondDerivatives
 from ..fem.pattern import SymmetricPattern
-from ..recording.experiment import Experiment
 from .force_term import AssemblyIndices, ForceTerm, States
-
-
-def stiffness_change_terms(experiment: Experiment, t_s: Array) -> Iterator[StiffnessChange]:
-    """Yield the change of the stiffness at times (T,), if a deviation of the experiment may have
-    one; its share is that of the known deviations.
-    """
-    if experiment.stiffness_deviations:
-        share = experiment.known_stiffness_change(t_s)[:, None]
-        yield StiffnessChange(experiment.body, share, is_static=experiment.is_static)
 
 
 @dataclass(frozen=True, eq=False)

@@ -452,12 +452,11 @@ def with_start_memory(forces: Forces, loaded_s: float) -> Forces:
     """Return forces on the start shape, with the additional stiffness of a load that was applied a
     time `loaded_s` [s] ago: Q = g e^(−t/τ) S.
 
-    For a body without memory, or if `loaded_s` is infinite, the argument itself is returned.
-    Otherwise it is unchanged; it must be given at one time, and its `memory_state` is replaced in
-    the result.
+    If `loaded_s` is infinite, the argument itself is returned. Otherwise it is unchanged; it must be
+    given at one time, and its `memory_state` is replaced in the result.
     """
     body = forces.body
-    if not body.has_memory or np.isinf(loaded_s):
+    if np.isinf(loaded_s):
         return forces
     past = body.memory.relaxed(1)
     c = FadingCoefficients.from_body(

@@ -139,8 +139,9 @@ def problem_arguments(
                 notes += reader.notes
             experiments.append(experiment)
             complete_steps(StepUnit.RECORDING)
-    with located(path):
-        require_equal_units(specimens)
+    if specimens:
+        with located(path):
+            require_equal_units(specimens)
     return {
         "experiments": experiments,
         "parameters": parameters,

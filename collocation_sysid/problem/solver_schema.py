@@ -16,7 +16,7 @@ from ..common.schema_tables import Among, Section
 from ..common.validated_types import Positive
 from ..errors import InputError
 from ..methods import METHODS, method_options_schema, method_summary
-from ..methods.comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
+from ..methods.comparison.casadi_nlp import PREFIX, Sleqp, SqpMethod, refusal_reason
 from ..methods.comparison.penalty import AugmentedLagrangian, Penalty
 from ..methods.comparison.shooting import Shooting
 from ..methods.interior_point import InteriorPoint
@@ -31,8 +31,8 @@ DEFAULT = "reduced-space"
 
 def _require_offered(name: Any) -> Any:
     """An unknown name is returned, too; a solver of CasADi that cannot be used is refused."""
-    reason = refusal_reason(name) if isinstance(name, str) else None
-    if reason is not None:
+    is_plugin = isinstance(name, str) and name.startswith(PREFIX)
+    if is_plugin and (reason := refusal_reason(name)) is not None:
         raise ValueError(reason)
     return name
 

@@ -197,9 +197,10 @@ class Experiment:
         loads = ("masses", "forces", "tendons", "pressures")
         if self.body.is_slender:
             self._require_no_surface()
-        vars(self)["body"] = with_obstacle_frames(
-            self.body, self.obstacles, is_static=self.is_static
-        )
+        if self.obstacles or len(self.body.frames):
+            vars(self)["body"] = with_obstacle_frames(
+                self.body, self.obstacles, is_static=self.is_static
+            )
         framed = zip(self.obstacles, self.body.frames, strict=True)
         vars(self).update(
             grasps=(

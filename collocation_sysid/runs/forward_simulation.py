@@ -210,7 +210,9 @@ def simulate_with_parameters(
         Where the simulation fails.
     """
     integrator = problem.scheme if problem.rollout.integrator == "scheme" else "newmark"
-    corrected = with_contact_energy(transcription.corrected_experiment(phi))
+    corrected = transcription.corrected_experiment(phi)
+    if corrected.obstacles:
+        corrected = with_contact_energy(corrected)
     trajectory = simulate(
         corrected,
         transcription.body.theta_from_values(parameters),

@@ -349,7 +349,7 @@ def _solve_once(
                 scan, solution = _solve_from_scan(solver, solution, watch=watch)
             if warm_start is None and solution.method == ReducedSpace.name:
                 solution = best_of_second_start(solver, solution, watch=watch)
-            if warm_start is None:
+            if warm_start is None and any(body.has_memory for body in problem.bodies):
                 solution = with_ascending_times(solution, problem.parameters)
     except InputError as error:
         raise error.located(problem.path) from error

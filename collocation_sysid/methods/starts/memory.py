@@ -106,8 +106,8 @@ class _Table:
 
 
 def memory_start(collocation: Collocation, parameters: Parameters) -> Start | None:
-    """Return a start; None unless all recordings are harmonic tests or tables of a relaxation
-    modulus of specimens with the same branches, all of whose shares are estimated; or if the guesses
+    """Return a start of a fit of specimens; None unless all are harmonic tests or tables of a
+    relaxation modulus with the same branches, all of whose shares are estimated; or if the guesses
     are as good. `parameters` are those of the collocation, with guesses of all.
     """
     tables = [_Table.of(each.experiment) for each in collocation.transcriptions]

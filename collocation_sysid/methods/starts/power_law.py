@@ -142,9 +142,9 @@ class PowerLawStart(Start):
 
 
 def power_law_start(collocation: Collocation) -> PowerLawStart | None:
-    """Return the start of a law in powers of the stretches; None unless all recordings are tests of
-    homogeneous specimens of one such law, without memory, whose factors and exponents are all
-    estimated without ties and priors.
+    """Return the start of a law in powers of the stretches; None unless all recordings are, as
+    they must be, tests of homogeneous specimens, of one such law without memory, whose factors and
+    exponents are all estimated without ties and priors.
 
     Guesses are replaced, bounds are kept, except that the default bounds of the first term admit
     exponents of both signs. No constant is fixed if one of the law has a guess: who states a guess
@@ -206,7 +206,6 @@ class _PowerLawFits:
         if (
             len(laws) != 1
             or not is_power_law(law := laws.pop())
-            or any(each.specimen is None for each in experiments)
             or any(part.prony for part in parts)
             or not set(own) <= estimated
             or any(item.tied is not None for item in parameters.components)

@@ -106,10 +106,11 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
         `is_complete` to the end at none from the best one on.
     """
     usual = typical_parameters(collocation.parameters, SOFT_PA)
-    if (of_memory := memory_start(collocation, usual)) is not None:
+    are_specimens = all(each.experiment.specimen for each in collocation.transcriptions)
+    if are_specimens and (of_memory := memory_start(collocation, usual)) is not None:
         return of_memory
     unguessed = collocation.parameters.names_without_guess
-    start = power_law_start(collocation) if unguessed else None
+    start = power_law_start(collocation) if unguessed and are_specimens else None
     if start is not None:
         usual = typical_parameters(start.collocation.parameters, start.young_pa)
         return Start(collocation.with_parameters(usual), note=start.note)

@@ -21,18 +21,16 @@ MOST_HALVINGS = 10
 def homogeneous_equilibria(
     experiment: Experiment, dynamics: Dynamics, options: NewtonOptions, guess: Array | None
 ) -> Array | None:
-    """Return the stable equilibria (N, 3n) [m] of all rows of a specimen's dynamics.
+    """Return the stable equilibria (N, 3n) [m] of all rows of the dynamics of a specimen without
+    memory.
 
-    None if the body has a memory, or if a sample is not found: then the path of the samples before
-    it must be followed.
+    None if a sample is not found: then the path of the samples before it must be followed.
 
     Parameters
     ----------
     guess : (N, 3n) array, optional
         Equilibria at other parameters [m]; by default those of an incompressible material.
     """
-    if experiment.specimen is None or dynamics.body.has_memory:
-        return None
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     if (is_prescribed != is_prescribed[0]).any():
         return None

@@ -83,7 +83,8 @@ def _solve_equilibrium(
     solver: NewtonSolver,
 ) -> Array:
     shape = experiment.rigid_positions([at_s])[0]
-    forces = with_start_memory(forces, experiment.loaded_since_s)
+    if forces.body.has_memory:
+        forces = with_start_memory(forces, experiment.loaded_since_s)
     separate = _with_separate_obstacles(forces, shape)
 
     def equations(share: float) -> tuple[Residual, Linearise]:

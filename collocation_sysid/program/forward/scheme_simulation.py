@@ -112,9 +112,10 @@ def continue_simulation(
     if failure is not None:
         return x[:0] if known is None else known, failure
     options = options or NewtonOptions()
-    equilibria = homogeneous_equilibria(experiment, dynamics, options, approximate_solution)
-    if equilibria is not None:
-        return equilibria, None
+    if experiment.specimen is not None and not dynamics.body.has_memory:
+        equilibria = homogeneous_equilibria(experiment, dynamics, options, approximate_solution)
+        if equilibria is not None:
+            return equilibria, None
     solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
     v0 = np.zeros(x.shape[1])

@@ -4,7 +4,7 @@ For evaluations k = 1 … N − 1, in mean edge lengths ℓ as positions are,
 
     (b_k − h(ξ_{k−1}, ν_{k−1}, c_{k−1}, b_{k−1})) / ℓ = 0,   variables b_k / ℓ,
 
-see `model.custom_force_terms`; b_0 is zero. Of the Lagrangian's second derivatives, those by
+see `model.point_forces`; b_0 is zero. Of the Lagrangian's second derivatives, those by
 positions and parameters alone are computed together with the other forces (with other weights);
 those with b are computed here.
 """
