@@ -14,7 +14,7 @@ from kit.problems import uneven_box
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
-from collocation_sysid.recording import environment
+from collocation_sysid.recording import experiment as experiments
 from collocation_sysid.result import run_record, solve_progress
 
 BodyFactory = Callable[..., Body]
@@ -48,7 +48,7 @@ def _no_lines_of_slow_machines() -> Iterator[None]:
 def _no_air() -> Iterator[None]:
     """Bodies of tests are in a vacuum unless they say otherwise: most tests compare with theory."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(environment, "USUAL_KG_M3", 0.0)
+        patch.setattr(experiments, "USUAL_KG_M3", 0.0)
         yield
 
 

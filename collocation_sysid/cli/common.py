@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.text import Text
 
-from ..common.console import PlainConsole
-from ..common.display import Shown, on_terminal, plain_text
+from ..common.display import PlainConsole, Shown, on_terminal, plain_text
 
 if TYPE_CHECKING:
     from ..problem import Problem

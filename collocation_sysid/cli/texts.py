@@ -14,8 +14,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markdown import CodeBlock, Markdown
 from rich.text import Text
 
-from ..common.console import PlainConsole
-from ..common.display import Shown, Table
+from ..common.display import PlainConsole, Shown, Table
 from ..common.pages import glossary_terms, page_files, page_text, page_title, search_pages
 from ..common.serialisation import as_json as json_text
 from ..errors import InputError, hint_at, located
@@ -167,7 +166,7 @@ def _word_table(word: str) -> Table:
     from ..fem.laws.constants import KNOWN, constants_with_symbol, unit_of
     from ..recording.nuisance import nuisances_called
     from ..statistics.budget.systematic_effects import DEVIATIONS, source_label
-    from ..statistics.remedies import REMEDIES
+    from ..statistics.concerns import REMEDIES
 
     constants = [word] if word in KNOWN else constants_with_symbol(word)
     rows = [

@@ -4,9 +4,9 @@
   classes that users state in Python or in a problem file, their checks and descriptions.
 - `time_dependence`: fields that depend on time, their selection and interpolation.
 - `files`, `array_files`, `written_files`: reading and writing of files, completely or not at all.
-- `serialisation`: results as JSON; `display`: output as text, HTML and Markdown; `console`:
-  terminal output; `pages`: pages of the documentation.
+- `serialisation`: results as JSON; `display`: output as text, HTML and Markdown, in the
+  terminal too; `pages`: pages of the documentation.
 - `signal_handling`, `isolated_process`: interrupts, and work in a process of its own.
 - `step_counting`: progress of long operations; `machine`: available memory; `cluster`: Dask.
-- `array_types`: array types for annotations; `unique_codes`: sorted sets of integers.
+- `array_types`: array types for annotations.
 """

@@ -25,7 +25,7 @@ from ..recording.measurement import Measurement
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen import STRESS_NAME
 from ..recording.specimen_files import moduli_of
-from ..statistics.instrument_misfit import InstrumentMisfit, misfit
+from ..statistics.assessment import InstrumentMisfit, misfit
 from .measurement_results import PredictionErrors, PredictionResiduals
 
 # Share of the samples below which a note says what is missing, and most names in it.

@@ -7,7 +7,6 @@ Bodies:
 - `regions`: parts of a body with their own material, and the vector θ of all constants.
 - `spatial_field`: constants that vary in space.
 - `rest_shape`, `rest_point_layout`: stress-free shape of a body that was scanned under gravity.
-- `air`: buoyancy, added mass and drag of the surrounding air.
 
 Packages:
 
@@ -18,7 +17,8 @@ Packages:
 Elements and forces:
 
 - `elements`: shape functions, quadrature, mass lumping.
-- `node_force`, `force_points`, `contact_surface`: forces on nodes and faces, and contact points.
+- `node_force`, `force_points`, `contact_surface`: forces on nodes and faces, such as
+  those of the air, and contact points.
 - `shape`: lengths and volumes as functions of node positions.
 
 Assembly:

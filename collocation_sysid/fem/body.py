@@ -32,7 +32,6 @@ from ..common.array_types import Array
 from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
-from .air import placed_unit_drag
 from .discretisation import Discretisation
 from .elements import ROD, element_named
 from .laws.constants import DENSITY, NATURAL_STRAINS, Constant
@@ -42,7 +41,7 @@ from .laws.memory import MemoryInput
 from .laws.stress import StressEvaluator
 from .meshes.mesh import TetMesh
 from .meshes.selection import Selection
-from .node_force import LocatedForce, NodeForce
+from .node_force import LocatedForce, NodeForce, placed_unit_drag
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
@@ -709,7 +708,7 @@ class Body(Discretisation):
 
     @cached_property
     def unit_air_drag(self) -> LocatedForce:
-        """Drag on the surface in a fluid of density 1 kg/m³, see `air`."""
+        """Drag on the surface in a fluid of density 1 kg/m³, see `node_force`."""
         return placed_unit_drag(self.nodes, self.sum_dof_volumes_m3()[::3])
 
     def sum_dof_volumes_m3(self) -> Array:

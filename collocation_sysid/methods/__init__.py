@@ -16,7 +16,7 @@ Start
 Common
     `solution` defines the protocol of methods and the result, `solve_recorder` the history,
     `best_iterate` the answer after an interruption, `options` the construction of methods from
-    options by name, `nlpsol` and `callbacks` the interface to CasADi's solvers.
+    options by name, `nlpsol` the interface to CasADi's solvers.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
-from ..common.unique_codes import unique_codes
+from ..fem.pattern import unique_codes
 from ..program.collocation import Collocation
 from ..program.linear_algebra.sparse_assembly import SparseAssembly
 from ..program.transcription import Transcription

@@ -29,5 +29,4 @@ Equations in discrete time:
 - `dynamics`: discrete equations of motion of an experiment.
 - `equations_at_parameters`: these equations at given parameters, with the chain rule.
 - `grasp_constraint`: prescribed displacements of grasped nodes, as a function of φ.
-- `numerical_damping`: damping and period error of a scheme.
 """

@@ -21,10 +21,9 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..common.time_dependence import LOAD, over_time
-from ..fem.air import unit_drag
 from ..fem.body import Linearisation, SecondDerivatives
 from ..fem.force_points import ForcePoints
-from ..fem.node_force import CONTEXT_SIZE, LocatedForce, NodeForce
+from ..fem.node_force import CONTEXT_SIZE, LocatedForce, NodeForce, unit_drag
 from ..fem.pattern import SymmetricPattern
 from .force_term import AssemblyIndices, ForceTerm, States
 from .generated_functions import GeneratedFunction

@@ -7,7 +7,7 @@ mass-proportional damping γ_m,
     F_k = (M(u_k) − D) g + f_k + Σ_l s_l,k (f_l,k − γ_m m_l ν_k),    c_t ∋ −(M(ū_t) + A) a_t.
 
 D is the mass of the air that the body displaces and A the added mass of the air that moves with it,
-on which neither γ_m nor gravity acts, see `fem.air`. ū_t is the mean over the evaluations with the
+on which neither γ_m nor gravity acts, see `fem.node_force`. ū_t is the mean over the evaluations with the
 weights of row t, so that a free fall continues unchanged, whatever joins the body. Inputs are
 gravity, where a parameter rotates it, and each s_l as a change from the stated share.
 """
@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
 from ..common.time_dependence import LOAD, PARTS_OVER_TIME, over_time
-from ..fem.air import ADDED_MASS_SHARE
 from ..fem.body import Body, Linearisation, SecondDerivatives
+from ..fem.node_force import ADDED_MASS_SHARE
 from ..fem.regions import Theta
 from ..recording.experiment import Experiment
 from ..recording.loads import Force, PointMass

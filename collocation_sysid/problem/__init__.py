@@ -2,10 +2,9 @@
 
 `problem` defines `Problem`, and `options` its options for checks and uncertainties. The
 other modules read a problem file: `reading` parses and validates it, `loading` converts it
-to a problem, `recording_reader` reads the files of one experiment (`marker_tracking` its markers,
-`recording_frames` the frames of logs, `code_loader` Python files, `named_files` finds those that a
-key names, `bench_files` tables of a test bench, `density_guesses` the mass), and `size`
-estimates memory and time; `specimen_reader` reads tests without a mesh, and `gripper_transforms`
+to a problem, `recording_reader` reads the files of one experiment (`recording_frames` its
+markers and the frames of logs, `code_loader` Python files, `bench_files` tables of a test bench), and
+`size` estimates memory and time; `specimen_reader` reads tests without a mesh, and `gripper_transforms`
 the poses of bodies in grippers. `schema`, `recording_schema`, `camera_section` (a
 `measurement_section`, which reads its own files), `nuisance_schema`, `specimen_schema` and
 `solver_schema` define the keys, those of declared classes by reference to these

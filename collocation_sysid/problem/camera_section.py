@@ -16,8 +16,12 @@ from ..recording.depth_camera import points_from_image, samples_with_outlines
 from ..recording.sources.depth_files import DepthFileContent, read_depth
 from ..recording.sources.units import METRES_PER_UNIT
 from ..recording.time_tables import is_within_experiment
-from .measurement_section import MeasurementSection, RecordingFolder, require_file_name
-from .named_files import existing_file
+from .measurement_section import (
+    MeasurementSection,
+    RecordingFolder,
+    existing_file,
+    require_file_name,
+)
 
 
 class DepthCameraSection(Section, of=DepthCamera):

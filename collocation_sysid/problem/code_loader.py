@@ -19,7 +19,7 @@ from ..fem.laws.materials import Energy, Material
 from ..fem.node_force import NodeForce
 from ..recording.deviation import Deviation
 from ..recording.node_selection import selection_from_section
-from .named_files import existing_file
+from .measurement_section import existing_file
 from .nuisance_schema import CustomNuisanceSection
 from .schema import CodeSection, NodeForceSection
 

@@ -19,11 +19,11 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, create_model
 
 from ..common.array_types import Array
+from ..common.files import require_regular
 from ..common.schema_tables import Section
-from ..errors import InputError, located
+from ..errors import InputError, hint_at, located
 from ..recording.sources.logs import stored_files
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
-from .named_files import existing_file
 
 # Group of the entry points of other packages: the key of a list of tables within
 # [[experiment]], and the class of the tables, a `MeasurementSection`.
@@ -168,3 +168,28 @@ def _type_of(entry: EntryPoint) -> Any:
         raise ValueError(message)
 
     return Annotated[Any, BeforeValidator(refuse)]
+
+
+def existing_file(folder: Path, name: str, key: str) -> Path:
+    """Return the path of a file that a key of the problem file names, relative to `folder`; `name`
+    may also be a topic of a log, as "log#topic", or an absolute path.
+
+    Raises
+    ------
+    InputError
+        At `key`, if it does not exist, is a folder or no regular file.
+    """
+    file = folder / name
+    require_regular(file, key)
+    if not stored_files(file):
+        fault = "is a folder" if file.is_dir() else "does not exist"
+        hint = folder / "README.md"
+        see = f"; {hint} may explain how to get it" if hint.is_file() else ""
+        beside = [each.name for each in file.parent.iterdir()] if file.parent.is_dir() else []
+        similar = hint_at(file.name, sorted(beside)) if not file.exists() else ""
+        message = (
+            f"{file} {fault}; expected a file: the path is relative to the folder of the problem "
+            f"file{similar}{see}"
+        )
+        raise InputError(message, where=key)
+    return file

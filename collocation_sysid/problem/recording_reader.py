@@ -49,16 +49,15 @@ from ..recording.sources.units import UNITS, si_factor
 from ..recording.time_tables import is_within_experiment
 from .bench_files import strain_length_m
 from .code_loader import CodeLoader
-from .marker_tracking import (
+from .measurement_section import RecordingFolder, existing_file
+from .nuisance_schema import nuisance_from_section
+from .recording_frames import (
+    RecordingFrames,
     gripper_markers,
     poses_from_markers,
     read_marker_tracks,
     transform_to_body_frame,
 )
-from .measurement_section import RecordingFolder
-from .named_files import existing_file
-from .nuisance_schema import nuisance_from_section
-from .recording_frames import RecordingFrames
 from .recording_schema import (
     LOADS,
     MEASUREMENT_TABLES,

@@ -27,7 +27,7 @@ from ..fem.rods import LAWS as ROD_LAWS
 from ..fem.schemes import MOST_STEPS, SCHEMES
 from ..fem.spatial_field import Field as SpatialField
 from ..model.parameters import Unknown
-from ..recording.environment import usual_air_density
+from ..recording.experiment import usual_air_density
 from ..recording.node_selection import Nodes
 from ..statistics.budget.systematic_effects import Assumptions, ExactIfNone
 from .options import RolloutOptions, UncertaintyOptions

@@ -23,7 +23,7 @@ from ..recording.specimen_checks import (
     rows_after_cycles,
 )
 from ..recording.specimen_files import SpecimenLayout, SpecimenTable, read_specimen
-from .named_files import existing_file
+from .measurement_section import existing_file
 from .specimen_schema import SpecimenSection, deviation
 
 # Strain of the first sample, over the largest, above which a memory's unknown past matters.

@@ -7,8 +7,8 @@ Transcription
     measurements; `association` states where on the body and in time these are evaluated,
     `experiment_iterate` is one experiment at given variables, and `shared_nuisances` has the
     nuisance parameters that experiments have in common. `motion_jacobian` lays out the sparse
-    Jacobian, `local_loss` the Hessian of the loss, and `lifted` the program in which
-    variables that are otherwise eliminated have equations of their own.
+    Jacobian, and `lifted` the program in which variables that are otherwise eliminated have
+    equations of their own.
 Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the
     equations of motion, and `measurement_residual` compares them with data. A `measurement_model`

@@ -11,17 +11,16 @@ Begin with `experiment` (one recording with all its parts). Its parts are in:
 - `custom_sensor`: custom sensors.
 - `measurement`: what all measurements have in common.
 - `nuisance`: unknowns of a single recording, with their priors.
-- `environment`: the density of the air.
 - `specimen`, `specimen_stretches`, `homogeneous_deformation`: material tests without a mesh;
   `specimen_files` reads their tables, and `specimen_checks` finds mistakes and cycles in them.
 
 Files are read by `marker_files` (markers), `pose_files` (poses), `time_tables` (forces,
 displacements, pressures, custom sensors) and the subpackage `sources`; `writers` writes
-them. `alignment`, `sample_times`, `frame_times`, `gap_interpolation` and `rigid_fit` prepare data:
-one time grid, sample times, samples of lost or jittered frames, interpolation between consecutive
+them. `alignment`, `sample_times`, `gap_interpolation` and `rigid_fit` prepare data:
+one time grid with lost or jittered frames, sample times, interpolation between consecutive
 samples, rigid fits. `experiment_refinement` and
 `experiment_coarsening` move an experiment to a finer or coarser mesh by `experiment_on_body`,
-`rotation_per_step` finds the fastest rotation of its grasps, `measurement_selection` copies it with a
+`measurement_selection` copies it with a
 part of its measurements, and `node_selection` checks selections of nodes.
 """
 

@@ -18,11 +18,11 @@ from ..common.declarations import declaration, key
 from ..common.schema_tables import ByForm, Vector
 from ..common.validated_types import Finite, Flag, NotNegative
 from ..errors import InputError, listed
+from ..fem.node_force import AIR_KG_M3
 from .actuator import Actuator
 from .custom_sensor import CustomSensor
 from .depth_camera import Depth
 from .deviation import Deviation
-from .environment import air_density, usual_air_density
 from .grasp import Grasp, free_rigid_motions, prescribed_dofs
 from .homogeneous_deformation import HomogeneousDeformation
 from .loads import Force, LoadTime, PointMass, smooth_ramp
@@ -74,6 +74,39 @@ def _temperature(value: ArrayLike) -> Array:
     """Return times [s] and temperature differences [K] as (k, 2), from a table or one number."""
     table = [[0.0, value]] if np.ndim(value) == 0 else value
     return float_converter((None, 2), "temperature_difference_k")(table)
+
+
+VACUUM = "none"
+# Density of the air around experiments that state none [kg/m³].
+USUAL_KG_M3: float = AIR_KG_M3
+
+
+def usual_air_density() -> float:
+    """Return `USUAL_KG_M3`, the density of the air around experiments that state none [kg/m³], as
+    it is at the time of the call.
+    """
+    return USUAL_KG_M3
+
+
+def air_density(value: float | Literal["none"]) -> float:
+    """Return a stated density of the air [kg/m³]; zero for "none", a vacuum.
+
+    Raises
+    ------
+    InputError
+        If it is neither "none" nor a finite number of at least zero; booleans and numbers as text
+        are refused.
+    """
+    if isinstance(value, str) and value == VACUUM:
+        return 0.0
+    is_number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    density_kg_m3 = float(value) if is_number else np.nan
+    if not 0 <= density_kg_m3 < np.inf:
+        raise InputError(
+            f"air_density_kg_m3 is {value!r}; expected a density in kg/m³ such as {AIR_KG_M3}, or "
+            f'"{VACUUM}" for a vacuum or a recording simulated without air'
+        )
+    return density_kg_m3
 
 
 @declaration

@@ -41,8 +41,7 @@ from ..runs.result_content import UNMOVED, Elapsed, Result
 from ..statistics.assessment import Assessment
 from ..statistics.budget.effect_estimates import effect_row
 from ..statistics.budget.systematic_effects import source_label
-from ..statistics.concerns import Concern, topics_of
-from ..statistics.remedies import remedy_for
+from ..statistics.concerns import Concern, remedy_for, topics_of
 from .picture_captions import captioned_pictures
 from .replay import LARGEST_NUMBER, damaged_run_refused, read_arrays
 

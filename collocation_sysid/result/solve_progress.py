@@ -17,8 +17,7 @@ from typing import Self
 from rich.console import Console, Group
 from rich.text import Text
 
-from ..common.console import Watched
-from ..common.display import Shown, Table, on_terminal
+from ..common.display import Shown, Table, Watched, on_terminal
 from ..common.step_counting import SEARCH, listen_to_activities, listen_to_shares, listen_to_states
 from ..fem.laws.constants import symbol_of, unit_of
 from ..methods.solution import Iteration

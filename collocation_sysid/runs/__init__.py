@@ -1,10 +1,8 @@
 """Runs: the operations on a problem, and their results.
 
 - `check`: examine a problem before it is solved.
-- `solving`: solve it,
-`second_start` and `several_starts` for local minima, `warm_start` for a start from an earlier run,
-`smaller_problem` for starts from smaller problems: `coarse_start` on a coarser mesh, and
-`thinned_start` with fewer points of cameras.
+- `solving`: solve it, `several_starts` for local minima, `warm_start` for a start from an earlier run,
+`smaller_problem` for starts from smaller problems: on a coarser mesh, and with fewer points of cameras.
 - `forward_simulation`, `prediction`: simulate recordings with the estimates, and compare with the
 measurements.
 - `verdict`: concerns about a solution; `mesh_resolution`: concerns about too coarse meshes;

@@ -44,7 +44,7 @@ from ..statistics.combinations import (
 from ..statistics.estimates import relative_derivatives
 from ..statistics.linearised import LinearisedFit, linearise_fit
 from ..statistics.uncertainty import ErrorModel, uncertainty_from_fit
-from .coarse_start import sample_distance
+from .smaller_problem import sample_distance
 
 # Errors of measurements that were not made.
 EXACT_NOISE = ErrorModel("given", "independent")

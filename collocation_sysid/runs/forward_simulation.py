@@ -24,17 +24,16 @@ from ..program.measured_motion import residual_changes, simulated_values
 from ..program.simulation import Trajectory, simulate
 from ..program.transcription import Transcription
 from ..recording import Experiment
-from ..statistics.assessment import largest_deviation
+from ..statistics.assessment import InstrumentMisfit, largest_deviation
 from ..statistics.budget.discretisation_error import (
     Refinement,
     change_in_observations,
     discretisation_errors,
 )
 from ..statistics.estimates import Estimate
-from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.linearised import LinearisedFit, parameter_values
-from .coarse_start import sample_distance
 from .prediction import nearest_recording_error, nuisance_of_fitted_recordings, unknown_onsets
+from .smaller_problem import sample_distance
 
 # Least ratio of grid step and simulation step for an estimate of the step's error: half, rounded.
 LEAST_STEP_RATIO = 1.99

@@ -24,7 +24,7 @@ from ..program.transcription import Transcription
 from ..recording import Experiment
 from ..recording.nuisance import CLOCK_RATE, DEPTH_TIME, JOINING, OBSTACLE_TIME, SENSOR_TIME, TIME
 from ..recording.sample_times import TIME_TOLERANCE_S
-from ..statistics.instrument_misfit import InstrumentMisfit
+from ..statistics.assessment import InstrumentMisfit
 
 
 def fit_misfits(solution: Solution) -> dict[str, list[InstrumentMisfit]]:

@@ -22,8 +22,8 @@ from ..statistics.budget.combined_intervals import ReportedEstimate
 from ..statistics.budget.discretisation_error import DiscretisationError, known_kinds
 from ..statistics.budget.effect_estimates import EffectEstimate, JointPosterior
 from ..statistics.combinations import Combination, Direction
+from ..statistics.concerns import remedy_for
 from ..statistics.profile_likelihood import Profile
-from ..statistics.remedies import remedy_for
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.scale_identifiability import ScaleReference
 from ..statistics.uncertainty import MarkerPlace

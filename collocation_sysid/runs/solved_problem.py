@@ -47,7 +47,7 @@ from ..statistics.linearised import DerivedModuli, LinearisedFit
 from ..statistics.profile_likelihood import Profile
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
-from .check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
+from .check.body import grasp_extent_concerns, grasp_extent_notes
 from .check.modes import ModesCheck
 from .ensemble import draw_samples
 from .forward_simulation import ForwardSimulation

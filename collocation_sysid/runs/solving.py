@@ -31,12 +31,16 @@ from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from .branch_order import with_ascending_times
 from .check.cost import require_memory
-from .coarse_start import CoarseStart
 from .prediction import fit_misfits
-from .second_start import second_start, start_beyond_bounds, without_limitless_shares
-from .several_starts import KnownMinimum, follow_starts, until_known
-from .smaller_problem import NoStartError, SmallerProblem
-from .thinned_start import ThinnedStart
+from .several_starts import (
+    KnownMinimum,
+    follow_starts,
+    second_start,
+    start_beyond_bounds,
+    until_known,
+    without_limitless_shares,
+)
+from .smaller_problem import CoarseStart, NoStartError, SmallerProblem, ThinnedStart
 from .warm_start import WarmStart
 
 
@@ -94,9 +98,9 @@ def solve(
 
     There may be several searches, one after another: from the results of a scan, if guesses are
     missing or a search from guesses fails; a second one in reduced space, where the first may have
-    ended in a worse optimum or on the way, see `second_start`; with correspondences of measurements that
+    ended in a worse optimum or on the way, see `several_starts`; with correspondences of measurements that
     the estimates change; with other correlation lengths of fields; and, of a large body,
-    one on a coarser mesh first, see `coarse_start`. `watch` receives the iterations of all of them,
+    one on a coarser mesh first, see `smaller_problem`. `watch` receives the iterations of all of them,
     and one of them gives the solution: its history and counts are of that search alone, and its
     times too, with those of the search on a coarser mesh if it started from there. Nothing is
     written.

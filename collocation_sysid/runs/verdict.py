@@ -18,8 +18,9 @@ from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
 from ..program.transcription import Transcription
 from ..recording.nuisance import TIME
-from ..recording.rotation_per_step import DOUBTFUL_ANGLE_RAD
 from ..statistics.assessment import (
+    DOUBTFUL_ANGLE_RAD,
+    InstrumentMisfit,
     clock_concerns,
     fit_concerns,
     forward_simulation_concerns,
@@ -36,7 +37,6 @@ from ..statistics.assessment import (
     validation_concerns,
 )
 from ..statistics.concerns import Concern, Grade
-from ..statistics.instrument_misfit import InstrumentMisfit
 from ..statistics.plausibility import (
     copied_measurements,
     density_concerns,

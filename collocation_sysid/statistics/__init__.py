@@ -10,7 +10,7 @@ Error bars
     spatially varying constants.
 Combined intervals
     The package `budget` adds the discretisation error and systematic effects (type B) and computes
-    the intervals to publish. `remedies` says what to measure.
+    the intervals to publish.
 Checks
     `identifiability` and `scale_identifiability` describe what the data determine. `hypothesis` is a
     likely mistake in the description, which the package `judge` finds (`axes`: exchanged or reversed

@@ -9,24 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from ..common.array_types import Array
+from ..common.array_types import Array, root_mean
 from ..common.display import predicted_change
 from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
 from ..recording.deviation import Deviation, in_readable_unit
 from ..recording.experiment import Experiment
 from ..recording.impact_steps import impact_steps
-from ..recording.rotation_per_step import WARNING_ANGLE_RAD, fastest_rotation
 from .budget.discretisation_error import Refinement
 from .concerns import Concern, Grade, concern_if
 from .distributions import chi2_sf, normal_isf
 from .estimates import Estimate, display_name, limitless_shares
 from .hypothesis import Hypothesis
-from .instrument_misfit import InstrumentMisfit
 from .residuals.autocorrelation import Dependence
 from .residuals.diagnostics import MOST_WILD
 from .residuals.noise_level import NoiseLevel
@@ -77,6 +76,13 @@ HIDING = "it hides another error, such as a law that is too simple, or a wrong u
 FEW_IMPACT_STEPS = 2.0
 # Code of the concern about a measured discretisation error.
 NUMERICAL = "mesh/refined"
+# Rotation within a grid step [rad] above which there is a warning: it seems a strain of 4e-4.
+WARNING_ANGLE_RAD = 0.055
+# Rotation within a grid step [rad] that the recommended substeps reach; below FAST for rounding.
+TARGET_ANGLE_RAD = 0.05
+# Rotation within a grid step [rad] that makes the result doubtful: it seems a strain of 1e-3.
+DOUBTFUL_ANGLE_RAD = 0.1
+_KEY = "transcription.substeps"
 
 
 @dataclass(frozen=True)
@@ -669,3 +675,94 @@ def rms_expected_from_noise_m(
         return 0.0
     remaining = max(0.0, 1 - parameter_count / float(numbers.sum()))
     return float(np.sqrt(remaining * (numbers @ sigma_m**2) / samples.sum()))
+
+
+@dataclass(frozen=True)
+class GraspRotation:
+    """The largest rotation of a grasp between two times of the grid."""
+
+    experiment: str
+    angle_rad: float  # angle of the rotation within the step
+    time_s: float  # begin of the step
+    step_s: float  # length of the step
+    # What to change in the problem, for messages: the substeps that reduce the angle to
+    # `TARGET_ANGLE_RAD`, or, for poses held between samples, a smooth interpolation.
+    remedy: str
+
+
+def fastest_rotation(experiment: Experiment, substeps: int) -> GraspRotation:
+    """Return the largest rotation of an experiment's grasps and obstacles within a step of the time
+    grid, while they are active.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        Of a static experiment the angle is 0, as there are no steps, and the time that of the first
+        sample.
+    substeps : int
+        Steps per sample.
+    """
+    step_s = experiment.timestep_s / substeps
+    steps = (len(experiment.t_s) - 1) * substeps
+    t_s = experiment.t_s[0] + step_s * np.arange(steps + 1)
+    largest = 0.0
+    time_s = float(t_s[0])
+    is_rigid_grasp = False
+    for grasp in () if experiment.is_static else experiment.grasps:
+        times_s = t_s[grasp.is_active(t_s)]
+        if len(times_s) < 2:
+            continue
+        rotations = grasp.poses.at(times_s)[0]
+        # tr RᵀQ = 1 + 2 cos θ loses small angles to rounding; |R − Q|² = 8 sin²(θ/2) does not.
+        chords = np.linalg.norm(np.diff(rotations, axis=0), axis=(1, 2))
+        k = int(np.argmax(chords))
+        angle = 2 * float(np.arcsin(min(1.0, chords[k] / np.sqrt(8))))
+        if angle > largest:
+            largest = angle
+            time_s = float(times_s[k])
+            is_rigid_grasp = grasp.poses.interpolation == "hold"
+    needed = max(1, ceil(substeps * largest / TARGET_ANGLE_RAD))
+    # A pose that is held turns by as much at a sample, however many steps there are between.
+    remedy = (
+        'set interpolation = "smooth" in the grasp' if is_rigid_grasp else f"set {_KEY} = {needed}"
+    )
+    return GraspRotation(experiment.name, largest, time_s=time_s, step_s=step_s, remedy=remedy)
+
+
+@dataclass(frozen=True)
+class InstrumentMisfit:
+    """Differences between a prediction and the measurements of one kind, in stated σ."""
+
+    what: str  # what is measured, for people
+    sigma_key: str  # key of σ in the problem, for people
+    sigmas: float  # root mean square of the differences over σ
+    # The same without outliers of depth, see `DepthError`; predictions are judged by it.
+    robust_sigmas: float
+    count: int  # number of measured values
+    size: str = ""  # root mean square in a unit, for people; empty if units differ
+
+    @property
+    def size_text(self) -> str:
+        """`size`, or without one the multiple of σ in words."""
+        return self.size or f"{self.sigmas:.3g} times {self.sigma_key}"
+
+
+def misfit(what: str, declared_size: str, ratio: Array, size: str = "") -> InstrumentMisfit:
+    """Return the misfit of one instrument; its RMS is that of the values that are finite.
+
+    Parameters
+    ----------
+    what : str
+        The instrument, for messages.
+    declared_size : str
+        Name of its stated σ, for messages.
+    ratio : array
+        Differences over σ; NaN is ignored.
+    size : str
+        RMS with its unit, for messages; "" if there is none.
+    """
+    known = ratio[np.isfinite(ratio)]
+    sigmas = root_mean(known**2)
+    return InstrumentMisfit(
+        what, declared_size, sigmas=sigmas, robust_sigmas=sigmas, count=known.size, size=size
+    )

@@ -26,9 +26,9 @@ from collocation_sysid import (
     simulate,
     with_markers,
 )
-from collocation_sysid.fem.air import DRAG_COEFFICIENT, FACING_SHARE
 from collocation_sysid.fem.laws.constants import GAMMA_R
 from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw, rayleigh
+from collocation_sysid.fem.node_force import DRAG_COEFFICIENT, FACING_SHARE
 from collocation_sysid.statistics.budget.shape_error import (
     SURFACE_MODES,
     surface_modes,

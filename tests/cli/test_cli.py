@@ -36,7 +36,7 @@ from rich.console import Console
 import collocation_sysid as cs
 from collocation_sysid import cli, pipeline
 from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sources, common
-from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.common.display import PlainConsole
 from collocation_sysid.judge import engine
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.starts import stiffness_scan
@@ -44,7 +44,7 @@ from collocation_sysid.methods.starts.start import Start
 from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
-from collocation_sysid.recording.environment import usual_air_density
+from collocation_sysid.recording.experiment import usual_air_density
 from collocation_sysid.result import run_record
 from collocation_sysid.result import solve_progress as progress_shown
 from collocation_sysid.result.solve_progress import Heartbeat

@@ -16,8 +16,7 @@ from kit.problem_files import run_command
 import collocation_sysid as cs
 from collocation_sysid import Problem, run
 from collocation_sysid.cli.texts import TerminalPage, _key_table, _word_table
-from collocation_sysid.common.console import PlainConsole
-from collocation_sysid.common.display import Table, plain_text
+from collocation_sysid.common.display import PlainConsole, Table, plain_text
 from collocation_sysid.common.pages import page_files, page_text, page_url
 from collocation_sysid.fem.laws.constants import KNOWN, constants_with_symbol
 from collocation_sysid.problem.key_descriptions import all_keys, find_keys
@@ -27,8 +26,7 @@ from collocation_sysid.result.run_sections import remedy_command, remedy_lines
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, source_label
-from collocation_sysid.statistics.concerns import TOPICS, Concern
-from collocation_sysid.statistics.remedies import REMEDIES
+from collocation_sysid.statistics.concerns import REMEDIES, TOPICS, Concern
 
 CONCERNS = (Concern("residuals/persist"), Concern("scheme/damping"), Concern("solve/no-start"))
 

@@ -9,12 +9,12 @@ import pytest
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
 
-from collocation_sysid.common.console import PlainConsole
 from collocation_sysid.common.display import (
     Cards,
     Line,
     Listing,
     Picture,
+    PlainConsole,
     Shown,
     Span,
     Table,

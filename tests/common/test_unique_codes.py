@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from collocation_sysid.common.unique_codes import unique_codes
+from collocation_sysid.fem.pattern import unique_codes
 
 
 def test_codes_of_all_groups_ascend_and_occur_once(rng):

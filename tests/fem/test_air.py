@@ -28,7 +28,7 @@ from scipy.integrate import solve_ivp
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.fem.air import AIR_KG_M3, SMOOTH_BELOW_M_S
+from collocation_sysid.fem.node_force import AIR_KG_M3, SMOOTH_BELOW_M_S
 from collocation_sysid.judge.posterior import BudgetLine, Effects, Posterior
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.model.force_term import States

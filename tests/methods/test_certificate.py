@@ -10,9 +10,8 @@ from kit.lifted import of_branches, swung
 from kit.memories import ONE
 from kit.problems import GUESS, hung_cube, measured, noisy
 
-from collocation_sysid.methods.certificate import certify
 from collocation_sysid.methods.horizon import Horizon
-from collocation_sysid.methods.interior_point import InteriorPoint
+from collocation_sysid.methods.interior_point import InteriorPoint, certify
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem

@@ -19,7 +19,7 @@ from collocation_sysid.model.parameters import (
     is_default_bound,
     with_widest_bounds,
 )
-from collocation_sysid.runs.second_start import start_beyond_bounds
+from collocation_sysid.runs.several_starts import start_beyond_bounds
 from collocation_sysid.runs.solving import continued_beyond_bounds
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern

@@ -11,7 +11,7 @@ from kit.problems import hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.runs import solving
-from collocation_sysid.runs.second_start import NEARLY_INCOMPRESSIBLE, second_start
+from collocation_sysid.runs.several_starts import NEARLY_INCOMPRESSIBLE, second_start
 from collocation_sysid.runs.solving import best_of_second_start
 
 KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}

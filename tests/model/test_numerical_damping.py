@@ -9,11 +9,7 @@ from kit.oscillations import oscillation, released_in_a_mode
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.schemes import SCHEMES
-from collocation_sysid.model.numerical_damping import (
-    numerical_mode,
-    principal_root,
-    substeps_needed,
-)
+from collocation_sysid.runs.check.modes import numerical_mode, principal_root, substeps_needed
 
 EULER, MIDPOINT, BDF2 = (SCHEMES[name] for name in ("backward-euler", "midpoint", "bdf2"))
 STEP_S = 0.01

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.program.forward.extrapolation import next_value
 from collocation_sysid.program.forward.newton_solver import NewtonSolver
+from collocation_sysid.program.forward.scheme_simulation import next_value
 
 
 def test_polynomial_is_continued_exactly() -> None:

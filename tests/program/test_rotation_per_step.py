@@ -16,9 +16,8 @@ from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate
 from collocation_sysid.recording import Experiment, Grasp
 from collocation_sysid.recording.poses import Interpolation
-from collocation_sysid.recording.rotation_per_step import fastest_rotation
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.statistics.assessment import rotation_step_concerns
+from collocation_sysid.statistics.assessment import fastest_rotation, rotation_step_concerns
 
 STEPS, FINEST = 8, 32
 

@@ -139,7 +139,6 @@ def test_a_problem_is_solved_without_the_judge(tmp_path):
 # The methods that need sparse exact matrices, and what checks or measures their programs.
 LIFTING = (
     "program.lifted",
-    "methods.certificate",
     "methods.interior_point",
     "methods.starts.initial_point",
     "methods.complementarity",

@@ -20,7 +20,7 @@ from collocation_sysid.recording import (
     read_markers,
     write_markers_csv,
 )
-from collocation_sysid.recording.frame_times import assign_frames
+from collocation_sysid.recording.alignment import assign_frames
 
 RATE_HZ = 30.0
 COUNT = 77

@@ -23,7 +23,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.cli import common
-from collocation_sysid.common.console import PlainConsole
+from collocation_sysid.common.display import PlainConsole
 from collocation_sysid.errors import InputError
 from collocation_sysid.extras.live.frames import FrameReader
 from collocation_sysid.problem import Problem

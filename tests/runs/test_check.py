@@ -25,13 +25,11 @@ from kit.problems import TRUTH, bar_in_two_hands, hung_cube
 from kit.static import block
 
 from collocation_sysid.cli import common
-from collocation_sysid.common.console import PlainConsole
-from collocation_sysid.common.display import plain_text
+from collocation_sysid.common.display import PlainConsole, plain_text
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.schemes import SCHEMES, as_scheme
-from collocation_sysid.model.numerical_damping import numerical_mode
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording.obstacle import Obstacle
 from collocation_sysid.recording.obstacle_solids import Sphere
@@ -52,7 +50,13 @@ from collocation_sysid.runs.check.cost import (
     search_factor,
 )
 from collocation_sysid.runs.check.derivatives import shortened_problem
-from collocation_sysid.runs.check.modes import ModeCheck, ModesCheck, check_modes, mode_concerns
+from collocation_sysid.runs.check.modes import (
+    ModeCheck,
+    ModesCheck,
+    check_modes,
+    mode_concerns,
+    numerical_mode,
+)
 from collocation_sysid.statistics.concerns import Concern
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.

@@ -28,9 +28,9 @@ from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.simulation import with_markers
 from collocation_sysid.recording import Experiment, Force, Nuisance, PointMass
 from collocation_sysid.recording.experiment_coarsening import coarse_experiment, node_sets
-from collocation_sysid.runs import coarse_start
-from collocation_sysid.runs.coarse_start import CoarseStart
+from collocation_sysid.runs import smaller_problem
 from collocation_sysid.runs.forward_simulation import simulate_experiments
+from collocation_sysid.runs.smaller_problem import CoarseStart
 from collocation_sysid.runs.solving import solve
 
 DIVISIONS = (5, 5, 5)
@@ -237,8 +237,8 @@ def test_a_search_with_many_samples_starts_with_a_part(monkeypatch):
     assert coarse_note(direct) == ""
     simulated = simulate_experiments(problem, direct)["hung cube"]
     assert simulated.trajectory.steps_per_sample == 4
-    monkeypatch.setattr(coarse_start, "MANY_SAMPLES", 60)
-    monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 12)
+    monkeypatch.setattr(smaller_problem, "MANY_SAMPLES", 60)
+    monkeypatch.setattr(smaller_problem, "FEWEST_SAMPLES", 12)
     start = CoarseStart.of(problem, ReducedSpace())
     assert start is not None
     (some,) = start.problem.experiments
@@ -256,8 +256,8 @@ def test_a_search_with_many_samples_starts_with_a_part(monkeypatch):
 
 
 def test_all_samples_of_fast_motions_and_of_other_sensors_are_the_start(monkeypatch):
-    monkeypatch.setattr(coarse_start, "MANY_SAMPLES", 10)
-    monkeypatch.setattr(coarse_start, "FEWEST_SAMPLES", 4)
+    monkeypatch.setattr(smaller_problem, "MANY_SAMPLES", 10)
+    monkeypatch.setattr(smaller_problem, "FEWEST_SAMPLES", 4)
     (swing,) = finely_sampled().experiments
     ripple_m = 0.02 * np.sin(np.arange(len(swing.t_s)) * np.pi / 2)[:, None, None]
     tracks = with_markers(swing, swing.markers.positions_m + ripple_m)

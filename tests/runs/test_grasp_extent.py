@@ -14,7 +14,7 @@ from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.grasp_extent import grasp_extent_concerns, grasp_extent_notes
+from collocation_sysid.runs.check.body import grasp_extent_concerns, grasp_extent_notes
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 # A cube of 100 mm with layers of nodes every 20 mm along z.

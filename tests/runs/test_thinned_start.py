@@ -15,9 +15,8 @@ from collocation_sysid.methods.horizon import Horizon
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.program.depth.surface_correspondences import SurfaceCorrespondences
-from collocation_sysid.runs import several_starts, thinned_start
-from collocation_sysid.runs.smaller_problem import NoStartError
-from collocation_sysid.runs.thinned_start import ThinnedStart
+from collocation_sysid.runs import several_starts, smaller_problem
+from collocation_sysid.runs.smaller_problem import NoStartError, ThinnedStart
 
 # Finer than the pixels, so that no point is left out.
 SPACING_M = 2e-4
@@ -50,8 +49,8 @@ def thinned() -> ThinnedStart:
 @pytest.fixture
 def many(monkeypatch):
     """The points of the image count as many."""
-    monkeypatch.setattr(thinned_start, "MANY_POINTS", 1000)
-    monkeypatch.setattr(thinned_start, "THINNED_POINTS", 400)
+    monkeypatch.setattr(smaller_problem, "MANY_POINTS", 1000)
+    monkeypatch.setattr(smaller_problem, "THINNED_POINTS", 400)
 
 
 def compared(solution: cs.Solution) -> int:
@@ -89,8 +88,8 @@ def test_few_points_are_not_thinned():
 def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
     direct = cs.solve(problem())
     assert not any("searched with" in note for note in direct.notes)
-    monkeypatch.setattr(thinned_start, "MANY_POINTS", 1000)
-    monkeypatch.setattr(thinned_start, "THINNED_POINTS", 400)
+    monkeypatch.setattr(smaller_problem, "MANY_POINTS", 1000)
+    monkeypatch.setattr(smaller_problem, "THINNED_POINTS", 400)
     solution = cs.solve(problem())
     (note,) = (each for each in solution.notes if "searched with" in each)
     (given,) = depth().clouds
@@ -129,7 +128,7 @@ def test_thinned_points_that_do_not_determine_a_parameter_are_no_start(many, mon
     smaller = thinned()
     rough = cs.solve(smaller.problem)
     smaller.given_collocation(problem(), rough)
-    monkeypatch.setattr(thinned_start, "undetermined_names", lambda _: ("young_pa",))
+    monkeypatch.setattr(smaller_problem, "undetermined_names", lambda _: ("young_pa",))
     with pytest.raises(NoStartError, match="determine E"):
         smaller.given_collocation(problem(), rough)
 
@@ -208,7 +207,7 @@ def test_a_search_at_a_known_minimum_ends():
 
 def test_all_points_have_the_correspondences_of_the_thinned_solution(many):
     rough = cs.solve(thinned().problem)
-    collocation = thinned_start.collocation_with_all_points(problem(), rough)
+    collocation = smaller_problem.collocation_with_all_points(problem(), rough)
     (transcription,) = collocation.transcriptions
     (found,) = transcription.association.correspondences
     assert isinstance(found, SurfaceCorrespondences)

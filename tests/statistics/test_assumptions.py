@@ -32,9 +32,9 @@ from collocation_sysid import (
     run,
     simulate,
 )
-from collocation_sysid.fem.air import AIR_KG_M3
 from collocation_sysid.fem.laws.constants import GAMMA_R
 from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw
+from collocation_sysid.fem.node_force import AIR_KG_M3
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, ExperimentAtAnswer

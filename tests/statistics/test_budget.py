@@ -41,9 +41,9 @@ from collocation_sysid.statistics.budget.systematic_effects import (
     Assumptions,
     source_label,
 )
+from collocation_sysid.statistics.concerns import REMEDIES, remedy_for
 from collocation_sysid.statistics.estimates import Estimate
 from collocation_sysid.statistics.linearised import linearise_fit
-from collocation_sysid.statistics.remedies import REMEDIES, remedy_for
 
 NOTHING = {name: "none" for name in Assumptions().collect_deviations()}
 

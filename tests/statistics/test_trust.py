@@ -29,6 +29,7 @@ from collocation_sysid.statistics.assessment import (
     GROSS_MISFIT,
     MISFIT,
     Assessment,
+    InstrumentMisfit,
     fit_concerns,
     forward_simulation_concerns,
     nuisance_concerns,
@@ -41,7 +42,6 @@ from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 from collocation_sysid.statistics.concerns import TOPICS, Concern, topics_of
 from collocation_sysid.statistics.estimates import correlation_notes
 from collocation_sysid.statistics.hypothesis import Hypothesis
-from collocation_sysid.statistics.instrument_misfit import InstrumentMisfit
 from collocation_sysid.statistics.residuals.autocorrelation import Dependence
 from collocation_sysid.statistics.uncertainty import uncertainty_from_fit
 

@@ -11,7 +11,7 @@ from kit.problems import uneven_box
 from kit.program_derivatives import check_program
 
 import collocation_sysid as cs
-from collocation_sysid.fem.air import unit_drag
+from collocation_sysid.fem.node_force import unit_drag
 from collocation_sysid.testing import check_force
 from collocation_sysid.testing.property_check import PropertyCheck
 from collocation_sysid.testing.small_problems import DENSITY_KG_M3, program_of, swung_experiment

@@ -27,7 +27,7 @@ from ...result.replay import MotionRecord
 from ...result.report import report_html
 from ...result.run_writers import replaced_folder
 from ...statistics.budget.systematic_effects import source_label
-from ...statistics.remedies import remedy_for
+from ...statistics.concerns import remedy_for
 from .band import OF_GRIP, OTHERS
 from .execution_problems import (
     CHECK_FILE,

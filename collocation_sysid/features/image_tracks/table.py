@@ -12,8 +12,7 @@ from ...common.array_types import Array
 from ...common.schema_tables import Declared, Section, Unit, Vector, declared_in
 from ...common.validated_types import Finite, NotNegative, Positive, Text
 from ...errors import InputError, located
-from ...problem.measurement_section import MeasurementSection, RecordingFolder
-from ...problem.named_files import existing_file
+from ...problem.measurement_section import MeasurementSection, RecordingFolder, existing_file
 from ...recording import read_poses
 from ...recording.camera import Camera, ImageSize, PoseMatrix
 from ...recording.sources.calibration_files import read_calibration

@@ -33,7 +33,6 @@ from ...recording.grasp import prescribed_dofs
 from ..linear_algebra.lapack import one_blas_thread
 from ..observables import ReactionForces
 from .condensed_steps import StepEquations
-from .extrapolation import MOST_VALUES, next_value
 from .initial_equilibrium import initial_state
 from .newton_linearisation import LaggedStress, NewtonLinearisation
 from .newton_solver import (
@@ -43,6 +42,7 @@ from .newton_solver import (
     NewtonSolvers,
     simulation_error,
 )
+from .scheme_simulation import MOST_VALUES, next_value
 
 # Relative difference up to which two steps have the same length.
 SAME_STEP = 1e-6

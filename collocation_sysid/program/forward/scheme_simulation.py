@@ -20,7 +20,6 @@ from ...recording.experiment import Experiment
 from ..linear_algebra.lapack import one_blas_thread
 from ..stopwatch import Stopwatch
 from .condensed_steps import StepEquations
-from .extrapolation import MOST_VALUES, next_value
 from .homogeneous_equilibria import homogeneous_equilibria
 from .initial_equilibrium import initial_state
 from .newton_linearisation import LaggedStress, NewtonLinearisation
@@ -386,3 +385,26 @@ def solve_row(
         else:
             path.accept(solution)
     return path.x
+
+
+# Number of earlier values that are used: more do not decrease the number of iterations.
+MOST_VALUES = 6
+
+
+def next_value(values: Array) -> Array:
+    """Return an extrapolation (…) of equally spaced values (k, …), oldest first, k ≥ 1, by the
+    polynomial that would have predicted the last of them best; zero if none is better than zero.
+
+    The degree follows from the values: high for a smooth motion, low where it oscillates within
+    steps or after an impact.
+    """
+    differences = values[-MOST_VALUES:]
+    guess = np.zeros_like(differences[-1])
+    while len(differences):
+        latest = differences[-1]
+        differences = np.diff(differences, axis=0)
+        # The next difference is the error of the last prediction with the latest one.
+        if len(differences) and np.linalg.norm(differences[-1]) >= np.linalg.norm(latest):
+            break
+        guess += latest
+    return guess

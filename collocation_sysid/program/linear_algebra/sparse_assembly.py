@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from ...common.unique_codes import unique_codes
+from ...fem.pattern import unique_codes
 
 
 class EntryBlock(NamedTuple):

@@ -1,8 +1,7 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body` (meshes and grasps), `grasp_extent` (nodes that end before their box),
-`measurements`, `modes` (natural modes and the time grid), `cost` and
+`body` (meshes and grasps), `measurements`, `modes` (natural modes and the time grid), `cost` and
 `derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
@@ -46,10 +45,17 @@ from ...statistics.plausibility import copied_measurements, size_and_density_hyp
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
-from .body import BodyCheck, ElementShape, GraspCheck, check_body, check_grasps, grasp_concerns
+from .body import (
+    BodyCheck,
+    ElementShape,
+    GraspCheck,
+    check_body,
+    check_grasps,
+    grasp_concerns,
+    grasp_extent_concerns,
+)
 from .cost import LONG_SOLVE_S, MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
-from .grasp_extent import grasp_extent_concerns
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
 from .modes import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
 

@@ -2,6 +2,6 @@
 
 - `noise_level`: noise of each kind of measurement; `diagnostics`: residuals of each
   marker.
-- `autocorrelation`, `spatial_correlation`: correlation in time and space.
+- `autocorrelation`: correlation in time and space.
 - `recording_scatter`: between-recording variance.
 """
