@@ -213,7 +213,8 @@ def run(
                 answer = replace(answer, profiles=profiles)
                 answer = _with_added_measurements(answer, say)
                 answer = _with_offset_notes(answer, fit)
-            if seek_causes:
+            are_specimens = all(each.specimen for each in problem.experiments)
+            if seek_causes and (are_specimens or not answer.is_consistent):
                 from .judge.engine import cause_notes, find_misspecifications
 
                 if not answer.is_consistent:

@@ -596,7 +596,8 @@ class Experiment:
         """
         couplings = [each.require_measure().couplings for each in self.actuators]
         couplings += [each.couplings_with(self.body) for each in self.obstacles]
-        couplings += [self.body.unit_air_drag.points.couplings] * self.has_air_drag
+        if self.has_air_drag:
+            couplings.append(self.body.unit_air_drag.points.couplings)
         couplings += [self.body.pattern] * bool(self.stiffness_deviations)
         return self.body.joint_pattern_with(couplings)
 

@@ -40,9 +40,9 @@ from .figure_style import (
 )
 from .pictures.cameras import LEGEND_ENTRY
 from .pictures.over_time import rms_over_markers
-from .pictures.projection import ParallelCamera
 from .pictures.scene import (
     BodyDrawing,
+    ParallelCamera,
     SheetView,
     aspect_ratio,
     draw_directions,

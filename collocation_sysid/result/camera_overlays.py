@@ -27,7 +27,7 @@ from ..runs.solved_problem import SolvedProblem
 from .figure_style import own_settings
 from .pictures.album import save_pictures, with_unique_names
 from .pictures.cameras import KIND, depth_picture
-from .pictures.projection import ParallelCamera
+from .pictures.scene import ParallelCamera
 from .replay import image_unit
 
 # Description of the pictures of `save_overlays`, for the terminal.

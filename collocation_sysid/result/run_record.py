@@ -270,6 +270,9 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
             motion = finished.modes_by_experiment.get(experiment.name)
             natural = motion and np.array([mode.frequency_hz for mode in motion.modes])
             places_m = _marker_places_m(finished, experiment.name)
+            contact = {}
+            if experiment.obstacles:
+                contact = contact_fields(experiment, finished.solution, shown[0])
             replay = MotionRecord.from_experiment(
                 experiment,
                 fit,
@@ -279,7 +282,7 @@ def replays(finished: SolvedProblem) -> list[MotionRecord]:
                 recorded=recorded_series(
                     experiment, finished.solution.fitted_values.get(experiment.name), predicted
                 )
-                | contact_fields(experiment, finished.solution, shown[0]),
+                | contact,
             )
             of_cells = _field_estimates(finished, experiment.body)
             of_cameras = _visible_points(finished, experiment)

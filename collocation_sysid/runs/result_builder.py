@@ -31,8 +31,8 @@ from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..recording.deviation import in_readable_unit
 from ..recording.nuisance import GAUGE, JOINING, PLACE, SPECIMEN_STIFFNESS, TARE
+from ..statistics.combinations import identifiability_sentences
 from ..statistics.field_estimates import FieldEstimate
-from ..statistics.identifiability import identifiability_sentences
 from ..statistics.scale_identifiability import ScaleReference, scale_reference
 from ..statistics.uncertainty import MarkerPlace
 from .result_content import (
@@ -249,7 +249,9 @@ def _fit_result(answer: SolvedProblem) -> FitResult:
         experiment = part.transcription.experiment
         name = experiment.name
         markers = experiment.markers
-        friction = friction_summaries(experiment, part.equations.dynamics, x=part.x)
+        friction = ()
+        if experiment.obstacles:
+            friction = friction_summaries(experiment, part.equations.dynamics, x=part.x)
         errors = prediction_error(experiment, solution.fitted_values[name])
         experiments[name] = FittedExperiment(
             **vars(replace(errors, rms_m=errors.rms_m or 0.0, max_m=None)),

@@ -217,7 +217,10 @@ def second_start(solution: Solution) -> Start | None:
 
     The note of a second start says why there is one: a sentence without its predicate.
     """
-    return _usual_poisson_start(solution) or _power_law_start(solution)
+    start = _usual_poisson_start(solution)
+    if start is None and all(part.transcription.experiment.specimen for part in solution.parts):
+        return _power_law_start(solution)
+    return start
 
 
 def start_beyond_bounds(solution: Solution) -> Start | None:

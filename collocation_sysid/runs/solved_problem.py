@@ -34,6 +34,7 @@ from ..statistics.combinations import (
     Combination,
     Direction,
     Fix,
+    identifiability_sentences,
     principal_directions,
     vague_constants,
     with_something_to_state,
@@ -42,7 +43,6 @@ from ..statistics.concerns import Concern
 from ..statistics.estimates import Estimate, relative_derivatives
 from ..statistics.field_estimates import FieldEstimate, field_estimates
 from ..statistics.hypothesis import Hypothesis
-from ..statistics.identifiability import identifiability_sentences
 from ..statistics.linearised import DerivedModuli, LinearisedFit
 from ..statistics.profile_likelihood import Profile
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
@@ -288,6 +288,7 @@ class SolvedProblem:
         known = (
             field_estimates(b, collocation.parameters, q=q, uncertainty=self.uncertainty)
             for b in bodies
+            if b.field_lengths_m
         )
         return {field.name: field for each in known for field in each}
 

@@ -31,7 +31,7 @@ from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from .branch_order import with_ascending_times
 from .check.cost import require_memory
-from .prediction import fit_misfits
+from .forward_simulation import fit_misfits
 from .several_starts import (
     KnownMinimum,
     follow_starts,

@@ -47,8 +47,7 @@ from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from .check.modes import ModesCheck, check_modes
-from .forward_simulation import ForwardSimulation
-from .prediction import fit_misfits
+from .forward_simulation import ForwardSimulation, fit_misfits
 
 # Largest noise of cameras, relative to the size of the body.
 LARGEST_CAMERA_NOISE = 0.01

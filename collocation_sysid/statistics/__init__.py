@@ -12,7 +12,7 @@ Combined intervals
     The package `budget` adds the discretisation error and systematic effects (type B) and computes
     the intervals to publish.
 Checks
-    `identifiability` and `scale_identifiability` describe what the data determine. `hypothesis` is a
+    `combinations` and `scale_identifiability` describe what the data determine. `hypothesis` is a
     likely mistake in the description, which the package `judge` finds (`axes`: exchanged or reversed
     axes); `plausibility` has sizes, densities and copies. `stability_concerns` judges materials.
     `assessment` combines everything into a verdict with the messages of `concerns`.

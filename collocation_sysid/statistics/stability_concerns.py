@@ -82,9 +82,10 @@ def branch_concerns(iterates: Iterable[ExperimentIterate]) -> Iterator[Concern]:
     """
     for iterate in iterates:
         experiment = iterate.transcription.experiment
-        change = find_branch_change(experiment, iterate.equations.dynamics, iterate.x)
-        if change is not None:
-            yield branch_concern(experiment.name, change)
+        if experiment.is_static:
+            change = find_branch_change(experiment, iterate.equations.dynamics, iterate.x)
+            if change is not None:
+                yield branch_concern(experiment.name, change)
 
 
 def branch_concern(experiment: str, change: BranchChange) -> Concern:

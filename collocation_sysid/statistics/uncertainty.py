@@ -63,12 +63,7 @@ from .residuals.noise_level import (
     estimate_noise_level,
     project_errors,
 )
-from .residuals.recording_scatter import (
-    RecordingComparison,
-    blocks_by_recording,
-    compare_recordings,
-    single_fits,
-)
+from .residuals.recording_scatter import RecordingComparison, compare_recordings, single_fits
 
 Errors = Literal["independent", "autocorrelated"]
 
@@ -365,7 +360,7 @@ def _compare_recordings(
 
     Each recording is evaluated by `uncertainty_from_fit` with the error model `errors`.
     """
-    if len(blocks_by_recording(fit)) < 2:
+    if len({block.name for block in fit.blocks}) < 2:
         return None
     known: dict[str, tuple[Array, Array, Array]] = {}
     sizes = relative_derivatives(parameters, q)

@@ -59,13 +59,11 @@ from collocation_sysid.result.pictures import (
 )
 from collocation_sysid.result.pictures.album import experiment_pictures, with_unique_names
 from collocation_sysid.result.pictures.confidence import GREY, budget_picture, ellipse_outline
-from collocation_sysid.result.pictures.jacobian import RASTER_SIZE, SHOWN_STEPS
 from collocation_sysid.result.pictures.meshes import spread_levels
-from collocation_sysid.result.pictures.over_time import sensor_picture
-from collocation_sysid.result.pictures.projection import ParallelCamera
-from collocation_sysid.result.pictures.scene import BodyDrawing, SheetView, sheet
+from collocation_sysid.result.pictures.over_time import sensor_picture, spectral_density
+from collocation_sysid.result.pictures.scene import BodyDrawing, ParallelCamera, SheetView, sheet
+from collocation_sysid.result.pictures.search import RASTER_SIZE, SHOWN_STEPS
 from collocation_sysid.result.pictures.shapes import FIELD_COLOURS, SurfaceField
-from collocation_sysid.result.pictures.spectrum import spectral_density
 from collocation_sysid.result.pictures.stress_strain import is_unloading
 from collocation_sysid.result.replay import MotionRecord
 from collocation_sysid.runs.result_content import Result

@@ -19,7 +19,7 @@ from collocation_sysid.program.depth.surface_comparison import DepthError
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.result.run_summary import run_summary
-from collocation_sysid.runs.prediction import CopyError, nearest_recording_error
+from collocation_sysid.runs.forward_simulation import CopyError, nearest_recording_error
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.assessment import prediction_concerns
 

@@ -10,9 +10,8 @@ from kit.problems import box
 
 from collocation_sysid.fem.laws.moduli import ENGINEERING, LAME
 from collocation_sysid.model.parameters import Parameter, Parameters, ThetaMap
-from collocation_sysid.statistics.combinations import find_combinations
+from collocation_sysid.statistics.combinations import find_combinations, identifiability_sentences
 from collocation_sysid.statistics.estimates import UNDETERMINED
-from collocation_sysid.statistics.identifiability import identifiability_sentences
 from collocation_sysid.statistics.linearised import DerivedModuli, LinearisedFit, ResidualBlock
 from collocation_sysid.statistics.uncertainty import Uncertainty, uncertainty_from_fit
 

@@ -66,10 +66,10 @@ class BranchChange:
 
 @one_blas_thread()
 def find_branch_change(experiment: Experiment, dynamics: Dynamics, x: Array) -> BranchChange | None:
-    """Return the first sample of static equilibria that is not on the path of stable equilibria
+    """Return the first sample of a static experiment that is not on the path of stable equilibria
     from the sample before, or from the unloaded body; None if there is none.
 
-    None also for motions, specimens and experiments with obstacles. Where the path cannot be
+    None also for specimens and experiments with obstacles. Where the path cannot be
     followed, as at a limit point, nothing is known about that sample.
 
     Parameters
@@ -79,7 +79,7 @@ def find_branch_change(experiment: Experiment, dynamics: Dynamics, x: Array) -> 
     x : (N, 3n) array
         Equilibria at the samples [m].
     """
-    if not experiment.is_static or experiment.specimen is not None or experiment.obstacles:
+    if experiment.specimen is not None or experiment.obstacles:
         return None
     solvers = NewtonSolvers(experiment)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)

@@ -28,10 +28,9 @@ from .confidence import (
 )
 from .field_intervals import field_picture
 from .meshes import elements_picture, mesh_picture
-from .over_time import marker_errors, marker_tracks, sensor_picture
+from .over_time import marker_errors, marker_tracks, sensor_picture, spectrum_picture
 from .search import convergence, scan_picture
 from .shapes import obstacle_pictures, shapes_picture
-from .spectrum import spectrum_picture
 from .stress_strain import force_picture, harmonic_picture, relaxation_picture, strain_picture
 
 
@@ -152,7 +151,8 @@ def experiment_pictures(replay: MotionRecord) -> Iterator[tuple[str, Figure]]:
         is_tracks = is_of_tracks(replay.outlines.get(name))
         kind = "pixels" if is_tracks else "reading"
         yield (f"{kind}_{replay.name}_{name}", sensor_picture(values, names, units=units))
-    yield from camera_pictures(replay)
+    if replay.visible_points or replay.outlines:
+        yield from camera_pictures(replay)
     if replay.has_shapes():
         yield f"shapes_{replay.name}", shapes_picture(replay)
         for name, figure in obstacle_pictures(replay).items():

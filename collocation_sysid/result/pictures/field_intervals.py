@@ -15,8 +15,15 @@ from ...fem.laws.constants import symbol_with_unit
 from ...fem.meshes.checks import boundary_of
 from ..figure_style import PAGE_MM, SMALL_PT
 from ..replay import MotionRecord
-from .projection import ParallelCamera
-from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
+from .scene import (
+    BodyDrawing,
+    ParallelCamera,
+    SheetView,
+    aspect_ratio,
+    draw_directions,
+    draw_scale,
+    sheet,
+)
 from .shapes import FIELD_COLOURS
 
 # Height of the titles [mm].

@@ -9,8 +9,15 @@ from matplotlib.figure import Figure
 
 from ...program.forward.loss_of_stability import StabilityLoss
 from ..figure_style import PAGE_MM, SMALL_PT, own_settings
-from .projection import ParallelCamera
-from .scene import BodyDrawing, SheetView, aspect_ratio, draw_directions, draw_scale, sheet
+from .scene import (
+    BodyDrawing,
+    ParallelCamera,
+    SheetView,
+    aspect_ratio,
+    draw_directions,
+    draw_scale,
+    sheet,
+)
 from .shapes import FIELD_COLOURS
 
 # Height of the title [mm].

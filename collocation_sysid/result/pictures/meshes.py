@@ -17,10 +17,12 @@ from ...common.array_types import Array
 from ...fem.meshes.checks import edge_lengths, mean_ratios
 from ..figure_style import BLUE, COLUMN_MM, SMALL_PT, VERMILION, framed_figure, style_axes
 from ..replay import MotionRecord
-from .projection import ELEVATION_DEG, ParallelCamera, Triangles
 from .scene import (
+    ELEVATION_DEG,
     BodyDrawing,
+    ParallelCamera,
     SheetView,
+    Triangles,
     aspect_ratio,
     draw_directions,
     draw_legend,

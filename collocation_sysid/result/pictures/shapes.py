@@ -21,9 +21,10 @@ from ...fem.body import Body
 from ..element_fields import ElementFields
 from ..figure_style import PAGE_MM, SMALL_PT, own_settings
 from ..replay import MotionRecord
-from .projection import ELEVATION_DEG, ParallelCamera
 from .scene import (
+    ELEVATION_DEG,
     BodyDrawing,
+    ParallelCamera,
     SheetView,
     draw_directions,
     draw_legend,

@@ -161,15 +161,13 @@ def obstacle_shifts_m(iterate: ExperimentIterate) -> Iterator[tuple[Obstacle, Ar
         yield obstacle, rotations @ (rotations[each.row].T @ way_m)
 
 
-def scaled_start_m(iterate: ExperimentIterate) -> Array | None:
+def scaled_start_m(iterate: ExperimentIterate) -> Array:
     """Return the change (3n,) of given start positions per relative size of the body [m], about the
-    same point as in `obstacle_shifts_m`; None for a start from equilibrium.
+    same point as in `obstacle_shifts_m`.
 
     Without it, a larger body would be released compressed to its old size, and swing.
     """
     experiment = iterate.transcription.experiment
-    if not iterate.equations.dynamics.first_row:
-        return None
     turn, shift = (values[0] for values in experiment.rigid_motion(experiment.t_s[0]))
     pivot_m = turn @ iterate.transcription.nuisance.grasp_pivot_m + shift
     x_m = iterate.x[0].reshape(-1, 3)

@@ -248,12 +248,14 @@ class ExperimentAtAnswer:
         Places of the surface that are in contact with an obstacle are known and do not move.
         """
         transcription = self.iterate.transcription
-        gaps_m = surface_gaps_and_pressures(transcription.experiment, self.theta, x=self.iterate.x)[
-            0
-        ]
-        nearest = np.fmin.reduce(gaps_m, axis=0)
-        is_in_contact = np.nan_to_num(nearest, nan=np.inf) < transcription.length_m
-        known = np.unique(self.body.mesh.surface[is_in_contact])
+        known = np.zeros(0, dtype=int)
+        if transcription.experiment.obstacles:
+            gaps_m, _ = surface_gaps_and_pressures(
+                transcription.experiment, self.theta, x=self.iterate.x
+            )
+            nearest = np.fmin.reduce(gaps_m, axis=0)
+            is_in_contact = np.nan_to_num(nearest, nan=np.inf) < transcription.length_m
+            known = np.unique(self.body.mesh.surface[is_in_contact])
         modes = surface_modes(self.body, known)
         return thickness_m(self.body) * modes
 
@@ -415,16 +417,18 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     # Of a body made under gravity the deflection over the size grows with the weight over s².
     heavier = at.force_change_by_scan_weight() * (-2.0 if at.body.has_declared_mass else 1.0)
     mass = (0.0 if at.body.has_declared_mass else 3.0) * at.own_mass_kg
-    for change_n in contact_changes_by_size_n(at.dynamics, at.iterate.x):
-        force += at.pad_rows(change_n)
     transcription = at.iterate.transcription
+    obstacles = transcription.experiment.obstacles
+    if obstacles:
+        for change_n in contact_changes_by_size_n(at.dynamics, at.iterate.x):
+            force += at.pad_rows(change_n)
     rotations: Array = np.nan_to_num(transcription.prescribed_motion.pose_rows[0])
     arms_m = (
         transcription.prescribed_motion.displaced_nodes(at.iterate.phi)[0]
         - transcription.nuisance.grasp_pivot_m
     )
     displacement_m = np.einsum("tgj,gj->tg", rotations, arms_m)
-    for obstacle, shift_m in obstacle_shifts_m(at.iterate):
+    for obstacle, shift_m in obstacle_shifts_m(at.iterate) if obstacles else ():
         obstacle_dofs = np.searchsorted(
             transcription.prescribed_motion.dofs, obstacle.prescribed_dofs
         )
@@ -434,7 +438,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
         force + heavier + at.weight_and_drag(mass) + air,
         mass + 3.0 * at.dynamics.mass.added_kg,
         displacement_m=displacement_m,
-        start_m=scaled_start_m(at.iterate),
+        start_m=scaled_start_m(at.iterate) if at.dynamics.first_row else None,
     )
 
 
@@ -762,6 +766,8 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _platen_slip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return None if other measurements than loads show the grip, see `slip_displacements_m`."""
+    if not at.iterate.transcription.experiment.is_static:
+        return None
     displacement_m = slip_displacements_m(at.iterate, at.theta, reactions_n=at.grasp_force_n)
     if displacement_m is None:
         return None
@@ -779,6 +785,8 @@ def _platen_stick(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _contact_stiffness(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect to first order; None where contact is rigid already."""
+    if not at.iterate.transcription.experiment.obstacles:
+        return None
     change_n = rigid_contact_change_n(
         at.iterate.transcription.experiment, at.dynamics, x=at.iterate.x
     )
