@@ -6,7 +6,6 @@ recording belong into the packages `program`, `model` and `recording`.
 
 - `feature`: `Feature`, the functions that a feature may declare.
 - `registry`: the features, in the order of the residuals.
-- `measurement_results`: predictions and errors of measurements, as in ``result.json``.
 - `measurements`: comparison of predictions with measurements, for all kinds.
 - `wrenches`: likely errors in the description of force sensors, after a fit (`causes`) and by the
   simulation at the guess (`at_guess`).

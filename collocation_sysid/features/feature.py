@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.concerns import Concern, Topic
-from .measurement_results import PredictionErrors
+from .measurements import PredictionErrors
 
 
 def _nothing(*_: object) -> tuple[()]:

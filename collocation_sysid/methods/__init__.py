@@ -14,8 +14,8 @@ Start
     `starts` contains what happens before a search: scans, closed forms, simulations at given
     parameters, and searches of the first samples.
 Common
-    `solution` defines the protocol of methods and the result, `solve_recorder` the history,
-    `best_iterate` the answer after an interruption, `options` the construction of methods from
+    `solution` defines the protocol of methods and the result, `solve_recorder` the history
+    and the answer after an interruption, `options` the construction of methods from
     options by name, `nlpsol` the interface to CasADi's solvers.
 """
 

@@ -33,7 +33,7 @@ from ..common.files import is_own
 from ..common.pages import explain_command, page_url
 from ..common.serialisation import content
 from ..errors import listed
-from ..features.measurement_results import SimulatedExperiment
+from ..features.measurements import SimulatedExperiment
 from ..fem.laws.constants import symbol_of, unit_of
 from ..judge.posterior import main_sources
 from ..recording.deviation import in_readable_unit

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.display import Line, Shown, Table, flattened_parts, number, quantity
 from ..errors import listed
-from ..features.measurement_results import SimulatedExperiment
+from ..features.measurements import SimulatedExperiment
 from ..fem.laws.constants import (
     INSTANTANEOUS,
     KAPPA,

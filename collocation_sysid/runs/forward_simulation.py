@@ -16,8 +16,9 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
 from ..errors import InputError, SimulationError
-from ..features.measurement_results import CopyError, SimulatedExperiment
 from ..features.measurements import (
+    CopyError,
+    SimulatedExperiment,
     copied,
     copied_times_s,
     instrument_misfits,

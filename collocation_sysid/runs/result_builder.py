@@ -15,13 +15,14 @@ from ..common.display import short
 from ..common.files import SCHEMA
 from ..common.installation import package_version
 from ..common.serialisation import copy_fields
-from ..features.measurement_results import (
+from ..features.measurements import (
     FitResult,
     FittedExperiment,
     ForwardResult,
     SimulatedExperiment,
+    prediction_error,
+    stated_sigmas,
 )
-from ..features.measurements import prediction_error, stated_sigmas
 from ..fem.laws.constants import GAMMA_R, YOUNG
 from ..fem.schemes import as_scheme
 from ..methods.solution import pooled_wrench_rms

@@ -18,11 +18,11 @@ from ..errors import InputError
 from ..features.measurements import lost_samples
 from ..features.registry import FEATURES, present
 from ..fem.laws.constants import symbol_of, unit_of, without_region
-from ..methods.best_iterate import answers_as, best_iterate, keep
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.interior_point import InteriorPoint
 from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch, multipliers_at
+from ..methods.solve_recorder import answers_as, best_iterate, keep
 from ..methods.starts.initial_trajectories import associated_at_guess
 from ..methods.starts.start import Scan, Start
 from ..methods.starts.stiffness_scan import EXPLAINED, rescue, start_problem

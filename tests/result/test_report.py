@@ -16,7 +16,7 @@ from kit.results import ROLLOUT, a_result
 
 from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.serialisation import as_json
-from collocation_sysid.features.measurement_results import SimulatedExperiment
+from collocation_sysid.features.measurements import SimulatedExperiment
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.assessment import Assessment

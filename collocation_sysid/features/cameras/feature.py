@@ -13,7 +13,7 @@ from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...statistics.concerns import Concern, concern_if
 from ..feature import Feature
-from ..measurement_results import PredictionErrors
+from ..measurements import PredictionErrors
 from .poses import require_depth_units
 
 # Messages of concerns about a fit or a prediction, by code.

@@ -20,7 +20,6 @@ from ...program.collocation import Collocation
 from ...recording.experiment import Experiment
 from ...recording.measurement_selection import shortened_experiment
 from ...recording.time_tables import FEWEST_SHARED_SAMPLES
-from ..best_iterate import best_iterate
 from ..comparison.casadi_nlp import Sleqp, SqpMethod
 from ..comparison.penalty import AugmentedLagrangian, Penalty
 from ..comparison.shooting import Shooting
@@ -28,7 +27,7 @@ from ..interior_point import InteriorPoint
 from ..options import SHARES, MethodOptions, Shares, method_from_options
 from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Method, Solution, Status, Watch
-from ..solve_recorder import Recorder
+from ..solve_recorder import Recorder, best_iterate
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .motion_share import motion_shares, rows_of_share
 

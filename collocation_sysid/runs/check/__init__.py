@@ -21,8 +21,8 @@ from ...errors import SimulationError
 from ...features.measurements import lost_samples
 from ...features.registry import FEATURES, present
 from ...fem.schemes import as_scheme
-from ...methods.best_iterate import best_iterate
 from ...methods.reduced_space import ReducedSpace
+from ...methods.solve_recorder import best_iterate
 from ...methods.starts.initial_trajectories import initial_variables
 from ...methods.starts.stiffness_scan import (
     SOFT_PA,
