@@ -139,7 +139,7 @@ class Run(SolvedProblem):
         """
         from .result.run_record import write_run
 
-        return write_run(self, folder, frames=frames, pictures=pictures)
+        return write_run(self, self.result, folder, frames=frames, pictures=pictures)
 
 
 @validated

@@ -139,7 +139,7 @@ def solve(
             until_saved.close()
             if pictures:
                 with shown_progress(quiet=output.quiet, verbose=verbose) as progress:
-                    drawn = draw_run(finished, folder, report=progress.say)
+                    drawn = draw_run(finished, drawn, folder, report=progress.say)
         except KeyboardInterrupt:
             drawn = None
             again = shlex.join(["collocation-sysid", "plot", str(folder)])

@@ -20,12 +20,11 @@ from ..common.validated_classes import validated
 from ..common.validated_types import Count, NotNegative, Positive
 from ..errors import SimulationError
 from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
-from .horizon import Horizon, Iterate
+from .horizon import Horizon, Iterate, motion_shares, rows_of_share
 from .loss_curvature import exact_curvature, secant_update, with_curvature
 from .options import FEWEST, SHARES, MethodOptions, Shares
 from .solution import Iteration, Status
 from .solve_recorder import Recorder, misfit_of
-from .starts.motion_share import motion_shares, rows_of_share
 from .trajectory_sweeps import Feasibility
 
 if TYPE_CHECKING:
@@ -157,7 +156,7 @@ class SearchOptions(MethodOptions):
 def _oscillates(transcription: Transcription) -> bool:
     """Return whether the recording is a table of moduli over frequency, for several branches."""
     body = transcription.body
-    return body.memory.oscillates and any(len(part.prony) > 1 for part in body.parts)
+    return any(len(part.prony) > 1 for part in body.parts) and body.memory.oscillates
 
 
 @dataclass(frozen=True, eq=False)

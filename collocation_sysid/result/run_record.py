@@ -30,7 +30,6 @@ from ..features.outlines.residual import OutlinesResidual
 from ..fem.body import Body
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
-from ..runs.result_builder import build_result
 from ..runs.result_content import Result
 from ..runs.solved_problem import SolvedProblem
 from .element_fields import ElementFields
@@ -43,7 +42,12 @@ MAX_OUTLINED_IMAGES = 4
 
 
 def write_run(
-    solved: SolvedProblem, folder: str | Path, *, frames: bool = True, pictures: bool = True
+    solved: SolvedProblem,
+    result: Result,
+    folder: str | Path,
+    *,
+    frames: bool = True,
+    pictures: bool = True,
 ) -> Path:
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
@@ -59,6 +63,8 @@ def write_run(
 
     Parameters
     ----------
+    result : Result
+        Content of ``result.json``, see `build_result`.
     folder : str or Path
         Made with its parents if missing; an earlier, unchanged run at this place is replaced.
     frames, pictures : bool
@@ -71,26 +77,28 @@ def write_run(
         picture cannot be written.
     """
     try:
-        _write_folder(solved, Path(folder), frames=frames)
+        _write_folder(solved, result, Path(folder), frames=frames)
     except OSError as error:
         full = InputError(f"this cannot be written: {error.strerror or error}", folder)
-        raise _kept_elsewhere(solved, full, frames=frames) from error
+        raise _kept_elsewhere(solved, result, full, frames=frames) from error
     except InputError as error:
         if isinstance(error.__cause__, OSError):
-            raise _kept_elsewhere(solved, error, frames=frames) from error
+            raise _kept_elsewhere(solved, result, error, frames=frames) from error
         raise
     if pictures:
-        draw_run(solved, Path(folder))
+        draw_run(solved, result, Path(folder))
     return Path(folder)
 
 
-def _kept_elsewhere(solved: SolvedProblem, error: InputError, frames: bool) -> InputError:
+def _kept_elsewhere(
+    solved: SolvedProblem, result: Result, error: InputError, frames: bool
+) -> InputError:
     """Return the error unchanged if the temporary folder cannot be written, either."""
     for content in (partial(_write_folder, frames=frames), _write_answer):
         with suppress(InputError, OSError):
             folder = Path(mkdtemp(prefix="collocation-sysid-run-"))
             try:
-                content(solved, folder)
+                content(solved, result, folder)
             except (InputError, OSError):
                 shutil.rmtree(folder, ignore_errors=True)
                 raise
@@ -100,16 +108,16 @@ def _kept_elsewhere(solved: SolvedProblem, error: InputError, frames: bool) -> I
     return error
 
 
-def _write_answer(solved: SolvedProblem, place: Path) -> None:
-    (place / RESULT_FILE).write_text(_result_text(build_result(solved)), encoding="utf-8")
+def _write_answer(solved: SolvedProblem, result: Result, place: Path) -> None:
+    (place / RESULT_FILE).write_text(_result_text(result), encoding="utf-8")
     origin = solved.problem.origin
     if origin is not None:
         (place / "problem.toml").write_text(origin.text, encoding="utf-8")
 
 
-def _write_folder(solved: SolvedProblem, folder: Path, frames: bool) -> None:
+def _write_folder(solved: SolvedProblem, result: Result, folder: Path, frames: bool) -> None:
     with replaced_folder(folder) as place:
-        _write_answer(solved, place)
+        _write_answer(solved, result, place)
         if solved.refinement is not None and solved.refinement.levels:
             text = as_json(solved.refinement)
             (place / REFINEMENT_FILE).write_text(text + "\n", encoding="utf-8")
@@ -120,12 +128,14 @@ def _write_folder(solved: SolvedProblem, folder: Path, frames: bool) -> None:
 
 
 def draw_run(
-    solved: SolvedProblem, folder: Path, report: Callable[[str], None] | None = None
+    solved: SolvedProblem, result: Result, folder: Path, report: Callable[[str], None] | None = None
 ) -> Result:
     """Draw the pictures of a run into its folder, and store in ``result.json`` how long that took.
 
     Parameters
     ----------
+    result : Result
+        Content of its ``result.json``, see `build_result`.
     folder : Path
         The folder that `write_run` wrote for this solved problem.
     report : callable, optional
@@ -143,7 +153,6 @@ def draw_run(
         pictures are replaced already then. If the folder cannot be written to.
     """
     began_s = time.perf_counter()
-    result = build_result(solved)
     file = folder / RESULT_FILE
     write_pictures(solved, result, folder=folder, say=report or (lambda _: None))
     if not file.is_file() or file.read_text(encoding="utf-8") != _result_text(result):

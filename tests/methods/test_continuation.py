@@ -21,11 +21,11 @@ from kit.problems import (
 )
 
 from collocation_sysid.errors import InputError
+from collocation_sysid.methods.horizon import motion_shares, rows_of_share
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.starts.continuation import Continuation, first_samples, first_share
-from collocation_sysid.methods.starts.motion_share import motion_shares, rows_of_share
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.pipeline import solve
 from collocation_sysid.problem import Problem

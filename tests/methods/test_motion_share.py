@@ -10,9 +10,9 @@ import pytest
 from kit.problems import GUESS, TRUTH, hung_cube, measured, relative_errors
 
 from collocation_sysid import Experiment, PoseSequence, Problem, Unknown, solve
+from collocation_sysid.methods.horizon import motion_shares, rows_of_share
 from collocation_sysid.methods.options import FEWEST
 from collocation_sysid.methods.starts.continuation import first_share
-from collocation_sysid.methods.starts.motion_share import motion_shares, rows_of_share
 from collocation_sysid.methods.starts.stiffness_scan import TrialSimulation
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.simulation import with_markers

@@ -26,7 +26,7 @@ from kit.problems import (
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
-from collocation_sysid.methods.horizon import Horizon, Iterate
+from collocation_sysid.methods.horizon import Horizon, Iterate, motion_shares, rows_of_share
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
 from collocation_sysid.methods.options import SHARES
@@ -37,7 +37,6 @@ from collocation_sysid.methods.starts.initial_trajectories import (
     rigid_trajectory,
     simulate_trajectories,
 )
-from collocation_sysid.methods.starts.motion_share import motion_shares, rows_of_share
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.least_squares import SquareRootInformation

@@ -4,5 +4,5 @@
 - `structured`: boxes and cylinders; `surface`: mesh of a closed surface; `refinement`: finer
   meshes;
   `coarsening`: coarser meshes.
-- `files`, `meshio_reader`: files; `selection`: nodes, cells and faces by position or name.
+- `files`: files; `selection`: nodes, cells and faces by position or name.
 """

@@ -23,13 +23,13 @@ from ...recording.time_tables import FEWEST_SHARED_SAMPLES
 from ..comparison.casadi_nlp import Sleqp, SqpMethod
 from ..comparison.penalty import AugmentedLagrangian, Penalty
 from ..comparison.shooting import Shooting
+from ..horizon import motion_shares, rows_of_share
 from ..interior_point import InteriorPoint
 from ..options import SHARES, MethodOptions, Shares, method_from_options
 from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Method, Solution, Status, Watch
 from ..solve_recorder import Recorder, best_iterate
 from .initial_trajectories import complete_variables, simulate_trajectories
-from .motion_share import motion_shares, rows_of_share
 
 _ONE_HORIZON = (
     InteriorPoint,

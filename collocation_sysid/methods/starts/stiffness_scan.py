@@ -31,13 +31,13 @@ from ...program.collocation import Collocation, ExperimentIterate
 from ...program.forward.newton_solver import NewtonOptions
 from ...program.least_squares import SquareRootInformation
 from ...program.measurement_residual import huber_as_least_squares
+from ..horizon import motion_shares, rows_of_share
 from ..options import SHARES
 from ..reduced_space import ReducedSpace
 from ..solution import Solution
 from ..solve_recorder import interrupted_solution, keep
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .memory import memory_start
-from .motion_share import motion_shares, rows_of_share
 from .power_law import power_law_start
 from .start import NO_GUESS, Scan, Start
 

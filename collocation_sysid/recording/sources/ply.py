@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...errors import InputError
-from ...fem.meshes.meshio_reader import read_content
+from ...fem.meshes.files import read_content
 
 # More bytes of header than any program writes.
 LONGEST_HEADER = 100_000
