@@ -170,9 +170,9 @@ def sweep_after_step(
     """Return the result of one sweep after a step of the parameters to p.
 
     The positions are those of `previous` after its feasibility step, extrapolated along the
-    sensitivities. Static experiments are first solved for the equilibrium if one is near, and keep
-    the extrapolated positions otherwise: a linear extrapolation stretches slender bodies that
-    rotate much, so that its loss would be meaningless.
+    sensitivities as rotations and strains: a linear extrapolation stretches bodies that rotate, and
+    a tension of a thousandth of Young's modulus changes how stiff a slender body is in bending.
+    Static experiments are first solved for the equilibrium if one is near.
 
     Parameters
     ----------
@@ -192,7 +192,11 @@ def sweep_after_step(
     SimulationError
         If a time step is singular or not finite, or a node has no mass.
     """
-    part = _iterate(transcription, p, x=extrapolate(transcription, previous, step=step))
+    x = extrapolate(transcription, previous, step=step)
+    if solver.has_retraction:
+        held = solver.dynamics.is_temporarily_prescribed[: len(x)]
+        x = np.where(held, x, solver.retraction.of_rows(previous.x, x - previous.x))
+    part = _iterate(transcription, p, x=x)
     dynamics = part.equations.dynamics
 
     sweep_from = partial(sweep, solver, transcription, p, previous=previous, accuracy=accuracy)

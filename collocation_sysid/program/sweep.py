@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -39,6 +39,7 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.force_internal_variables import ForceForwardColumns
 from ..model.internal_variables import AnyHistory
 from ..model.viscoelasticity import MemoryForwardColumns
+from .forward.retraction import Retraction
 from .linear_algebra.block_band import Submatrix
 from .linear_algebra.factorisation import ACCURACY, Choice, Factor, Factoriser
 from .linear_algebra.lapack import one_blas_thread
@@ -316,6 +317,15 @@ class Sweep:
         )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
         self._has_temporary_grasps = bool(self.dynamics.is_temporarily_prescribed.any())
+        # It moves surfaces off the obstacles that hold them, and rods are not solids.
+        self.has_retraction = not (transcription.experiment.obstacles or self.body.is_slender)
+
+    @cached_property
+    def retraction(self) -> Retraction:
+        """Retraction of changes of positions, with the dofs that grasps always hold prescribed."""
+        prescribed = np.ones(self.pattern.size, dtype=bool)
+        prescribed[self.free] = False
+        return Retraction(self.body, prescribed.reshape(-1, 3))
 
     def __reduce__(self) -> tuple[type[Sweep], tuple[Transcription, int, None, Choice]]:
         return Sweep, (self.transcription, self.dynamics.row_count, None, self.factorisation)

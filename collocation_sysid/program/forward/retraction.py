@@ -34,6 +34,10 @@ LARGEST_STRAIN = 20.0
 # Largest entry of the gradient of an increment: steps of a nearly singular matrix may be of any
 # length, and are halved later.
 LONGEST_STEP = 1e6
+# Gradient of an increment below which its rotations cause a strain below 1e-6.
+SMALL_ROTATION = 1e-3
+# Number of quadrature points that are processed at a time, of all rows of a trajectory.
+POINTS_AT_A_TIME = 200_000
 
 
 class Retraction:
@@ -62,13 +66,32 @@ class Retraction:
         self._axes = [known[column.tobytes()] for column in prescribed.T]
 
     def __call__(self, x: Array, increment: Array) -> Array:
-        """Return positions (3n,) [m] after an increment; the gradients of x must be regular."""
-        moved = (x + increment).reshape(-1, 3)
+        """Return positions (..., 3n) [m] after an increment of the same shape; the gradients of x
+        must be regular.
+        """
+        moved = _columns(x + increment)
         right = self._gradient.T @ (self._weights[:, None] * self._target(x, increment))
         right += self._anchor[:, None] * moved
+        # The columns are the axes of the first state, those of the second, and so on.
         for k, (free, fixed, factor, coupling) in enumerate(self._axes):
-            moved[free, k] = factor.solve(right[free, k] - coupling @ moved[fixed, k])
-        return moved.ravel()
+            of_axis = right[free, k::3] - coupling @ moved[fixed, k::3]
+            moved[free, k::3] = factor.solve(of_axis)
+        return moved.reshape(len(moved), -1, 3).swapaxes(0, 1).reshape(x.shape)
+
+    def of_rows(self, x: Array, increments: Array) -> Array:
+        """Return positions (rows, 3n) [m] after an increment in each row; increments without
+        significant rotations are added.
+        """
+        moved = x + increments
+        count = max(1, 3 * POINTS_AT_A_TIME // len(self._weights))
+        for first in range(0, len(x), count):
+            rows = np.arange(first, min(first + count, len(x)))
+            gradients = np.abs(self._gradient @ _columns(increments[rows]))
+            largest = gradients.max(axis=0, initial=0.0).reshape(-1, 3).max(axis=1)
+            rows = rows[largest > SMALL_ROTATION]
+            if len(rows):
+                moved[rows] = self(x[rows], increments[rows])
+        return moved
 
     def relative_gradient(self, x: Array, increment: Array) -> Array:
         """Return the gradients ∇δ F⁻¹ (points, 3, 3) of an increment (3n,) in the shape x (3n,)
@@ -77,7 +100,9 @@ class Retraction:
         return self._deformation(increment) @ np.linalg.inv(self._deformation(x))
 
     def _target(self, x: Array, increment: Array) -> Array:
-        """Return gradients (3 · points, 3) after an increment, whose spin is a finite rotation."""
+        """Return gradients (3 · points, 3 · states) after an increment, whose spin is a finite
+        rotation.
+        """
         deformation = self._deformation(x)
         relative = self._deformation(increment) @ np.linalg.inv(deformation)
         relative = np.nan_to_num(relative).clip(-LONGEST_STEP, LONGEST_STEP)
@@ -86,12 +111,21 @@ class Retraction:
         vectors = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
         rotation = Rotation.from_rotvec(vectors).as_matrix()
         target = rotation @ _exponential(strain) @ deformation
-        return target.transpose(2, 0, 1).reshape(-1, 3)
+        states = target.reshape(len(self._weights) // 3, -1, 3, 3)
+        return states.transpose(3, 0, 1, 2).reshape(len(self._weights), -1)
 
     def _deformation(self, field: Array) -> Array:
-        """Return the gradient (points, 3, 3) of a nodal field (3n,) by the undeformed positions."""
-        by_axis = (self._gradient @ field.reshape(-1, 3)).reshape(3, -1, 3)
+        """Return the gradients (points · states, 3, 3) of nodal fields (..., 3n) by the undeformed
+        positions.
+        """
+        by_axis = (self._gradient @ _columns(field)).reshape(3, -1, 3)
         return by_axis.transpose(1, 2, 0)
+
+
+def _columns(field: Array) -> Array:
+    """Return nodal fields (..., 3n) as new columns (n, 3 · states)."""
+    states = field.reshape(-1, field.shape[-1] // 3, 3)
+    return states.swapaxes(0, 1).reshape(states.shape[1], -1)
 
 
 def _exponential(strain: Array) -> Array:
