@@ -1,8 +1,8 @@
 """Features: kinds of measurements and forces, each with all that it contributes to checks and runs.
 
-Runs, checks, verdicts, results and reports iterate over the features and name none of them. To add
-one, write a module with a `Feature` and add it to the registry; its residual, its force or its
-recording belong into the packages `program`, `model` and `recording`.
+Runs, checks and verdicts iterate over the features of the kinds that the recordings have, and name
+none of them. To add one, write a module with a `Feature` and add it to the registry; its residual,
+its force or its recording belong into the packages `program`, `model` and `recording`.
 
 - `feature`: `Feature`, the functions that a feature may declare.
 - `registry`: the features, in the order of the residuals.

@@ -124,7 +124,7 @@ def read_markers(
 def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     source = open_source(path)
     if isinstance(source, bytes):
-        if c3d.is_c3d(source):
+        if source[1:2] == b"\x50" and b"\0" in source[:512]:  # is no text
             return c3d.read(path, source, choose=choose)
         text = decode(source)
         start = text.lstrip().lstrip('"')

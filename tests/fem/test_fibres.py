@@ -14,9 +14,9 @@ import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.coarse_body import coarsen_body
 from collocation_sysid.fem.laws.fibres import FibreLaw, Fibres, reinforced
-from collocation_sysid.fem.laws.material_stability import is_examined
 from collocation_sysid.fem.laws.materials import MATERIALS
 from collocation_sysid.fem.meshes.refinement import refine_body
+from collocation_sysid.statistics.stability_concerns import is_examined
 from collocation_sysid.testing import check_material
 
 MU_PA, FIBRE_PA, EXPONENT = 1e4, 4e4, 0.8

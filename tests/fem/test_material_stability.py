@@ -11,17 +11,15 @@ from kit.materials import CONSTANTS, ELASTIC
 from kit.problems import hung_cube
 
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.laws.material_stability import (
-    is_examined,
-    principal_stretches,
-    stability_margins,
-)
 from collocation_sysid.fem.laws.materials import MATERIALS, Material, as_material, neo_hookean
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.statistics.stability_concerns import (
+    is_examined,
+    principal_stretches,
     rest_stability_concerns,
+    stability_margins,
     strain_stability_concerns,
 )
 

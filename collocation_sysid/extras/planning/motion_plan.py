@@ -38,7 +38,6 @@ from .reduced_solver import (
     informative_motion,
     solve_reduced,
 )
-from .signals import Commands
 from .spline_motion import PoseLimit, SplineMotion
 from .task import Reference, Task
 
@@ -192,11 +191,7 @@ class MotionPlan:
         return self.program.commands(self.answer.c, np.asarray(t_s))
 
     def execution(
-        self,
-        t_s: Array,
-        tracks_m: Array,
-        poses: PoseSequence | None = None,
-        commands: Commands | None = None,
+        self, t_s: Array, tracks_m: Array, poses: PoseSequence | None = None
     ) -> Experiment:
         """Return the recording of an execution, to be compared with the prediction (a problem with
         fixed parameters) or to be identified from beside the first recording.
@@ -210,9 +205,6 @@ class MotionPlan:
         poses : PoseSequence, optional
             Measured poses over the times since the start, in the format of the problem; those of
             the plan by default.
-        commands : mapping, optional
-            Times since the start and measured tensions or pressures, by name; those of the plan by
-            default.
         """
         body = self.program.body
         markers = body.template.markers
@@ -220,9 +212,8 @@ class MotionPlan:
         times = np.asarray(t_s, dtype=np.float64)
         moved = replace((poses or self.poses(times)).after(held), first_motion=held)
         places = body.marker_places_m
-        if commands is None:
-            fine_s = np.linspace(times[0], times[-1], POSES_PER_SAMPLE * (len(times) - 1) + 1)
-            commands = {name: (fine_s, values) for name, values in self.commands(fine_s).items()}
+        fine_s = np.linspace(times[0], times[-1], POSES_PER_SAMPLE * (len(times) - 1) + 1)
+        commands = {name: (fine_s, values) for name, values in self.commands(fine_s).items()}
         experiment = body.experiment(moved, times, places, commands)
         seen = Markers(
             times, tracks_m, markers.sigma_m, markers.names, np.array([*places.values()])

@@ -7,5 +7,4 @@
 - `stress`, `memory`: stresses and viscoelastic memory at quadrature points; `mean_dilatation`:
   averaged dilatation of nearly incompressible elements.
 - `damping_admissibility`: refusal of user-defined damping laws.
-- `material_stability`: loss of ellipticity of an energy.
 """

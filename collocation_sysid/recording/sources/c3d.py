@@ -14,8 +14,6 @@ from ...errors import InputError, listed
 from .raw_tracks import LabelChooser, RawTracks
 from .units import length_unit_of_text
 
-# Second byte of every C3D file.
-_KEY = 0x50
 # Beginnings of the parameters of all points.
 _OF_POINTS = ("LABELS", "UNITS", "RATE", "TYPE_GROUPS")
 # Bytes of a block, the unit of addresses in the file.
@@ -41,11 +39,6 @@ kept = [key for key in of_points if re.fullmatch(names, key)]
 found = {{key: numpy.array(of_points[key]["value"]) for key in kept}}
 found["points"] = numpy.asarray(file["data"]["points"], dtype=float)[:3]
 """
-
-
-def is_c3d(content: bytes) -> bool:
-    """Return whether a file's content is C3D: its second byte is 0x50, and it is no text."""
-    return len(content) > 1 and content[1] == _KEY and b"\0" in content[:_BLOCK]
 
 
 def read(path: str | Path, content: bytes, choose: LabelChooser) -> RawTracks:
