@@ -268,3 +268,53 @@ def test_a_sensor_in_another_unit_than_stated_is_refused(tiny, stated, is_read):
         return
     with pytest.raises(InputError, match="has the unit mm; expected m: convert its values"):
         Problem.read(tiny / "problem.toml", allow_code=True)
+
+
+@pytest.mark.parametrize(
+    ("column", "listed"),
+    [
+        *[
+            (f"{word} strain (-)", f"'{word.lower()}'")
+            for word in ("GL", "LE", "creep", "Biot", "d")
+        ],
+        *[(f"stress {word} (kPa)", f"'{word}'") for word in ("ratio", "increment", "drop", "area")],
+        *[
+            (f"force {word} (N)", f"'{word}'")
+            for word in ("ratio", "peak", "normalised", "preload")
+        ],
+        *[(f"{word} (kPa)", f"'{word.lower()}'") for word in ("Eigenspannung", "Fließspannung")],
+        ("Bruchdehnung (%)", "'bruchdehnung'"),
+        ("contrainte vraie (kPa)", "'vraie'"),
+        ("taux de déformation (-)", "'taux' and 'de'"),
+        ("stress*2 (kPa)", "'*2'"),
+        ("strain^2 (-)", "'^2'"),
+        ("1/strain (-)", "'1/'"),
+        ("−strain (-)", "'−'"),
+        ("|force| (N)", "'|' and '|'"),
+    ],
+)
+def test_each_word_and_sign_of_a_header_is_understood_or_listed(table, column, listed):
+    words = ("strain", "dehnung", "déformation", "stretch")
+    is_load = not any(word in column.lower() for word in words)
+    file = table(f"strain (-),{column}" if is_load else f"{column},stress (kPa)")
+    (note,) = read_specimen(file, layout(length_m=0.1, area_m2=1e-4)).notes
+    assert note.startswith(f"words that are not understood: {listed} in '{column}'")
+
+
+@pytest.mark.parametrize(
+    "column", ["strain rate (-)", "true strain (-)", "Dehnrate (-)", "Dehnungsrate (-)"]
+)
+def test_another_quantity_than_the_strain_is_not_read_as_one(table, column):
+    with pytest.raises(InputError, match="column"):
+        read_specimen(table(f"{column},engineering stress (kPa)"), layout())
+
+
+@pytest.mark.parametrize("column", ["E* (kPa)", "secant modulus (kPa)", "strain rate (1)"])
+def test_another_quantity_beside_strain_and_stress_is_not_read(table, column):
+    read = read_specimen(table(f"strain (-),stress (kPa),{column}"), layout())
+    assert set(read.columns) == {"strain", "stress"}
+
+
+@pytest.mark.parametrize("column", ["stretch ratio", "Dehnung (%)", "Längendehnung (%)"])
+def test_usual_words_of_a_header_are_understood(table, column):
+    assert not read_specimen(table(f"{column},stress (kPa)"), layout()).notes

@@ -199,8 +199,13 @@ _OTHER_MEASURES = {*(STRAIN_MEASURES.keys() - _DEFORMED), "piola", "kirchhoff", 
 _FIRST_PIOLA = re.compile(r"(first|1st|1\.)\s+(piola([\s–-]+kirchhoff)?|pk)\b|\bpk\s?1\b")
 # What the words of a name state about strains, stresses and moduli, or about the axis.
 KINDS = {
-    "tension": re.compile(r"tensile|\bzug|young|\b(uni)?axial|\bnormal|compressive|druckspann"),
-    "shear": re.compile(r"shear|schub|scher|cisaillement|cortante|taglio|torsion|gamma|γ|\btau|τ"),
+    "tension": re.compile(
+        r"tensile|\bzug|young|\b(uni)?axial|\bnormal(?!i[sz])|"
+        r"compressive|druckspann"
+    ),
+    "shear": re.compile(
+        r"shear|schub|scher|cisaillement|cortante|taglio|torsion|gamma|γ|\btau(?![^\W\d_])|τ"
+    ),
     "simple shear": re.compile(r"\bsimple\b|\beinfache"),
     "pure shear": re.compile(r"\bpure\b|\bplanar\b|\breine"),
     "two axes": re.compile(r"\b(equi-?)?biaxial"),
@@ -220,9 +225,11 @@ _NEUTRAL = (
     "instron zwick mts standard traverse grip clamp video optical extensometer gauge dic "
     "digital camera laser elapsed test run of the in from axial uniaxial tensile compressive "
     "compression zug prüf st first cable tendon chamber relative relaxation dynamic angular "
-    "delta δ ratio amount shear sigma σ epsilon eps ε nominale spannungs elastizitäts "
+    "delta δ amount shear sigma σ epsilon eps ε nominale spannungs elastizitäts "
     "relaxations kolben längen stauch"
 )
+# Signs of arithmetic in a name, as in strain^2, 1/strain and E*.
+_ARITHMETIC = re.compile(r"[\^*√×÷|]\d*|\d+\s*/|^\s*[-−]")
 # German compounds end with what they are: Druckspannung, Prüfkraft, Kolbenweg.
 _COMPOUND = re.compile(
     r"(?P<first>\w+)(?P<last>zeit|weg|kraft|last|spannung|dehnung|stauchung|streckung|druck|"
@@ -742,6 +749,7 @@ def _unknown_words(column: str, quantity: Quantity) -> list[str]:
     known = {*quantity.words.split(), *_NEUTRAL.split()}
     known |= set().union(*(QUALIFIERS.get(key, ()) for key in own), quantity.key.split("_"))
     patterns = [*KINDS.values(), *(_MODULUS_SYMBOLS.values() if "modulus" in own else ())]
+    known |= {"ratio"} if "stretch" in quantity.key else set()
     known |= {*"futp"} if "modulus" in own or len(own[0]) == 0 else set()
 
     def is_known(word: str) -> bool:
@@ -753,7 +761,8 @@ def _unknown_words(column: str, quantity: Quantity) -> list[str]:
         return any(pattern.search(word) for pattern in patterns)
 
     plain = _FIRST_PIOLA.sub("nominal", re.sub(r"['’]s\b", "", name))
-    return [word for word in re.findall(r"[^\W\d_]+", plain) if not is_known(word)]
+    unknown = [word for word in re.findall(r"[^\W\d_]+", plain) if not is_known(word)]
+    return unknown + _ARITHMETIC.findall(plain)
 
 
 def column_statement(names: Mapping[str, str]) -> str:
