@@ -52,6 +52,8 @@ C = TypeVar("C", bound=Callable[..., Any])
 # (".key" of a table, "[index]" of a list, or ""), the value there, and the faults, which are entries
 # of pydantic's `ValidationError.errors()`, one for each form that would be accepted.
 Refusal = Callable[[Mapping[str, Any], str, str, Any, Sequence[Mapping[str, Any]]], Exception]
+# Characters of a value that a representation shows.
+LONGEST_VALUE = 60
 _CONFIGURATION = ConfigDict(extra="forbid", arbitrary_types_allowed=True, validate_default=True)
 _PLAIN = {float: Number, int: StrictInteger, bool: Flag, str: Annotated[str, Strict()]}
 _ARRAY = Annotated[Any, AfterValidator(require_numbers)]
@@ -177,7 +179,29 @@ def validate_arguments(
 
     if is_class:
         called.__init__ = call
+        if stated_fields and hasattr(called.__repr__, "__wrapped__"):  # that of `dataclass`
+            called.__repr__ = _one_line
     return called if is_class else call
+
+
+def _one_line(made: Any) -> str:
+    """Return a class with its fields that differ from their defaults, arrays by their shapes."""
+    shown = []
+    for each in fields(made):
+        value = getattr(made, each.name)
+        default = each.default
+        if default is MISSING and each.default_factory is not MISSING:
+            default = each.default_factory()
+        if isinstance(value, np.ndarray):
+            text = f"array of shape {value.shape}"
+        elif not each.repr or value is default or repr(value) == repr(default):
+            continue
+        else:
+            text = " ".join(repr(value).split())
+        shown.append(
+            f"{each.name}={text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + '…'}"
+        )
+    return f"{type(made).__name__}({', '.join(shown)})"
 
 
 def _of_all(form: Any, parameter: inspect.Parameter) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import ClassVar
@@ -134,6 +134,21 @@ def test_objects_have_a_readable_representation():
     assert repr(swung(box())) == (
         "Experiment('experiment': 11 samples over 0.1 s, grasps: 1, Markers(m1, m2: 22 samples))"
     )
+
+
+def test_options_show_only_what_differs_from_the_defaults():
+    assert repr(cs.Nuisance()) == "Nuisance()"
+    shown = repr(cs.UncertaintyOptions(numerical=True, assumptions=cs.Assumptions(mass=0.3)))
+    assert shown == "UncertaintyOptions(numerical=True, assumptions=Assumptions(mass=0.3))"
+    fixed = repr(cs.Grasp([0, 1], cs.PoseSequence.fixed()))
+    assert fixed.startswith("Grasp(nodes=array of shape (2,), poses=PoseSequence(t_s=array of")
+
+
+def test_no_class_shows_many_fields():
+    for name in cs.__all__:
+        kind = getattr(cs, name)
+        if is_dataclass(kind) and hasattr(kind.__repr__, "__wrapped__"):  # that of `dataclass`
+            assert sum(field.repr for field in fields(kind)) <= 8, name
 
 
 # Runs ---------------------------------------------------------------------------------------------
