@@ -71,8 +71,10 @@ SMALLEST_TRUST = 1e-10
 SAFETY = 0.3
 # Largest residual of the equations of motion after that step, in the scaling of the NLP.
 FEASIBLE_FORCE = 1e-10
-# Largest trust region.
+# Largest step of the logarithm of a parameter, and of nuisance parameters.
 WIDEST = 4.0
+# Largest trust region with linear parameters, whose units may be far below what the data allow.
+WIDEST_LINEAR = 1e6
 # Largest trust region with unlabelled points, whose correspondences are valid only nearby.
 SEEING = 0.25
 # With unlabelled points, a rejected step shorter than this ends the search.
@@ -187,6 +189,8 @@ class ReducedSearch:
         Longest step, relative to `reach`.
     reach : (np,) array
         Change of each parameter that counts as a step of one.
+    largest_step : (np,) array
+        Largest change of each parameter in one step.
     lower, upper : (np,) array
         Bounds of the parameters.
     has_correspondences : bool
@@ -255,7 +259,10 @@ class ReducedSearch:
         self.largest_strain = (
             SMALL_IMPACT_STRAIN if self.has_impacts else SLENDER_STRAIN if is_slender else None
         )
-        self.largest_trust = SEEING if self.has_unlabelled else WIDEST
+        linear = [item.scale == "linear" for item in collocation.parameters.free]
+        linear = np.flatnonzero(linear)
+        widest = WIDEST_LINEAR if len(linear) else WIDEST
+        self.largest_trust = SEEING if self.has_unlabelled else widest
         self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
         self.refines_solutions = not all(
@@ -273,6 +280,8 @@ class ReducedSearch:
         self.ended_by_association = False
         self.feasible_length = np.inf
         self.reach = collocation.reach_p
+        self.largest_step = WIDEST * self.reach
+        self.largest_step[linear] = WIDEST_LINEAR
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
         self.workers = workers
@@ -531,8 +540,9 @@ class ReducedSearch:
 
     def _next_step(self, point: Iterate, curvature: Array, trust: float) -> Array:
         """Return the step that minimises the quadratic model within bounds and trust region."""
-        low = np.maximum(self.lower - point.p, -trust * self.reach)
-        high = np.minimum(self.upper - point.p, trust * self.reach)
+        largest = np.minimum(trust * self.reach, self.largest_step)
+        low = np.maximum(self.lower - point.p, -largest)
+        high = np.minimum(self.upper - point.p, largest)
         # Rounding may leave a parameter on its bound by a hair.
         low = np.minimum(low, 0.0) - 1e-15
         high = np.maximum(high, 0.0) + 1e-15

@@ -442,3 +442,15 @@ def test_ripples_of_the_loss_of_an_impact_end_a_search_near_its_minimum(
     monkeypatch.setattr(Horizon, "evaluate_step", fail)
     collocation = falling_block({"young_pa": guess_pa}, noise_m=0.0).collocation()
     assert ReducedSpace(ladder=(1.0,))(collocation).status is status
+
+
+def test_a_law_with_linear_constants_converges_on_the_toe_of_a_curve():
+    # The unit of C20 and C30 is the stiffness over a strain of one, a thousandth of their values.
+    strain = np.linspace(0, 0.045, 40)
+    stress_pa = 8e5 * strain * np.minimum(strain / 0.012, 1.0) ** 0.8
+    stress_pa = stress_pa + 250 * np.random.default_rng(2).normal(size=40)
+    press = cs.Specimen("uniaxial", -strain, -stress_pa, 250.0).experiment("yeoh", "press")
+    unknown = {name: cs.Unknown() for name in ("c10_pa", "c20_pa", "c30_pa")}
+    solution = cs.solve(cs.Problem([press], unknown | {"kappa_pa": 1e9}))
+    assert solution.status is Status.CONVERGED
+    assert solution.iterations < 60
