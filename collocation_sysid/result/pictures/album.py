@@ -38,8 +38,8 @@ from .stress_strain import force_picture, harmonic_picture, relaxation_picture, 
 def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
-    Pictures without data are left out. A specimen has pictures of its measurements over strain
-    only.
+    Pictures without data are left out. A run of specimens alone has those of the intervals, of the
+    budget and of its measurements over strain only.
 
     Parameters
     ----------
@@ -50,16 +50,20 @@ def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, F
         Content of ``result.json`` of the same run.
     """
     names = [n for n, item in result.parameters.items() if not item.fixed and n in result.estimates]
-    pictures = {"convergence": convergence(result.history, names)} if result.history else {}
-    if (scan := result.scan) is not None:
+    pictures = dict[str, Figure]()
+    has_body = not replays or any(replay.strain is None for replay in replays)
+    if result.history and has_body:
+        pictures["convergence"] = convergence(result.history, names)
+    if (scan := result.scan) is not None and has_body:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, best=scan.best)
     confidence = Confidence.from_result(result)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
-        pictures["correlation"] = correlation_matrix(confidence)
+        if has_body:
+            pictures["correlation"] = correlation_matrix(confidence)
     known = result.uncertainty
     # Alone, each combination is one of the constants.
-    if known is not None and any(len(each.names) > 1 for each in known.directions):
+    if has_body and known is not None and any(len(each.names) > 1 for each in known.directions):
         members = {name for each in known.directions for name in each.names}
         ends = {n: result.parameters[n].combined95 for n in names if n in members}
         alone = {
