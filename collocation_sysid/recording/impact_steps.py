@@ -24,7 +24,7 @@ def impact_steps(experiment: Experiment) -> int:
     the positions afterwards is of first order, a share of the motion in a step.
     """
     markers = experiment.markers
-    if experiment.is_static or not len(markers.names):
+    if experiment.is_static or not experiment.obstacles or not len(markers.names):
         return 1
     sigma_m = float(np.sqrt(np.mean(markers.sigma_m**2)))
     moved_m = 0.0

@@ -607,8 +607,6 @@ def impact_step_concerns(experiment: Experiment, substeps: int) -> list[Concern]
     """Return one concern, as a list, if a body that may strike an obstacle moves by much more than the
     noise of its markers in one of the `substeps` of a sample; else empty.
     """
-    if not experiment.obstacles:
-        return []
     needed = impact_steps(experiment)
     is_coarse = needed > FEW_IMPACT_STEPS * substeps
     return concern_if(
