@@ -143,8 +143,8 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
     if say is not None and (is_large or size.time_s() > ANNOUNCED_SOLVE_S):
         act = "a solve" if size.unknowns else "a simulation"
         say(
-            f"{what}: {act} takes about {duration(size.time_s())} and "
-            f"{size.memory_mb() / 1e3:.2g} GB of memory, or more"
+            f"{what}: {act} takes about {size.memory_mb() / 1e3:.2g} GB of memory, or more; "
+            "check estimates its time"
         )
 
 
