@@ -6,7 +6,7 @@
 >>> run.parameters, run.interval("mu_pa")             # doctest: +SKIP
 """
 
-from .common import signal_handling as _starting  # noqa: F401  (before all that takes time to import)
+from .common import starting as _starting  # noqa: F401  (before all that takes time to import)
 
 # isort: split
 import ast as _ast

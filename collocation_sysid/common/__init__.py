@@ -6,7 +6,7 @@
 - `files`, `array_files`, `written_files`: reading and writing of files, completely or not at all.
 - `serialisation`: results as JSON; `display`: output as text, HTML and Markdown, in the
   terminal too; `pages`: pages of the documentation.
-- `signal_handling`, `isolated_process`: interrupts, and work in a process of its own.
+- `starting`, `signal_handling`, `isolated_process`: interrupts, and work in a process of its own.
 - `step_counting`: progress of long operations; `machine`: available memory; `cluster`: Dask.
 - `array_types`: array types for annotations.
 """

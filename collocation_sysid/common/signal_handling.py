@@ -1,8 +1,4 @@
-"""Handling of Ctrl-C and SIGTERM by the command line.
-
-This module is imported before all others and imports almost nothing, so that an interrupt during
-the imports ends the program without a traceback.
-"""
+"""Handling of Ctrl-C and SIGTERM by the command line."""
 
 from __future__ import annotations
 
@@ -17,7 +13,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-COMMAND = "collocation-sysid"
+from .starting import leave_at_once
+
 # Name of a thread that is left in a library's code, which no signal reaches.
 ABANDONED_THREAD = "left behind"
 # Files in whose functions an exception may be lost: the importer, and the wrappers of CasADi, whose
@@ -110,17 +107,6 @@ class Interrupts:
 INTERRUPTS = Interrupts()
 
 
-def _end_quietly() -> None:
-    """End the command line at Ctrl-C and SIGTERM during imports with its own exit codes."""
-    command = os.path.splitext(os.path.basename(sys.argv[0]))[0]
-    if command == COMMAND:
-        _handle(_leave_at_once, (signal.SIG_DFL, signal.default_int_handler))
-
-
-def _leave_at_once(number: int, _: FrameType | None) -> None:
-    os._exit(128 + number)
-
-
 def _handle(handler: Any, replaced: tuple[object, ...]) -> None:
     """Set the handler of Ctrl-C and SIGTERM where it is one of the replaced ones."""
     if threading.current_thread() is threading.main_thread():  # others may set none
@@ -139,7 +125,7 @@ def heed_interrupts() -> None:
     ENDED.status = None
     if threading.current_thread() is threading.main_thread():
         sys.unraisablehook = INTERRUPTS.note_unraisable
-    _handle(INTERRUPTS, (signal.SIG_DFL, signal.default_int_handler, _leave_at_once))
+    _handle(INTERRUPTS, (signal.SIG_DFL, signal.default_int_handler, leave_at_once))
 
 
 def ignore_interrupts() -> None:
@@ -198,7 +184,6 @@ def _is_losing(frame: FrameType | None) -> bool:
     return False
 
 
-_end_quietly()
 # While the interpreter clears its modules, it sets other handlers to the default. What is registered
 # first is called last.
 atexit.register(_handle, signal.SIG_IGN, (ENDED,))

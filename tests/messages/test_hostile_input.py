@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import concurrent.futures.thread
 import contextlib
 import io
@@ -518,6 +519,15 @@ def test_an_interrupt_during_imports_prints_nothing(name: str):
     done = ended(STARTED.format(name=name))
     assert done.returncode == 130
     assert done.stderr == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_signals_are_handled_before_slow_modules_are_imported():
+    new = "[name for name in sys.modules if name not in before]"
+    done = ended(f"import sys; before = {{*sys.modules}}; import collocation_sysid; print({new})")
+    names = ast.literal_eval(done.stdout)
+    first = names[: names.index("collocation_sysid.common.starting")]
+    assert {*first} <= {"collocation_sysid", "collocation_sysid.common", "__future__"}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")

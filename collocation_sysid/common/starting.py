@@ -1,0 +1,32 @@
+"""Ctrl-C and SIGTERM while the command line starts.
+
+This module is imported before all others and imports only what Python itself has imported, so that
+an interrupt during the imports ends the program without a traceback.
+"""
+
+from __future__ import annotations
+
+import _signal  # `signal` imports others
+import os
+import sys
+
+COMMAND = "collocation-sysid"
+
+
+def leave_at_once(number: int, _: object) -> None:
+    """End the process with the exit code of a signal."""
+    os._exit(128 + number)
+
+
+def _end_quietly() -> None:
+    """End the command line at Ctrl-C and SIGTERM during imports with its own exit codes."""
+    if os.path.splitext(os.path.basename(sys.argv[0]))[0] == COMMAND:
+        for number in (_signal.SIGINT, _signal.SIGTERM):
+            if _signal.getsignal(number) in (_signal.SIG_DFL, _signal.default_int_handler):
+                _signal.signal(number, leave_at_once)
+
+
+try:  # noqa: SIM105  (contextlib takes time to import)
+    _end_quietly()
+except ValueError:  # handlers can be set in the main thread alone
+    pass
