@@ -408,6 +408,21 @@ def strains_of(G: ca.SX) -> ca.SX:
     )
 
 
+def strains_with_sections(G: ca.SX, half_m: ca.SX) -> ca.SX:
+    """Return (Γ, κ) at a gradient G (3, 5), then Green's strains of both sections (12,), at half the
+    length of the element.
+    """
+    d1, d2, _, d1_slope, d2_slope = ca.horzsplit(G)
+    strain = strains_of(G)
+    for offset in (-half_m, half_m):
+        first, second = d1 + offset * d1_slope, d2 + offset * d2_slope
+        own = ca.vertcat(
+            ca.dot(first, first) - 1, ca.dot(second, second) - 1, ca.dot(first, second)
+        )
+        strain = ca.vertcat(strain, own / 2)
+    return strain
+
+
 def _strain_function() -> ca.Function:
     G = ca.SX.sym("G", 3, COLUMNS)
     return ca.Function("strains", [G], [strains_of(G)])
@@ -496,7 +511,11 @@ class RodMaterial(Material):
 
     def stiffness(self, values: Sequence[float]) -> Array:
         """Return GA, GA, EA, EI₁, EI₂ and GJ (6,) from the constants (c,)."""
-        return np.array(ca.evalf(self._stiffness(ca.SX(ca.DM(list(values)))))).ravel()
+        return self.all_stiffnesses(values)[:STRAINS]
+
+    def all_stiffnesses(self, values: Sequence[float]) -> Array:
+        """Return them with those of both sections (12,)."""
+        return np.array(ca.evalf(self._all_stiffnesses(ca.SX(ca.DM(list(values)))))).ravel()
 
     def natural_strains(self, values: Sequence[float]) -> Array:
         """Return the natural curvatures and twist (3,) [1/m] from the constants (c,)."""
@@ -525,17 +544,14 @@ class RodMaterial(Material):
         """Return the stiffnesses (12,) and strains (12,) whose energy per length is ½ Σ stiffness ·
         strain²: those of the rod, then Green's strains of both sections.
         """
-        stiffness, strain = self._stiffness(values), self._strain(G, values)
-        section = SECTION_STIFFNESS * stiffness[2] / 2 * ca.SX([1, 1, 2])
-        d1, d2, _, d1_slope, d2_slope = ca.horzsplit(G)
         half = values[len(self.constants)]  # not from the volume, by which stiffness is scaled
-        for offset in (-half, half):
-            first, second = d1 + offset * d1_slope, d2 + offset * d2_slope
-            own = ca.vertcat(
-                ca.dot(first, first) - 1, ca.dot(second, second) - 1, ca.dot(first, second)
-            )
-            stiffness, strain = ca.vertcat(stiffness, section), ca.vertcat(strain, own / 2)
-        return stiffness, strain
+        of_sections = strains_with_sections(G, half)[STRAINS:]
+        return self._all_stiffnesses(values), ca.vertcat(self._strain(G, values), of_sections)
+
+    def _all_stiffnesses(self, values: ca.SX) -> ca.SX:
+        stiffness = self._stiffness(values)
+        section = SECTION_STIFFNESS * stiffness[2] / 2 * ca.SX([1, 1, 2])
+        return ca.vertcat(stiffness, section, section)
 
     def _strain(self, G: ca.SX, values: ca.SX) -> ca.SX:
         rest = values[values.numel() - STRAINS - 1 : values.numel() - 1]

@@ -97,6 +97,9 @@ WARM_PUSH = 1e-9
 WARM_MULTIPLIER = 1e-10
 # The barrier parameter begins there at this share of the tolerance, near where it ends.
 WARM_BARRIER = 0.1
+# Least tolerance for slender bodies: rounding errors of their positions, which the rigid sections
+# multiply, change the gradient by about 2e-8.
+SLENDER_TOLERANCE = 1e-7
 # Time that IPOPT is given at least, in which it begins and ends at once [s].
 SHORTEST_S = 1e-9
 # Smallest and largest factor by which one step changes the damping.
@@ -276,8 +279,10 @@ class InteriorPoint(MethodOptions):
         self, functions: NlpFunctions, program: Collocation, *, is_warm: bool
     ) -> dict[str, Any]:
         """Return the options except the time limit; those of the user replace the others."""
+        is_slender = any(each.body.is_slender for each in program.transcriptions)
+        tolerance = max(self.tolerance, SLENDER_TOLERANCE * is_slender)
         settings = nlpsol.ipopt_settings(
-            functions, self.linear_solver, self.tolerance, self.max_iterations
+            functions, self.linear_solver, tolerance, self.max_iterations
         )
         settings |= {
             "ipopt.nlp_scaling_method": "none",  # the NLP is scaled already
@@ -289,7 +294,7 @@ class InteriorPoint(MethodOptions):
                 "ipopt.warm_start_bound_push": WARM_PUSH,
                 "ipopt.warm_start_bound_frac": WARM_PUSH,
                 "ipopt.warm_start_mult_bound_push": WARM_MULTIPLIER,
-                "ipopt.mu_init": WARM_BARRIER * self.tolerance,
+                "ipopt.mu_init": WARM_BARRIER * tolerance,
             }
         if self.linear_solver == "mumps":  # the matrix as it is: IPOPT refines
             settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_pivtol": PIVOT_TOLERANCE}
@@ -301,11 +306,9 @@ class InteriorPoint(MethodOptions):
             settings["ipopt.hessian_approximation"] = "limited-memory"
         sharpness = _largest_curvature(program)
         settings |= {
-            # Rows of pressures are nearly dependent where a surface lies on another. With the
-            # rigid sections of a rod the multipliers are too large for the constant.
+            # Rows of pressures are nearly dependent where a surface lies on another.
             "ipopt.perturb_always_cd": "no"
             if lifted_count(complete_program(program), "pressure")
-            or any(each.body.is_slender for each in program.transcriptions)
             else "yes",
             "ipopt.jacobian_regularization_exponent": 0.0,
             "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),

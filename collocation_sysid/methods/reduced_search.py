@@ -640,9 +640,9 @@ class ReducedSearch:
         return self._accept(horizon, resimulated)
 
     def _are_feasible(self, reached: list[Feasibility]) -> bool:
-        """Whether each largest residual is at most `FEASIBLE_FORCE` times its unit of force."""
+        """Whether each largest residual is at most `FEASIBLE_FORCE` times its `stiffness_n`."""
         return all(
-            each.violation_n <= FEASIBLE_FORCE * transcription.force_n
+            each.violation_n <= FEASIBLE_FORCE * transcription.stiffness_n
             for each, transcription in zip(reached, self.collocation.transcriptions, strict=True)
         )
 

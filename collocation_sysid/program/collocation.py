@@ -23,7 +23,7 @@ Constraints g, in this order:
 =================  =========================================================================
 c_{e,t,i} / f_e    equations of motion: experiment e, grid time t from 0 (start in
                    equilibrium) or 1, free dofs i ascending; f_e is the mean of
-                   |∂c_t/∂x_t| ℓ_e at the guess
+                   |∂c_t/∂x_t| ℓ_e at the guess, or of a rod a force that bends it
 (x − u x̄) / ℓ_e    prescribed displacements, in place of c: of dofs grasped for a part of the
                    time; with `has_grasp_constraints` of all grasped dofs, so that every dof has a
                    constraint

@@ -236,7 +236,7 @@ class DrivenMotion:
                 return None
             x = x + step
             size = float(np.abs(step).max())
-            if violation <= CORRECTED * self.transcription.force_n or (
+            if violation <= CORRECTED * self.transcription.stiffness_n or (
                 size <= 1e-12 * self.transcription.length_m
             ):
                 return x

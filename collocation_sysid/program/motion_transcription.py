@@ -30,6 +30,7 @@ from ..model.inputs import Inputs, inputs_from_experiment, with_inputs
 from ..model.internal_variables import AnyHistory
 from ..model.nuisance_map import NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
+from ..model.rod_stresses import bending_moment_n_m
 from ..recording.experiment import Experiment
 from .linear_algebra.block_band import (
     BandBlock,
@@ -275,8 +276,18 @@ class MotionTranscription:
 
     @cached_property
     def force_n(self) -> float:
+        """Unit of equations of motion [N]: `stiffness_n`; of a rod, whose rigid sections would leave
+        no other force visible, the force whose moment at one edge length bends it by 1 rad.
+        """
+        if not self.body.is_slender:
+            return self.stiffness_n
+        theta = self.constants.theta(self.parameters.guess_q)
+        return bending_moment_n_m(self.body, theta) / self.length_m
+
+    @cached_property
+    def stiffness_n(self) -> float:
         """Mean of |∂c_t/∂x_t| ℓ over the diagonal at the undeformed shape and the guess
-        [N], the unit of equations of motion.
+        [N], to which rounding errors are in proportion.
         """
         theta = self.constants.theta(self.parameters.guess_q)
         at_rest = self.body.nodes_m

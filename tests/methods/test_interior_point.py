@@ -588,7 +588,8 @@ def test_the_history_counts_iterations_and_ends_at_the_answer():
 
 
 @pytest.mark.long
-def test_the_constants_of_a_cable_are_those_of_reduced_space():
+@pytest.mark.parametrize("initial", ["reduced-space", "simulation"])
+def test_the_constants_of_a_cable_are_those_of_reduced_space(initial):
     mesh = straight(0.6, CrossSection.round(0.006), 11, (0, 0, -1))
     body = cable(mesh)
     t_s = np.arange(31) * 0.01
@@ -603,6 +604,7 @@ def test_the_constants_of_a_cable_are_those_of_reduced_space():
     truth |= {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
     seen = with_markers(swing, simulate(swing, truth, "midpoint", substeps=1).markers_m)
     problem = Problem([seen], truth | {"bending_n_m2": Unknown(1.5e-3)}, substeps=1)
-    found = solve(problem, InteriorPoint())
+    found = solve(problem, InteriorPoint(initial=initial))
     assert found.status.converged
+    assert found.iterations <= 10 + (initial == "simulation")
     assert found.parameters["bending_n_m2"] == pytest.approx(1e-3, rel=1e-6)

@@ -1,28 +1,29 @@
 """Program with lifted variables, for methods that need sparse exact matrices.
 
-`with_lifted_variables` returns the program in which history variables, measured reactions and
-pressures of obstacles are variables with equations of their own, see `lifted_variables`. The
-optimum and the multipliers of the other constraints are those of the program in which they are
-eliminated.
+`with_lifted_variables` returns the program in which history variables, measured reactions,
+pressures of obstacles and stresses of rods are variables with equations of their own, see
+`lifted_variables`. The optimum and the multipliers of the other constraints are those of the program
+in which they are eliminated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ...common.array_types import Array, Index
+from ...model.rod_stresses import GivenStresses
 from ..collocation import Collocation
 from ..experiment_iterate import ExperimentIterate
 from ..motion_transcription import Offsets, RowWeights, WeightedHistory
 from ..transcription import Transcription
 from .force_histories import LiftedForceHistory
 from .memory import LiftedMemory
-from .pressures import LiftedPressure
+from .pressures import LiftedPressure, LiftedStress
 from .reactions import LiftedReactions
 from .resultants import LiftedResultant
 from .variables import LiftedVariables
@@ -137,15 +138,32 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
     """Return the program with lifted variables, or the argument itself if it has them already or
     nothing can be lifted.
 
-    The transcriptions are shared with the result.
+    The transcriptions are shared with the result, except those of rods.
     """
-    if not collocation.eliminates_variables:
+    is_slender = any(each.body.is_slender for each in collocation.transcriptions)
+    if isinstance(collocation, LiftedCollocation) or not (
+        collocation.eliminates_variables or is_slender
+    ):
         return collocation
     settings = {field.name: getattr(collocation, field.name) for field in fields(Collocation)}
     lifted = LiftedCollocation(**settings)
     # The same transcriptions, with the values that they have cached.
-    vars(lifted)["transcriptions"] = collocation.transcriptions
+    vars(lifted)["transcriptions"] = tuple(
+        _with_given_stresses(each) if each.body.is_slender else each
+        for each in collocation.transcriptions
+    )
     return lifted
+
+
+def _with_given_stresses(transcription: Transcription) -> Transcription:
+    """Return the transcription of a rod with `GivenStresses` in its equations of motion."""
+    theta = transcription.constants.theta(transcription.parameters.guess_q)
+    energy_j = transcription.force_n * transcription.length_m
+    stresses = GivenStresses.from_body(transcription.body, theta, energy_j)
+    dynamics = transcription.dynamics
+    own = replace(transcription)
+    vars(own)["dynamics"] = replace(dynamics, forces=stresses.added_to(dynamics.forces))
+    return own
 
 
 def lifted_variables(collocation: Collocation) -> tuple[LiftedVariables, ...]:
@@ -159,7 +177,7 @@ def lifted_count(collocation: Collocation, kind: str | None = None) -> int:
 
     Parameters
     ----------
-    kind : {"memory", "force", "pressure", "reaction"}, optional
+    kind : {"memory", "force", "pressure", "stress", "reaction"}, optional
         Kind of lifted variables; None means all.
     """
     return sum(each.count for each in lifted_variables(collocation) if kind in (None, each.kind))
@@ -221,7 +239,10 @@ def lift_variables(
         forces = transcription.dynamics.forces
         of_forces = [
             *((LiftedForceHistory, k) for k in forces.terms_with_internal_variables),
-            *((LiftedPressure, k) for k in forces.complementarity_terms),
+            *(
+                (LiftedStress if transcription.body.is_slender else LiftedPressure, k)
+                for k in forces.complementarity_terms
+            ),
         ]
         for history, (kind, k) in enumerate(of_forces, int(transcription.body.has_memory)):
             add(kind, motion_history=history, force_index=k, reactions=reactions)

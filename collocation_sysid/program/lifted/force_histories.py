@@ -42,6 +42,8 @@ class LiftedForceHistory(LiftedVariables):
     kind = "force"
     # Index of the evaluation that the first variables belong to.
     first_evaluation = 1
+    # Whether force and equations are linear in the variables, and neither has parameters.
+    is_bilinear = False
 
     @property
     def unit_m(self) -> float:
@@ -180,13 +182,14 @@ class LiftedForceHistory(LiftedVariables):
             )
 
     def _hessian_blocks(self) -> Iterator[EntryBlock]:
-        """Yield the Hessian's entries in the columns of b: by b, by x and by parameters."""
+        """Yield the Hessian's entries in the columns of b: by x, by b and by parameters."""
         columns = self.offsets.variable + self._indices
-        i, j = np.triu_indices(self.shape[0])
-        yield EntryBlock([columns[i]], [columns[j]])
         for here, x, *_ in self._position_lags(self.first_evaluation):
             yield EntryBlock([x], [columns[:, here][..., self._points.nonzero_weights[0]]])
-        yield EntryBlock([self._dynamic_columns[:, None, None, None]], [columns])
+        if not self.is_bilinear:
+            i, j = np.triu_indices(self.shape[0])
+            yield EntryBlock([columns[i]], [columns[j]])
+            yield EntryBlock([self._dynamic_columns[:, None, None, None]], [columns])
 
     def jacobian_values(self, iterate: ExperimentIterate, z: Array) -> tuple[Array, Array]:
         history = self._history_of(iterate)
@@ -228,9 +231,11 @@ class LiftedForceHistory(LiftedVariables):
         second_derivatives = history.mixed_second_derivatives(mu, weights.forces)
         first = self.first_evaluation
         by = LawDerivatives(*(self.unit_m * each[:, :, first:] for each in second_derivatives))
-        blocks = [self.unit_m * by.b[np.triu_indices(self.shape[0])]]
         by_state = LawDerivatives(*(each.swapaxes(0, 1) for each in by))
-        blocks += [length_m * each for each in self._position_derivatives(first, by_state)]
+        blocks = [length_m * each for each in self._position_derivatives(first, by_state)]
+        if self.is_bilinear:
+            return np.concatenate([each.ravel() for each in blocks])
+        blocks.append(self.unit_m * by.b[np.triu_indices(self.shape[0])])
         of_inputs = iterate.equations.input_derivatives[first:][:, places]
         blocks.append(np.einsum("cati,tcm->mati", by.c, of_inputs))
         return np.concatenate([each.ravel() for each in blocks])

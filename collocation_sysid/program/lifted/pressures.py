@@ -6,8 +6,8 @@ For evaluations k with an equation of motion, in the unit δ of the pressures,
 
 with the pressure variable b, the gap g and the relaxation r of a
 `model.point_forces.ComplementarityForce`. The structure is that of a force history
-(`force_histories`), but b belongs to the evaluation itself instead of the one before. The
-variables are not negative.
+(`force_histories`), but b belongs to the evaluation itself instead of the one before. Stresses of a
+rod have the same structure.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...common.array_types import Array
+from ...fem.rods import RESULTANTS
 from ...model.point_forces import ComplementarityForce
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
@@ -27,10 +28,10 @@ from .force_histories import LiftedForceHistory
 
 @dataclass(frozen=True, eq=False)
 class LiftedPressure(LiftedForceHistory):
-    """Lifted pressure variables b of one force of one experiment; their lower bound is 0."""
+    """Lifted pressure variables b of one force of one experiment."""
 
     kind = "pressure"
-    lower_bound = 0.0  # type: ignore[override]
+    width = 1  # number of variables of each point
 
     @property
     def first_evaluation(self) -> int:  # type: ignore[override]
@@ -51,20 +52,20 @@ class LiftedPressure(LiftedForceHistory):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Shape (1, evaluations, I): evaluations with an equation
+        """Shape (width, evaluations, I): evaluations with an equation
         of motion, and I points.
         """
-        return 1, self.transcription.constraint_times, self._points.count
+        return self.width, self.transcription.constraint_times, self._points.count
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
         xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
         return self._find_force().scaled_pressures(xi).ravel() / self.unit_m
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
-        """Return a copy of the iterate with the scaled pressures b (1, N, I) [m] of this force
+        """Return a copy of the iterate with the scaled pressures b (width, N, I) [m] of this force
         taken from z; b is zero at a stated initial state.
         """
-        b = np.zeros((1, self.transcription.grid_times, self._points.count))
+        b = np.zeros((self.width, self.transcription.grid_times, self._points.count))
         b[:, self.first_evaluation :] = self.unit_m * z[self.columns].reshape(self.shape)
         return replace(iterate, lifted_pressures={**iterate.lifted_pressures, self.force_index: b})
 
@@ -78,11 +79,11 @@ class LiftedPressure(LiftedForceHistory):
         )
 
     def weighted_history(self, iterate: ExperimentIterate, multipliers: Array) -> WeightedHistory:
-        """Return the history and its weights μ (1, N, I) in the Lagrangian, such that multipliers ·
+        """Return the history and its weights μ (width, N, I) in the Lagrangian, such that multipliers ·
         equations = Σ μ_k h_k with the unscaled equations h_k of evaluation k; `multipliers` are
         those of all constraints g.
         """
-        mu = np.zeros((1, self.transcription.grid_times, self._points.count))
+        mu = np.zeros((self.width, self.transcription.grid_times, self._points.count))
         mu[:, self.first_evaluation :] = multipliers[self.rows].reshape(self.shape) / self.unit_m
         return self._history_of(iterate), mu
 
@@ -91,7 +92,7 @@ class LiftedPressure(LiftedForceHistory):
         rows = self.offsets.row + self._indices
         columns = self.offsets.variable + self._indices
         instance = self._points.nonzero_weights[0]
-        yield EntryBlock([rows], [columns])
+        yield EntryBlock([rows], [columns])  # no equation has the variable of another
         for here, x, *_ in self._position_lags(self.first_evaluation):
             yield EntryBlock([rows[:, here][..., instance]], [x])
         for pairs, k, row, _ in self._motion_entries():
@@ -104,10 +105,18 @@ class LiftedPressure(LiftedForceHistory):
         d = self._points.dofs
         slopes = history.derivatives(slice(None))
         by = type(slopes)(*(each[d:, :, self.first_evaluation :] / self.unit_m for each in slopes))
-        blocks = [self.unit_m * by.b]
+        blocks = [self.unit_m * np.einsum("aati->ati", by.b)]
         blocks += [
             self.transcription.length_m * each
             for each in self._position_derivatives(self.first_evaluation, by)
         ]
         blocks += self._motion_derivatives(slopes)
         return self.residuals(iterate, z), np.concatenate([each.ravel() for each in blocks])
+
+
+class LiftedStress(LiftedPressure):
+    """Lifted stresses of the elements of a rod, see `model.rod_stresses`."""
+
+    kind = "stress"
+    width = RESULTANTS
+    is_bilinear = True
