@@ -271,3 +271,44 @@ def test_pixels_of_one_camera_are_solved(tmp_path):
     assert_within(run, "young_pa", 60e3)
     assert_within(run, "poisson", 0.35)
     assert_within(run, "gamma_r_s", 2e-3)
+
+
+@pytest.mark.parametrize(
+    ("case", "note"),
+    [
+        ("bluehill_results_table", "length_m = 0.05 is the length that is stretched"),
+        ("unordered_time_of_elastic_specimen", "21 of 30 rows are used"),
+        ("c3d_model_outputs_as_markers", "LWristAngles of POINT:ANGLES are outputs of a model"),
+    ],
+)
+def test_files_of_other_programs_are_read_with_a_note(case, note):
+    assert CASES is not None
+    notes = cs.Problem.read(CASES / case / "problem.toml").notes
+    assert any(note in each for each in notes), notes
+
+
+@pytest.mark.parametrize(
+    ("case", "file", "found"),
+    [
+        ("lagrange_strain", "problem.toml", "holds a Green-Lagrange strain"),
+        ("lagrange_strain", "mr.toml", "holds a Green-Lagrange strain"),
+        ("shear_modulus_read_as_E", "harmonic.toml", 'expected test = "shear-harmonic"'),
+        ("shear_modulus_read_as_E", "relaxation.toml", 'expected test = "shear-relaxation"'),
+        ("template_video_keys", "problem.toml", "belongs to image_tracks, above the table camera"),
+    ],
+)
+def test_words_that_contradict_a_reading_are_refused(case, file, found):
+    assert CASES is not None
+    with pytest.raises(cs.InputError, match=found):
+        cs.Problem.read(CASES / case / file)
+
+
+@pytest.mark.parametrize("file", ["specimen.toml", "specimen_strain.toml"])
+def test_the_platens_of_a_flat_disc_are_in_the_interval(file):
+    assert_within(answer("disc_compression_specimen", file), "young_pa", 1e6)
+
+
+def test_terms_of_ogden_that_nearly_cancel_end_with_an_answer():
+    run = answer("two_term_ogden_no_convergence")
+    assert run.solution.status.converged
+    assert_within(run, "young_pa", 478e3)
