@@ -184,11 +184,11 @@ def validate_arguments(
     return called if is_class else call
 
 
-def _one_line(made: Any) -> str:
+def _one_line(self: Any) -> str:
     """Return a class with its fields that differ from their defaults, arrays by their shapes."""
     shown = []
-    for each in fields(made):
-        value = getattr(made, each.name)
+    for each in fields(self):
+        value = getattr(self, each.name)
         default = each.default
         if default is MISSING and each.default_factory is not MISSING:
             default = each.default_factory()
@@ -201,7 +201,7 @@ def _one_line(made: Any) -> str:
         shown.append(
             f"{each.name}={text if len(text) <= LONGEST_VALUE else text[:LONGEST_VALUE] + '…'}"
         )
-    return f"{type(made).__name__}({', '.join(shown)})"
+    return f"{type(self).__name__}({', '.join(shown)})"
 
 
 def _of_all(form: Any, parameter: inspect.Parameter) -> Any:
