@@ -180,7 +180,7 @@ def validate_arguments(
     if is_class:
         called.__init__ = call
         if stated_fields and hasattr(called.__repr__, "__wrapped__"):  # that of `dataclass`
-            called.__repr__ = _one_line
+            called.__repr__ = _one_line  # type: ignore[method-assign]
     return called if is_class else call
 
 
