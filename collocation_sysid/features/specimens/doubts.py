@@ -354,4 +354,6 @@ def _compressed(experiment: Experiment) -> Correction:
     return _strained(replace(reversed_stress, readings=readings), -1.0), {}
 
 
-SPECIMENS = Source(Specimen, candidates=specimen_candidates, consistent=likelier_kinds)
+SPECIMENS = Source(
+    HomogeneousDeformation, candidates=specimen_candidates, consistent=likelier_kinds
+)
