@@ -495,7 +495,12 @@ class ReducedSearch:
                 self.ended_by_association = not is_near
                 return Status.CONVERGED
             if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
-                return self._status_without_progress(point, curvature)
+                if rejections or self._is_feasible(point, NEARLY_FEASIBLE):
+                    return self._status_without_progress(point, curvature)
+                # The loss of an infeasible point may be too low, also at bounds.
+                point = self._make_feasible(horizon, point)
+                rejections = 1
+                continue
             self.trust = SHRINK * length
             if rejections and self.has_impacts:
                 # Points touch and part within short steps: χ² is smooth only within shorter ones,

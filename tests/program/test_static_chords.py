@@ -164,7 +164,7 @@ def test_a_sweep_along_unstable_equilibria_searches_stable_equilibria(monkeypatc
     monkeypatch.setattr(module, "sweep", sweep)
     monkeypatch.setattr(module, "ExperimentIterate", lambda *args, **kwargs: part)
     monkeypatch.setattr(module, "extrapolate", lambda *args, **kwargs: None)
-    nothing = SimpleNamespace(experiment=None, stopwatch=None, nq=0)
+    nothing = SimpleNamespace(experiment=None, stopwatch=None, nq=0, has_retraction=False)
     result = module.sweep_after_step(
         nothing, nothing, p=np.zeros(1), previous=nothing, step=np.zeros(1)
     )
