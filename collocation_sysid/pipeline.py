@@ -213,7 +213,8 @@ def run(
                 answer = replace(answer, profiles=profiles)
                 answer = _with_added_measurements(answer, say)
                 answer = _with_offset_notes(answer, fit)
-            are_specimens = all(each.specimen for each in problem.experiments)
+            fitted = answer.solution.collocation.experiments
+            are_specimens = all(each.specimen for each in fitted)
             if seek_causes and (are_specimens or not answer.is_consistent):
                 from .judge.engine import cause_notes, find_misspecifications
 
@@ -327,8 +328,7 @@ def _with_added_measurements(answer: Run, say: Log) -> Run:
 
 
 def _with_offset_notes(answer: Run, fit: LinearisedFit) -> Run:
-    fitted = [each.experiment for each in answer.solution.collocation.transcriptions]
-    if not all(each.specimen for each in fitted):
+    if not all(each.specimen for each in answer.solution.collocation.experiments):
         return answer
     offsets = stress_offset_notes(fit)
     return replace(answer, notes=(*answer.notes, *offsets))

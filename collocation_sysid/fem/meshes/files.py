@@ -222,20 +222,31 @@ def _as_input_error(path: str | Path, done: str) -> Iterator[None]:
     """Turn a failure on an invalid file into one `InputError`, and print nothing."""
     captured = io.StringIO()
     try:
-        with (
-            contextlib.redirect_stdout(captured),
-            contextlib.redirect_stderr(captured),
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")
+        with _printing_to(captured):
             yield
     except InputError as error:
         raise error.located(path) from None
     except (Exception, SystemExit) as error:
         if isinstance(error, OSError) and done == "written":  # it tells its file itself
             raise
-        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise _unreadable_error(done, reason, path=path) from error
+        raise _unreadable_error(done, _reason(error, captured), path=path) from error
+
+
+@contextlib.contextmanager
+def _printing_to(captured: io.StringIO) -> Iterator[None]:
+    """Print into `captured` and ignore warnings."""
+    with (
+        contextlib.redirect_stdout(captured),
+        contextlib.redirect_stderr(captured),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _reason(error: BaseException, captured: io.StringIO) -> str:
+    """Return what was printed before an error, or the error."""
+    return " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
 
 
 def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
@@ -466,16 +477,10 @@ def _read_in_process(path: str | Path) -> MeshContent:
 
     captured = io.StringIO()
     try:
-        with (
-            contextlib.redirect_stdout(captured),
-            contextlib.redirect_stderr(captured),
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")
+        with _printing_to(captured):
             mesh: Any = meshio.read(path)
     except (Exception, SystemExit) as error:
-        reason = " ".join(captured.getvalue().split()) or f"{type(error).__name__}: {error}"
-        raise InputError(reason[:LONGEST_REASON]) from error
+        raise InputError(_reason(error, captured)[:LONGEST_REASON]) from error
     return MeshContent(
         points=np.asarray(mesh.points),
         cells=[CellBlock(block.type, block.dim, data=block.data) for block in mesh.cells],
