@@ -176,7 +176,7 @@ def _load_object(
             corners, elements = generated
             size = _smallest_size(file, corners=corners, elements=elements, simulation=simulation)
             require_feasible(replace(size, substeps=1))
-        mesh = _load_mesh(file.object, folder, _stations_m(file))
+        mesh = _load_mesh(file, folder)
     size = _smallest_size(
         file, corners=len(mesh.points_m), elements=len(mesh.tetrahedra), simulation=simulation
     )
@@ -383,20 +383,34 @@ def _load_rod(section: ObjectSection, folder: Path, stations_m: Sequence[float])
         raise InputError(message, None, where=where) from error
 
 
-def _load_mesh(section: ObjectSection, folder: Path, stations_m: Sequence[float]) -> TetMesh:
+def _grasp_planes_m(file: ProblemFile) -> dict[str, list[float]]:
+    """Return the coordinates of the faces of all boxes that select grasped nodes, by axis."""
+    grasps = [held for experiment in file.recordings for held in experiment.grasp_list]
+    selections = [getattr(held, "nodes", None) for held in grasps]
+    boxes = [each.box_m for each in selections if isinstance(each, NodesSection) and each.box_m]
+    return {
+        axis: sorted({box[k] for pair in boxes for box in pair}) for k, axis in enumerate("xyz")
+    }
+
+
+def _load_mesh(file: ProblemFile, folder: Path) -> TetMesh:
     """Return the mesh of [object]; meshes of surfaces are cached in ``.meshes``."""
+    section = file.object
     if section.is_rod:
-        return _load_rod(section, folder, stations_m)
+        return _load_rod(section, folder, _stations_m(file))
     if section.mesh is not None:
-        file = existing_file(folder, section.mesh, key="mesh")
-        return TetMesh.read(file, section.length_unit)
+        mesh = existing_file(folder, section.mesh, key="mesh")
+        return TetMesh.read(mesh, section.length_unit)
     assert section.edge_length_m is not None  # by the schema
     if section.surface is None:
         return _generate_mesh(section, section.edge_length_m)
     surface = existing_file(folder, section.surface, key="surface")
-    cache = folder / ".meshes"
     return TetMesh.from_surface(
-        surface, section.edge_length_m, length_unit=section.length_unit, cache=cache
+        surface,
+        section.edge_length_m,
+        length_unit=section.length_unit,
+        cache=folder / ".meshes",
+        planes_m=_grasp_planes_m(file),
     )
 
 

@@ -7,7 +7,7 @@ then, for quadratic elements, one in the middle of each edge.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +32,7 @@ from .checks import (
     signed_volumes,
     unique_edges,
 )
+from .cutting import with_nodes_in_planes
 from .files import length_in_metres, read_tetrahedra, read_triangles, write_tetrahedra
 from .surface import tetrahedralize_surface
 
@@ -189,6 +190,7 @@ class TetMesh:
         edge_length_m: float,
         length_unit: str = "m",
         cache: str | Path | None = None,
+        planes_m: Mapping[str, Sequence[float]] | None = None,
     ) -> TetMesh:
         """Fill a closed surface with tetrahedra by `surface.tetrahedralize_surface`.
 
@@ -202,6 +204,9 @@ class TetMesh:
             Unit of the surface's coordinates.
         cache : str or Path, optional
             Folder in which the mesh is kept, since meshing again would give a different mesh.
+        planes_m : mapping of "x", "y" or "z" to coordinates, optional
+            Planes that no element crosses, such as those where the fingers of a gripper end: a body
+            is free from its last held nodes on. Problem files have those of the boxes of grasps.
 
         Raises
         ------
@@ -216,11 +221,10 @@ class TetMesh:
             points = checked_points(surface[0]) * length_in_metres(length_unit)
             triangles = surface[1]
         try:
-            return cls(
-                *tetrahedralize_surface(
-                    points, triangles, edge_length_m=edge_length_m, cache_dir=cache
-                )
+            mesh = tetrahedralize_surface(
+                points, triangles, edge_length_m=edge_length_m, cache_dir=cache
             )
+            return cls(*with_nodes_in_planes(*mesh, planes_m=planes_m or {}))
         except InputError as error:
             raise error.located(path) from error.__cause__
 
