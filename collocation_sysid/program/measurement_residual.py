@@ -850,3 +850,17 @@ def lagrange_weights(position: T, places: Sequence[T]) -> list[Any]:
         math.prod((position - other) / (own - other) for j, other in enumerate(places) if j != i)
         for i, own in enumerate(places)
     ]
+
+
+def smooth_weights(position: ca.SX, places: Sequence[ca.SX]) -> list[ca.SX]:
+    """Return weights as `lagrange_weights`, of an interpolation whose slope is continuous where
+    `neighbouring_times` go on to the next place: in the interval in the middle, the polynomial
+    without the last place passes linearly into that without the first.
+    """
+    if len(places) < 2:
+        return lagrange_weights(position, places)
+    before, after = places[(len(places) - 1) // 2 :][:2]
+    share = ca.fmin(ca.fmax((position - before) / (after - before), 0), 1)
+    first = [*lagrange_weights(position, places[:-1]), 0]
+    last = [0, *lagrange_weights(position, places[1:])]
+    return [(1 - share) * a + share * b for a, b in zip(first, last, strict=True)]

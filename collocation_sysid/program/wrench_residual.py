@@ -3,9 +3,8 @@
     ŷ(s) = Σ_k ℓ_k(s + τ) Y_k + tare,
 
 where Y is the resultant of the reactions on the grid (`reactions.resultant`), τ the shift
-of the sensor's clock, and ℓ are the cubic weights of the four grid times around the sample. Each
-sample is compared at its own time, however many there are in a step, so that no averaging hides a
-motion.
+of the sensor's clock, and ℓ are the weights of the six grid times around the sample. Each sample is
+compared at its own time, however many there are in a step, so that no averaging hides a motion.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from .measurement_model import MeasurementModel
 from .measurement_residual import (
     MeasurementResidual,
     RowStencil,
-    lagrange_weights,
     neighbouring_times,
+    smooth_weights,
 )
 from .observables import ObservedMotion
 from .reactions.resultant import TIMES_PER_SAMPLE, ReactionResultant
@@ -93,7 +92,7 @@ class WrenchResidual(MeasurementResidual):
         return _is_covered(self.observable, self.t_s, known=known)
 
     def _neighbour_count(self, known: int) -> int:
-        """Times that a sample is interpolated from: four, two if static."""
+        """Times that a sample is interpolated from: six, two if static."""
         return min(2 if self.observable.reaction_grid.is_static else TIMES_PER_SAMPLE, known)
 
     def stencil(self, phi: Array, known: int) -> RowStencil:
@@ -126,7 +125,7 @@ class WrenchResidual(MeasurementResidual):
         has_clock = len(self.observable.parameter_indices(SENSOR_TIME))
         at = own[0] if has_clock else ca.SX(0)
         predicted = ca.reshape(values, 6, times) @ ca.vertcat(
-            *lagrange_weights(at, ca.vertsplit(data))
+            *smooth_weights(at, ca.vertsplit(data))
         )
         tare = own[has_clock:]
         if tare.numel():

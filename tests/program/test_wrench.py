@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from kit.checks import relative_error
@@ -20,11 +21,17 @@ from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.model.recursion import RecursionTrajectory
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
-from collocation_sysid.program.observables import ObservedMotion, ReactionForces
+from collocation_sysid.program.measurement_residual import neighbouring_times, smooth_weights
+from collocation_sysid.program.observables import (
+    ObservableDerivatives,
+    ObservedMotion,
+    ReactionForces,
+)
 from collocation_sysid.program.reactions.resultant import LOW_PASS
 from collocation_sysid.program.simulation import simulate, with_wrenches
 from collocation_sysid.program.wrench_residual import WrenchResidual
-from collocation_sysid.recording import Experiment, PoseSequence
+from collocation_sysid.recording import Experiment, Nuisance, PoseSequence
+from collocation_sysid.recording.nuisance import SENSOR_TIME
 
 
 def at_truth(
@@ -172,6 +179,45 @@ def test_samples_between_grid_times_are_read_to_the_third_order():
         (expected,) = predicted_wrenches(dense)
         errors.append(relative_error(read[:, :3], expected[:, :3]))
     assert errors[1] < 0.4 * errors[0]
+
+
+def test_the_slope_by_the_clock_is_continuous_at_grid_times():
+    """Where a sample at a grid time passes to the next grid times."""
+    cube = wristed_cube(nuisance=Nuisance(sensor_time_s=0.001))
+    (residual,) = at_truth(felt(cube)).transcription.residuals_of(WrenchResidual)
+    t_s = residual.observable.t_s
+    values = np.sin(60 * t_s[:, None, None] + np.arange(6).reshape(2, 3))
+    (clock,) = residual.observable.parameter_indices(SENSOR_TIME)
+    assert np.isclose(residual.t_s[:, None], t_s).any(axis=1).sum() > 5
+
+    def at(phi: float) -> tuple[np.ndarray, np.ndarray]:
+        own = np.zeros(residual.nuisance.size)
+        own[clock] = phi
+        slopes = ObservableDerivatives.without_own(np.arange(0), np.zeros((*values.shape, 0)))
+        return residual.linearise(values, slopes, phi=own, size=len(own))
+
+    step = 1e-4
+    (here, by_phi), (ahead, _), (behind, _) = at(0.0), at(step), at(-step)
+    slope = by_phi[..., clock]
+    np.testing.assert_allclose((ahead - here) / step, slope, atol=2e-4 * np.abs(slope).max())
+    np.testing.assert_allclose((here - behind) / step, slope, atol=2e-4 * np.abs(slope).max())
+
+
+def test_a_swing_between_grid_times_is_read_to_the_fifth_order():
+    at, places = ca.SX.sym("at"), ca.SX.sym("places", 6)
+    weights = ca.vertcat(*smooth_weights(at, ca.vertsplit(places)))
+    weigh = ca.Function("weights", [at, places], [weights])
+    fine = np.linspace(0.1, 0.9, 300)
+    errors = []
+    for step_s in (0.02, 0.01):
+        t_s = np.arange(0, 1 + step_s, step_s)
+        times = neighbouring_times(t_s, fine, count=6)
+        at_samples = np.array(weigh.map(len(fine))(fine[None], t_s[times].T))
+        errors.append(
+            np.abs((at_samples.T * np.exp(20j * t_s[times])).sum(axis=1) - np.exp(20j * fine)).max()
+        )
+    assert errors[0] < 0.4**5 / 250
+    assert errors[0] / errors[1] == pytest.approx(2**5, rel=0.05)
 
 
 def low_passed(signal: np.ndarray, lag_s: float, step_s: float = 0.01) -> RecursionTrajectory:

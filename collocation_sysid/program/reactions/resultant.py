@@ -38,8 +38,8 @@ from .forces import centred_rows
 # Sizes of the data of the tool: the sensor's axes Q, the grasp's rotation and its second time
 # derivative, its translation from the sensor's origin, and the second derivative of that.
 TOOL_DATA = (9, 9, 9, 3, 3)
-# Grid times that a sample is interpolated from: an error of (ωΔt)⁴ / 40 of a swing.
-TIMES_PER_SAMPLE = 4
+# Grid times that a sample is interpolated from: an error of (ωΔt)⁵ / 280 of a swing.
+TIMES_PER_SAMPLE = 6
 
 
 @dataclass(frozen=True, eq=False)
