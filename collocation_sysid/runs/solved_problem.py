@@ -227,13 +227,15 @@ class SolvedProblem:
         were computed.
         """
         effects = effect_concerns(self.effects, self.suspects)
-        of_fit = solution_concerns(
-            self.solution,
-            self.rollouts,
-            motions=self.modes_by_experiment.values(),
-            uncertainty=self.uncertainty,
-            phi=self.posterior and self.posterior.phi,
-            surprise=effects[0].grade if effects else None,
+        of_fit = tuple(
+            solution_concerns(
+                self.solution,
+                self.rollouts,
+                motions=self.modes_by_experiment.values(),
+                uncertainty=self.uncertainty,
+                phi=self.posterior and self.posterior.phi,
+                surprise=effects[0].grade if effects else None,
+            )
         )
         if not self.solution.collocation.nq:
             effects = []
@@ -247,10 +249,14 @@ class SolvedProblem:
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
             # Effects are judged with this mesh, so that a coarse one is as grave.
             known = [replace(each, grade=effects[0].grade) for each in meshes] if effects else []
+            # What is farther from its prior than an effect may distort the effects.
+            surprise = effects[0].data["surprise"] if effects else np.inf
+            farther = [each for each in of_fit if each.data.get("deviations", 0.0) > surprise]
             return Assessment.from_concerns(
                 (
                     *(each for each in causes if each.code not in OPEN_CAUSES),
                     *known,
+                    *farther,
                     *effects,
                     *(each for each in causes if each.code in OPEN_CAUSES),
                     *of_fit,

@@ -80,6 +80,11 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "section of the body is round",
         "compare the laws first",
     ),
+    "marker of a cable elsewhere": (
+        lambda: wrong.cable_with_marker_at(0.33),
+        "place of middle",
+        "marker mass",
+    ),
 }
 
 
@@ -101,6 +106,7 @@ def test_the_first_reason_is_right(name: str):
         lambda: wrong.rolling_shutter(2e-5),
         lambda: wrong.mirrored_mesh(False),
         lambda: wrong.round_rod("round"),
+        lambda: wrong.cable_with_marker_at(0.3),
     ],
 )
 def test_the_right_description_is_good(made: Made):

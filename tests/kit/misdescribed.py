@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.recording.loads import PointMass
 from kit import filmed
+from kit.rods import cable, straight
 
 UNDAMPED = {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 # Bodies that are simulated with their own mesh have none of the errors of real ones.
@@ -234,3 +235,29 @@ def round_rod(section: str, young_pa: float = 2e5, density_kg_m3: float = 1000.0
     tracks_m = real.markers_m + 3e-4 * noise.normal(size=real.markers_m.shape)
     loads = real.wrenches[0] + noise.normal(size=(21, 6)) * np.repeat(sigma, 3)
     return _problem(cs.with_markers(swung(section, loads), tracks_m))
+
+
+# Cables -------------------------------------------------------------------------------------------
+
+
+def cable_with_marker_at(stated_m: float) -> cs.Problem:
+    """A swung cable whose middle marker is at 0.3 m."""
+    mesh = straight(0.6, cs.CrossSection.round(0.006), 16)
+    t_s = 0.02 * np.arange(41)
+    sway_m = np.outer(0.05 * (1 - np.cos(6 * t_s)), [1, 0.5, 0.2])
+    hand = cs.PoseSequence(t_s, sway_m, np.tile([0, 0, 0, 1.0], (41, 1)))
+    values = {"bending_n_m2": 1e-3, "torsion_n_m2": 3e-4, "axial_n": 200.0}
+    values |= {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
+
+    def hung(middle_m: float, tracks_m: np.ndarray) -> cs.Experiment:
+        places_m = [mesh.place_m(middle_m), mesh.place_m(0.6)]
+        markers = cs.Markers(t_s, tracks_m, 5e-4, ["middle", "tip"], places_m=places_m)
+        body = cable(mesh)
+        return cs.Experiment(
+            body, t_s, [cs.Grasp(range(3), hand)], markers, air_density_kg_m3="none"
+        )
+
+    tracks_m = cs.simulate(hung(0.3, np.zeros((41, 2, 3))), values).markers_m
+    seen = hung(stated_m, tracks_m + 5e-4 * rng().normal(size=tracks_m.shape))
+    unknown = {name: cs.Unknown() for name in ("bending_n_m2", "gamma_r_s", "gamma_m_1_s")}
+    return cs.Problem([seen], values | unknown)
