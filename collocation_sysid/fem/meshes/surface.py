@@ -25,7 +25,7 @@ ASKED_LENGTH = 0.8
 # Largest distance of the new surface from the old one, in edge lengths: that of a chord of such a
 # length from an arc with a radius of as much.
 TOLERANCE = 0.13
-_RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}, volume of the surface"
+_RECIPE = f"coarsen, length {ASKED_LENGTH}, tolerance {TOLERANCE}, volume by columns"
 
 # Largest accepted number of tetrahedra; more suggest a wrong edge length or length unit.
 MOST_ELEMENTS = 2_000_000
@@ -36,6 +36,10 @@ MOST_SAMPLES = 200_000
 # Largest ratio of the way of a node to the mean distance of its faces from the surface: it is 1.5 on a
 # cylinder.
 LARGEST_FACTOR = 3.0
+
+# Least cosine of the angle between a face and the surface for which the column between them is as
+# high as their distance over the cosine: at an edge of the body, the nearest surface is another side.
+STEEPEST = 0.5
 
 # Program of a separate process: fTetWild writes a file to its working directory and cannot be
 # interrupted.
@@ -236,11 +240,12 @@ def with_volume_of(
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     areas = np.linalg.norm(normals, axis=1)
     normals /= areas[:, None]
-    middles = (corners + np.roll(corners, -1, axis=1)) / 2  # their mean is exact for arcs
+    parts = _quarters_of(_quarters_of(corners)).mean(axis=1).reshape(-1, *faces.shape)
     samples, planes = _samples_of(scan_m[scan], np.sqrt(np.median(areas)) / 4)
-    nearest = KDTree(samples).query(middles)[1]
-    heights = np.einsum("fki,fki->fk", samples[nearest] - middles, planes[nearest])
-    gaps = np.einsum("fk,fki,fi->f", heights, planes[nearest], normals) / 3
+    nearest = KDTree(samples).query(parts)[1]
+    heights = np.einsum("kfi,kfi->kf", samples[nearest] - parts, planes[nearest])
+    cosines = np.einsum("kfi,fi->kf", planes[nearest], normals)
+    gaps = (heights * np.where(np.abs(cosines) > STEEPEST, 1 / cosines, cosines)).mean(axis=0)
     missing_m3 = (areas * gaps).sum()
     move = np.zeros_like(points_m)
     weight = np.zeros(len(points_m))
@@ -266,12 +271,16 @@ def _samples_of(triangles_m: np.ndarray, spacing_m: float) -> tuple[np.ndarray, 
         is_long = np.linalg.norm(ends - triangles_m, axis=2).max(axis=1) > spacing_m
         if not is_long.any():
             break
-        a, b, c = triangles_m[is_long].swapaxes(0, 1)
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-        parts = [np.stack(each, axis=1) for each in quarters]
-        triangles_m = np.concatenate([triangles_m[~is_long], *parts])
+        triangles_m = np.concatenate([triangles_m[~is_long], _quarters_of(triangles_m[is_long])])
     a, b, c = triangles_m.swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     return triangles_m.mean(axis=1), normals
+
+
+def _quarters_of(triangles_m: np.ndarray) -> np.ndarray:
+    """Return the triangles (4 F, 3, 3) at the corners and in the middle of triangles (F, 3, 3)."""
+    a, b, c = triangles_m.swapaxes(0, 1)
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    quarters = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(each, axis=1) for each in quarters])
