@@ -48,8 +48,9 @@ def plan(
     film: Annotated[bool, option("Make a film of the motion.")] = True,
     output: OutputOptions,
 ) -> None:
-    """Plan the motion of the hand with which points of the body follow references, or with which a
-    recording determines constants (experimental).
+    """Plan a motion of the hand by which points follow references, or constants are determined.
+
+    Planning is experimental.
 
     The motion begins at rest, ends at rest without residual vibration, and respects the limits. The
     output folder contains poses.csv for the robot, the predicted points, pictures, a film and

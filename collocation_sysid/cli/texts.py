@@ -102,10 +102,9 @@ def explain(
         ),
     ] = None,
 ) -> None:
-    """Show pages of the documentation, or list their topics; describe keys of the problem file, and
-    words of the output, such as constants and rows of the uncertainty budget; list the pages with
-    any other word.
+    """Show pages of the documentation, keys of the problem file, or words of the output.
 
+    Without a topic, the topics of the pages are listed; with any other word, the pages with it.
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
     """

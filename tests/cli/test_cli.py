@@ -785,6 +785,8 @@ def test_every_command_is_in_exactly_one_group_of_the_help():
     listed = dict(zip(sections[1::2], sections[2::2], strict=True))
     for title, group in COMMAND_GROUPS.items():
         assert tuple(re.findall(r"^  ([a-z-]+)  ", listed[title], re.MULTILINE)) == group
+        sentences = re.split(r"^  (?=[a-z])", listed[title].rstrip(), flags=re.MULTILINE)[1:]
+        assert all(sentence.rstrip().endswith(".") for sentence in sentences)
 
 
 def test_version_and_help():

@@ -143,6 +143,7 @@ def test_a_check_of_a_rod_speaks_of_no_tetrahedra_and_no_moduli():
     body = swung().body
     checked = check_body(body, body.theta_from_values(VALUES), ("swing",))
     assert not checked.worst_elements
+    assert checked.open_question is None
     assert not checked.warnings
     assert set(checked.guess) == set(VALUES)
 

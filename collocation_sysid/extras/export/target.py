@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -84,7 +84,7 @@ class ExportedFiles:
 
     # mapping of file name to text: content of each file; `write_export` adds ``identified.json``
     # and the poses.
-    files: Mapping[str, str]
+    files: Mapping[str, str] = field(repr=False)
     limitations: tuple[str, ...]  # what the target cannot express, and what was done instead
 
 

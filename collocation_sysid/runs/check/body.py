@@ -217,8 +217,10 @@ class BodyCheck:
     @property
     def open_question(self) -> str | None:
         """What should be stated about the origin of the body, in one sentence; None if nothing is
-        missing.
+        missing, and for a rod, which has no mesh of its own.
         """
+        if self.element == "rod":
+            return None
         questions = []
         if self.made is None:
             questions.append("made (cast, foam, printed, tissue)")
