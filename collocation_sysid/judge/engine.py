@@ -23,7 +23,7 @@ from ..recording.experiment import Experiment
 from ..recording.measurement_selection import measured_count
 from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
 from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL
-from .fit import TestedFit, discrepancy, has_trend, thinned
+from .fit import Corrected, TestedFit, discrepancy, has_trend, thinned, with_corrected
 from .modes import find_misspecifications_by_modes
 from .motion import motion_candidates, motion_rows
 from .registry import SOURCES
@@ -42,6 +42,8 @@ MOST_REFITS = 3
 FEWEST_SWEEPS = 15
 # Length of the last step of a parameter's logarithm.
 TOLERANCE = 1e-2
+# The same of specimens, whose constants of large strain the first samples determine least.
+SPECIMEN_TOLERANCE = 1e-3
 # Predicted relative decrease of the loss by a change of one logarithm by 1 that ends a refit: far
 # below that of a correction that counts.
 LEAST_DECREASE = 1e-2
@@ -179,7 +181,7 @@ def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 class _Refits:
-    """Fits of some experiments, one of which is corrected, with a limited number of sweeps; from the
+    """Fits of some experiments, one or several of them corrected, with a limited number of sweeps; from the
     problem's guess, or from the answer and its motion.
     """
 
@@ -195,12 +197,12 @@ class _Refits:
         parameters = solution.collocation.parameters
         values = parameters.values(solution.q)
         self.answer = {item.name: values[item.name] for item in parameters.free}
-        self.known: dict[Experiment | None, Solution | None] = {}
+        self.known: dict[Corrected | None, Solution | None] = {}
         if len(fitted) == len(stated) and samples == own:
             self.known[None] = solution
 
-    def fit(self, corrected: Experiment | None, is_near: bool = True) -> Solution | None:
-        """Return the fit with a corrected experiment, or as stated; None if it fails. One that
+    def fit(self, corrected: Corrected | None, is_near: bool = True) -> Solution | None:
+        """Return the fit with corrected experiments, or as stated; None if it fails. One that
         reaches its limit counts.
         """
         if corrected not in self.known:
@@ -245,29 +247,27 @@ class _Refits:
             return None
         return max(map(discrepancy, refit.parts))
 
-    def loss(self, corrected: Experiment) -> float:
+    def loss(self, corrected: Corrected) -> float:
         """Return the loss with that expected of measurements left out; infinite without a fit."""
         refit = self.fit(corrected)
         if refit is None:
             return np.inf
-        (stated,) = (each for each in self.stated if each.name == corrected.name)
-        return refit.history[-1].loss + measured_count(stated) - measured_count(corrected)
+        fitted = with_corrected(self.stated, corrected)
+        left_out = sum(map(measured_count, self.stated)) - sum(map(measured_count, fitted))
+        return refit.history[-1].loss + left_out
 
-    def _fit(self, corrected: Experiment | None, is_near: bool) -> Solution | None:
+    def _fit(self, corrected: Corrected | None, is_near: bool) -> Solution | None:
         stated = None if self.stated[0].specimen else self.known.get(None)
         method = ReducedSpace(
             max_iterations=max(FEWEST_SWEEPS, min(self.each, self.sweeps)),
-            tolerance=TOLERANCE,
+            tolerance=TOLERANCE if self.stated[0].specimen is None else SPECIMEN_TOLERANCE,
             least_decrease=LEAST_DECREASE,
             largest_loss=UNLIMITED
             if stated is None
             else REFUTED * max(1.0, stated.history[-1].loss),
         )
         collocation = self.whole.collocation
-        experiments = tuple(
-            corrected if corrected is not None and each.name == corrected.name else each
-            for each in self.stated
-        )
+        experiments = with_corrected(self.stated, corrected)
         try:
             changed = replace(collocation, experiments=experiments)
             first = experiments[0]

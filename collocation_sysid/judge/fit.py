@@ -26,6 +26,8 @@ from .doubt import Doubt
 
 # Share of χ² that a correction is predicted to leave, and the hypothesis with it as `corrected`.
 Candidate = tuple[float, Hypothesis]
+# An experiment with a mistake corrected, or several with the same one.
+Corrected = Experiment | tuple[Experiment, ...]
 
 
 def discrepancy(part: ExperimentIterate) -> float:
@@ -75,6 +77,15 @@ def thinned(experiment: Experiment, most_samples: int) -> Experiment:
     ]
     markers = Markers.none(experiment.t_s[chosen])
     return replace(experiment, t_s=experiment.t_s[chosen], readings=readings, markers=markers)
+
+
+def with_corrected(
+    experiments: Sequence[Experiment], corrected: Corrected | None
+) -> tuple[Experiment, ...]:
+    """Return experiments with the corrected one, or several, in place of those of the same name."""
+    others = corrected if isinstance(corrected, tuple) else (corrected,)
+    by_name = {each.name: each for each in others if each is not None}
+    return tuple(by_name.get(each.name, each) for each in experiments)
 
 
 def scaled_residuals(part: ExperimentIterate) -> Iterator[tuple[Measurement, Array]]:

@@ -53,12 +53,12 @@ MESSAGES = {
     "mesh-parts": "the mesh consists of {parts} unconnected parts, and no grasp holds {loose} of "
     "them, the largest with {nodes} nodes: merge coincident nodes, or remove loose parts from "
     "the mesh",
-    "specimen-true-stress": "its stresses fit as true stresses (force over deformed area): set "
+    "specimen-true-stress": "stresses fit as true stresses (force over deformed area): set "
     'stress = "true", or divide the forces by the undeformed area',
-    "specimen-compression": "its strains and stresses fit as those of a compression test: set "
+    "specimen-compression": "strains and stresses fit as those of a compression test: set "
     "strain_sign = -1 and stress_sign = -1",
-    "specimen-percent": 'its strains fit as percent: name the unit in the column, "strain (%)"',
-    "specimen-kind": "its curve fits as that of a {test} test, with the same law: check the kind "
+    "specimen-percent": 'strains fit as percent: name the unit in the column, "strain (%)"',
+    "specimen-kind": "the curve fits as that of a {test} test, with the same law: check the kind "
     "of test; if it is right, compare laws with compare-models --materials",
     "specimen-kind/likelier": "the curve fits better as that of another kind of test, with the "
     "same law: {kinds}, instead of {stated} ({young}): check the kind of test",

@@ -381,6 +381,17 @@ def test_a_refit_finds_mistakes_that_leave_a_plausible_curve(mistake, test):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("mistake", ["compression", "true-stress"])
+def test_a_refit_finds_a_mistake_of_all_tables(mistake):
+    presses = [
+        replace(mistaken(mistake, "uniaxial"), name=name) for name in ("one", "two", "three")
+    ]
+    (cause,) = cs.run(cs.Problem(presses, {**NEO_HOOKEAN, "young_pa": cs.Unknown()})).causes
+    assert cause.cause == f"specimen-{mistake}"
+    assert cause.subject == "'one', 'two' and 'three'"
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("test", ["uniaxial", "planar"])
 def test_a_refit_finds_percent_that_were_taken_for_ratios(test):
     rng = np.random.default_rng(4)

@@ -3,8 +3,9 @@
 Mistakes in a table that show without a fit are in `recording.specimen_checks`. The others leave a
 plausible curve: true in place of engineering stress, compression with positive signs, percent in
 place of ratios, another unit or area, another kind of test, and columns of zeros that were not
-measured. All specimens are fitted again with one of them corrected; the misfit contains the
-nuisance parameters, so that a wrong area does not explain all. A correction keeps all measurements,
+measured. All specimens are fitted again with one of them corrected in one table, or in all tables of
+one kind of test; the misfit contains the nuisance parameters, so that a wrong area does not explain
+all. A correction keeps all measurements,
 unless the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
@@ -25,7 +26,7 @@ from ...common.display import readable_stress
 from ...errors import InputError, SimulationError, listed
 from ...fem.laws.moduli import engineering_constants
 from ...judge.doubt import Correction, Doubt
-from ...judge.fit import Candidate, TestedFit, has_trend, scaled_residuals, thinned
+from ...judge.fit import Candidate, TestedFit, has_trend, scaled_residuals, thinned, with_corrected
 from ...judge.source import Source
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
@@ -76,6 +77,10 @@ CONFUSED_TESTS = {
     "simple-shear": ("planar", "uniaxial"),
     "confined": ("uniaxial",),
 }
+# Mistakes that all tables of one program or one person may have.
+OF_ALL_TABLES = frozenset(
+    {"specimen-true-stress", "specimen-compression", "specimen-percent", "specimen-kind"}
+)
 # Largest strain from which on a table of ratios may be one of percent.
 PERCENT_STRAIN = 1.0
 
@@ -91,16 +96,31 @@ def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
     if stated is None:
         return
     slopes_pa = [_initial_slope(each) for each in few]
-    for index, experiment in enumerate(few):
-        if len(experiment.t_s) < FEWEST_SAMPLES:
-            continue
-        for row in likely_mistakes(experiment, slopes_pa[:index] + slopes_pa[index + 1 :]):
-            tried, whole = row.hypothesis(experiment), row.hypothesis(originals[index])
-            if tried is None or whole is None:
+    tests = [each.specimen.test for each in originals if each.specimen is not None]
+    alike = [[k for k, each in enumerate(tests) if each == test] for test in dict.fromkeys(tests)]
+    alone = [[index] for index, each in enumerate(few) if len(each.t_s) >= FEWEST_SAMPLES]
+    for group in [*alone, *(each for each in alike if len(each) > 1)]:
+        first = group[0]
+        others_pa = slopes_pa[:first] + slopes_pa[first + 1 :]
+        for row in likely_mistakes(few[first], others_pa):
+            if len(group) > 1 and row.name not in OF_ALL_TABLES:
                 continue
-            refit = _refit(solution, [*few[:index], tried.corrected, *few[index + 1 :]], SCREENING)
+            tried = [row.hypothesis(few[index]) for index in group]
+            whole = [row.hypothesis(originals[index]) for index in group]
+            if None in tried or None in whole:
+                continue
+            corrected = with_corrected(few, tuple(each.corrected for each in tried if each))
+            refit = _refit(solution, corrected, SCREENING)
             if refit is not None:
-                yield _square_sum(refit.parts) / max(_square_sum(stated.parts), 1e-300), whole
+                found = [each for each in whole if each is not None]
+                yield (
+                    _square_sum(refit.parts) / max(_square_sum(stated.parts), 1e-300),
+                    replace(
+                        found[0],
+                        subject=listed([each.subject for each in found]),
+                        corrected=tuple(each.corrected for each in found),
+                    ),
+                )
 
 
 def likelier_kinds(solution: Solution) -> list[Hypothesis]:
