@@ -70,7 +70,10 @@ WILD = MOST_WILD
 WIDENING = (
     "check whether this value is possible, and if it is, widen its prior in the [[experiment]]"
 )
-HIDING = "it hides another error, such as a law that is too simple, or a wrong unit, area or kind of test"
+HIDING = (
+    "it hides another error, such as a preload at which the displacement was set to zero (strain_zero "
+    "states the strain under it), a law that is too simple, or a wrong unit, area or kind of test"
+)
 # Ratio of the steps that impacts need and the stated ones from which E is wrong by tens of percent: a
 # falling block with 4 in place of 15 was 46 % too stiff.
 FEW_IMPACT_STEPS = 2.0

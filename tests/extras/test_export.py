@@ -1274,5 +1274,7 @@ def test_constants_of_a_specimen_are_exported_as_a_material_but_not_as_a_body(tm
     moved = np.array([float(row.split(",")[1]) / 0.01 for row in curve])
     zero = run.solution.nuisance("zero of the strain")  # the strains are corrected by it
     np.testing.assert_allclose(moved, [0, *(strain + zero)], rtol=1e-9)
+    # A card alone has no cell to which the nominal density would belong.
+    assert "*DENSITY" not in (exported(body, "abaqus", tmp_path) / "material.inc").read_text()
     with pytest.raises(InputError, match="no body that moves"):
         exported(body, "mujoco", tmp_path)

@@ -192,6 +192,21 @@ def test_residuals_of_a_simple_law_name_the_law_first():
     assert "move the body" not in text
 
 
+def test_a_curve_that_returns_names_unloading_in_place_of_the_law():
+    larger = [Concern("noise/larger", data={"factor": 9.0, "stated": "sigma"})]
+    up_and_down = np.concatenate([STRAIN, STRAIN[-2::-1]])
+    named = {}
+    for name, strain in {
+        "loading": STRAIN,
+        "returns": up_and_down,
+        "both signs": np.concatenate([-STRAIN[::-1] / 2, STRAIN]),
+    }.items():
+        test = cs.Specimen("uniaxial", strain, neo_hookean_pa(strain), SIGMA_PA)
+        (concern,) = as_specimen_concerns(larger, [test.experiment(name="pull")])
+        named[name] = 'branch = "loading"' in concern.message
+    assert named == {"loading": False, "returns": True, "both signs": False}
+
+
 def test_concerns_of_specimens_name_no_markers():
     test = cs.Specimen("planar", STRAIN, 1e5 * STRAIN, SIGMA_PA)
     data = {"marker": "planar/second stress", "factor": 4.0, "count": 2}

@@ -33,10 +33,9 @@ def export(body: IdentifiedBody) -> ExportedFiles:
             card, limitation = material_card(region)
         limits += [f"{region.name}: {limitation}"] if limitation else []
         name = region.name.upper()
-        cards += (
-            f"*MATERIAL,NAME={name}\n{card}{memory_card(region)}"
-            f"*DENSITY\n{format_values(region.density_kg_m3)}\n"
-        )
+        cards += f"*MATERIAL,NAME={name}\n{card}{memory_card(region)}"
+        if body.experiment.specimen is None:  # a specimen has a nominal density
+            cards += f"*DENSITY\n{format_values(region.density_kg_m3)}\n"
     lines = [f"{body.title}: SI units; verdict: {body.verdict}"]
     lines += [f"not expressed: {each}" for each in limits]
     for name, estimate in body.parameters.items():

@@ -17,10 +17,11 @@ from ...errors import listed
 from ...fem.laws.damping_admissibility import STRAIN
 from ...recording.experiment import Experiment
 from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic
-from ...recording.specimen_checks import is_unloading
+from ...recording.specimen_checks import HYSTERESIS, is_unloading
 from ...recording.specimen_files import moduli_of, specimen_strains
 from ...statistics.concerns import Concern
 from ...statistics.thresholds import GROSS_MISFIT
+from .notes import GENERAL_TESTS
 
 # Code of the concern about a specimen by that of the general concern with the same data.
 SPECIMEN_CODES: Mapping[str, str] = {
@@ -41,6 +42,11 @@ ANGLE = "the angle of the cut (cut_angle_deg) and the direction of the fibres"
 TOE = (
     "the slope grows with the load, which no law does at such strains: at small loads faces or grips "
     "do not touch everywhere. Leave out these rows with window_s, and let strain_zero be unknown"
+)
+# Why no law fits a curve that returns.
+UNLOADED = (
+    "contain loading and unloading, which no law without memory fits together: state "
+    'branch = "loading"'
 )
 # Percentage of the squared residuals from which on a sample is the cause, whatever the law.
 NEARLY_ALL = 75.0
@@ -74,7 +80,10 @@ def as_specimen_concerns(
     }
     codes = dict(SPECIMEN_CODES)
     advice = _law_advice(experiments)
-    if has_fibres:
+    unloaded = [each.name for each in experiments if _is_unloaded(each)]
+    if unloaded:
+        advice = f"{listed(unloaded)} {UNLOADED}"
+    elif has_fibres:
         advice = f"check {ANGLE}, and compare laws with compare-models --materials"
     if all(np.abs(strain).max() < 2 * RELAXED_STRAIN for strain in strains):
         codes["noise/larger"] = "specimen/branches"
@@ -119,6 +128,20 @@ def as_specimen_concerns(
     grave = any(each.grade == "doubtful" for each in large)
     alone = [replace(each, grade="doubtful") if grave else each for each in alone]
     return [*alone, *first, *large, *others, *unknowns]
+
+
+def _is_unloaded(experiment: Experiment) -> bool:
+    """Whether the strain of a law without memory increases and decreases on one side of zero."""
+    if experiment.specimen is None or experiment.specimen.test in GENERAL_TESTS:
+        return False
+    strain, _ = specimen_strains(experiment)
+    sides = [np.abs(strain[is_side]) for is_side in (strain > 0, strain < 0) if is_side.any()]
+    returns = any(
+        not is_unloading(size)
+        and np.max(np.maximum.accumulate(size) - size) > HYSTERESIS * np.ptp(size)
+        for size in sides
+    )
+    return returns and not any(part.prony for part in experiment.body.parts)
 
 
 def _slope_grows(experiment: Experiment) -> bool:

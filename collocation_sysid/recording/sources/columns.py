@@ -222,7 +222,7 @@ _MODULUS_SYMBOLS = {
 _NEUTRAL = (
     "engineering eng nominal technical technische technischer ingénieur measured gemessen "
     "gemessene actual raw value signal channel kanal sensor transducer cell machine maschine "
-    "instron zwick mts standard traverse grip clamp video optical extensometer gauge dic "
+    "instron zwick mts standard traverse traversen grip clamp video optical extensometer gauge dic "
     "digital camera laser elapsed test run of the in from axial uniaxial tensile compressive "
     "compression zug prüf st first cable tendon chamber relative relaxation dynamic angular "
     "delta δ amount shear sigma σ epsilon eps ε nominale spannungs elastizitäts "

@@ -1149,9 +1149,9 @@ ASSUMPTIONS = (
         considered=1.0,
         description="sticking to the platens of a specimen without a mesh that is pressed, as a fraction "
         "of that without any slip",
-        remedy="state length_m and area_m2 of the specimen; if its platens are lubricated, state "
-        'specimen_sticking = "none" in [uncertainty.assumptions]; if its faces stick, use a test bench '
-        "with a mesh",
+        remedy='if the platens are lubricated, state specimen_sticking = "none" in '
+        "[uncertainty.assumptions]; if the faces stick, use a test bench with a mesh; beside a column "
+        "of strains, state length_m and area_m2",
         effect=_specimen_sticking,
         of_specimens=True,
     ),
