@@ -8,7 +8,7 @@ of other packages are the entry points `ENTRY_POINTS`.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -22,6 +22,8 @@ from ..common.array_types import Array
 from ..common.files import require_regular
 from ..common.schema_tables import Section
 from ..errors import InputError, hint_at, located
+from ..fem.body import Body
+from ..fem.rods import RodMesh
 from ..recording.sources.logs import stored_files
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
 
@@ -62,9 +64,22 @@ class RecordingFolder:
     """Folder of the files of one experiment, and how they are read."""
 
     path: Path  # folder that contains the files
+    body: Body
     is_static: bool  # whether the samples are equilibria
     is_simulation: bool  # whether measurements are simulated, so that their files need not exist
     add_note: Callable[[str], None]  # called with a sentence about what was read or assumed
+
+    def places_on_rod(self, s_m: Mapping[str, float], where: str) -> dict[str, list[float]]:
+        """Return the places [m] on the undeformed body that are stated by arc length, by name."""
+        mesh = self.body.mesh
+        if not s_m:
+            return {}
+        if not isinstance(mesh, RodMesh):
+            raise InputError(
+                "found arc lengths for a body that is not a rod; expected positions", where=where
+            )
+        with located(where=where):
+            return {name: mesh.place_m(s).tolist() for name, s in s_m.items()}
 
     def must_read(self, name: str | None) -> bool:
         """Return whether a file must be read: in a solve always, also without a name (None); in a

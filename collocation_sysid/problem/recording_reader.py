@@ -18,7 +18,6 @@ from ..common.declarations import keys_of
 from ..common.schema_tables import declared_in
 from ..errors import ImplausibleMarkersError, InputError, hint_at, listed, located
 from ..fem.body import Body
-from ..fem.rods import RodMesh
 from ..methods.starts.stiffness_scan import typical_constants
 from ..model.parameters import Parameters
 from ..recording import (
@@ -83,20 +82,6 @@ LARGEST_MISS = 3.0
 LARGEST_INTERPOLATION_SIGMAS = 0.3
 
 
-def _with_places_on_rod(section: ExperimentSection, body: Body) -> ExperimentSection:
-    """Return the table with positions of markers that are stated by arc length."""
-    if not isinstance(body.mesh, RodMesh):
-        raise InputError(
-            "found arc lengths for a body that is not a rod; expected reference_m",
-            where="markers.s_m",
-        )
-    with located(where="markers.s_m"):
-        known = {name: body.mesh.place_m(s).tolist() for name, s in section.markers.s_m.items()}
-    reference_m = {**known, **section.markers.reference_m}
-    markers = section.markers.model_copy(update={"reference_m": reference_m})
-    return section.model_copy(update={"markers": markers})
-
-
 @dataclass
 class RecordingReader:
     """Reader of one experiment's files."""
@@ -133,8 +118,11 @@ class RecordingReader:
                 key for key in ("depth", "outlines") if key in self.section.measurement_tables
             ]
             require_no_surface([*of_surface, *cameras])
-        if self.section.markers.s_m:
-            self.section = _with_places_on_rod(self.section, self.body)
+        markers = self.section.markers
+        if markers.s_m:
+            known = self._recording_folder.places_on_rod(markers.s_m, "markers.s_m")
+            markers = markers.model_copy(update={"reference_m": {**known, **markers.reference_m}})
+            self.section = self.section.model_copy(update={"markers": markers})
         section = self.section
         aligned = self._align([*map(self._poses, range(len(section.moved_sections)))])
         t_s = aligned.t_s
@@ -411,6 +399,7 @@ class RecordingReader:
         """Folder of the files, for tables that read themselves."""
         return RecordingFolder(
             self.folder,
+            self.body,
             is_static=self._is_static,
             is_simulation=self.simulation,
             add_note=self._add_notes,

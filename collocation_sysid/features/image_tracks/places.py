@@ -131,13 +131,13 @@ def find_places(
 
 
 def _require_stated(cameras: Sequence[ImageTracks], stated: Mapping[str, Array]) -> None:
-    """Places on a rod move along its surface in two directions, and not along its centreline alone."""
+    """A ray hardly ever meets the centreline of a rod."""
     for tracks in cameras:
         unknown = [name for name in tracks.names if name not in stated]
         if unknown:
             raise InputError(
-                f"no place is stated of {listed(unknown)} in '{tracks.name}'; expected places_m of all "
-                "points on a rod, because places in images of a rod are not estimated"
+                f"no place is stated of {listed(unknown)} in '{tracks.name}'; expected s_m or places_m "
+                "of all points on a rod, and their error along it, place_sigma_m"
             )
 
 
@@ -333,7 +333,7 @@ class TrackedPlaces(ImageCorrespondences):
     translations: Array
     is_placed: NDArray[np.bool_]  # (N,) of bool: points that are on the body
     is_visible: NDArray[np.bool_]  # (S, N) of bool: points that are not hidden
-    # (N, 2): indices in φ of the coordinates of the places; −1 for exact ones.
+    # (N, k): indices in φ of the coordinates of the places; −1 for exact ones.
     coordinate_parameters: Index
     # (p,): indices in φ of the errors of the pose that are estimated, rotation first.
     pose_parameters: Index
@@ -411,7 +411,7 @@ class TrackedPlaces(ImageCorrespondences):
         return changed
 
     def coordinates(self, phi: Array) -> Array:
-        """Return the coordinates (N, 2) of the places at φ (k,); zero for exact ones."""
+        """Return the coordinates (N, k) of the places at φ (k,); zero for exact ones."""
         return np.append(phi, 0.0)[self.coordinate_parameters]
 
     def places_m(self, phi: Array) -> Array:
@@ -439,10 +439,10 @@ class TrackedPlaces(ImageCorrespondences):
         for ever.
 
         A point is hidden if its face looks away from the camera, or if another part of the body or
-        an obstacle is in front of it.
+        an obstacle is in front of it; no point of a rod is.
         """
         count = len(shapes_m)
-        if not count:
+        if not count or self.association.body.is_slender:
             return self
         before, seen = self.is_visible[:count], self.tracks.is_seen[:count]
         visible = self.visible_points(shapes_m, self.translations[:count], before, seen)
@@ -484,6 +484,9 @@ class TrackedPlaces(ImageCorrespondences):
         """Return the correspondences at other estimates φ (k,) with the first s shapes (s, n, 3)
         [m]; self if nothing has changed.
         """
+        if self.association.body.is_slender:
+            moved, _ = self.association.follow_estimates(self.coordinates(phi))
+            return self if moved is self.association else replace(self, association=moved)
         other = self._with_faces_of(self.places_m(phi), shapes_m)
         return other.with_visibility(shapes_m, is_settled=other is self)
 
@@ -629,7 +632,8 @@ def surface_association(
     body: Body, places_m: Array, sigmas_m: Array, faces: Index
 ) -> MarkerAssociation:
     """Return the association of points whose places (N, 3) [m] move on the surface, from their faces
-    (N,), with prior standard deviations (N,) [m], zero for exact ones.
+    (N,), or along the centreline of a rod, with prior standard deviations (N,) [m], zero for exact
+    ones.
     """
     located = LocatedBody(body.nodes_m, body)
     attached: Sequence[tuple[Index, Array]] = [
@@ -646,10 +650,12 @@ def surface_association(
         weights=np.array([weights for _, weights in attached]),
         cells=none,
         centre_places_m=places_m,
-        axes=np.zeros((count, 3, 2)),
+        axes=np.zeros((count, 3, 1 if body.is_slender else 2)),
         crossed_edges=np.full((count, 2, 3), np.nan),
         crossing_counts=none,
     )
+    if body.is_slender:
+        return association.centred_at(places_m)
     on_faces = [
         nearest_points_of_triangles(place, body.nodes_m[body.mesh.surface[[face]]])[0]
         for place, face in zip(places_m, faces, strict=True)

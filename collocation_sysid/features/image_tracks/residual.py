@@ -181,11 +181,13 @@ class ImageTracksModel(CorrespondenceModel):
 
     @cached_property
     def _coordinate_parameters(self) -> Index:
-        """Indices in φ (N, 2) of the coordinates of the places; −1 for exact ones."""
+        """Indices in φ (N, k) of the coordinates of the places; −1 for exact ones."""
         tracks, nuisance = self.measurement, self.grid.nuisance
-        indices = np.full((len(tracks.names), 2), -1)
+        body = self.grid.experiment.body
+        labels = [place_labels(name, body) for name in tracks.names]
+        indices = np.full((len(labels), len(labels[0])), -1)
         for k in np.flatnonzero(tracks.place_sigmas_m(self.grid.experiment)).tolist():
-            indices[k] = nuisance.indices_of_labels(place_labels(tracks.names[k]))
+            indices[k] = nuisance.indices_of_labels(labels[k])
         return indices
 
     @cached_property

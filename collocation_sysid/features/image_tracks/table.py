@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -115,6 +115,8 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
     places_m : mapping of str to list
         Places [x, y, z] on the undeformed body by the names of points; others are found from their
         first image and estimated.
+    s_m : mapping of str to float
+        On a rod, arc lengths of points on the centreline instead, from the beginning of the rod.
     frame_rate_hz : float, optional
         Images per second, for files without times.
     start_s : float
@@ -131,6 +133,7 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
     camera: ImageCameraSection
     points: list[Text] | None = None
     places_m: dict[str, Vector] = Field(default_factory=dict)
+    s_m: dict[str, NotNegative] = Field(default_factory=dict)
     sigma_px: Declared
     least_likelihood: NotNegative = LEAST_LIKELIHOOD
     frame_rate_hz: Positive | None = None
@@ -153,16 +156,17 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
             "pose_sigma": PoseSigma(**self.pose_sigma.model_dump()),
             **declared_in(self, where=where),
         }
+        stated_m = {**folder.places_on_rod(self.s_m, f"{where}.s_m"), **self.places_m}
         if not folder.must_read(self.file):
-            names = self.points or [*self.places_m]
-            missing = [name for name in names if name not in self.places_m]
+            names = self.points or [*stated_m]
+            missing = [name for name in names if name not in stated_m]
             if missing or not names:
                 raise InputError(
                     f"found no place of {missing[0] if missing else 'any point'}; expected the "
                     "place on the undeformed body of each point that is simulated",
                     where=f"{where}.places_m",
                 )
-            return self._tracks(camera, names, t_s, None, where, arguments)
+            return self._tracks(camera, names, t_s, None, where, arguments, stated_m)
         content, at_s = self._read_file(folder, where)
         names = self._names(content, where)
         columns = [content.names.index(name) for name in names]
@@ -178,7 +182,9 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
             kept = np.flatnonzero(counts).tolist()
             names, pixels = [names[k] for k in kept], pixels[:, kept]
         folder.add_note(f"{self.file}: {is_used.sum()} of {len(at_s)} images are used")
-        return self._tracks(camera, names, at_s[is_used], pixels[is_used], where, arguments)
+        return self._tracks(
+            camera, names, at_s[is_used], pixels[is_used], where, arguments, stated_m
+        )
 
     def _tracks(
         self,
@@ -188,9 +194,9 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
         pixels: Array | None,
         where: str,
         arguments: dict[str, Any],
+        stated_m: Mapping[str, Sequence[float]],
     ) -> ImageTracks:
-        unknown = [np.nan] * 3
-        places = [self.places_m.get(name, unknown) for name in names]
+        places = [stated_m.get(name, [np.nan] * 3) for name in names]
         with located(where=where):
             return ImageTracks(
                 camera=camera, t_s=t_s, pixels=pixels, names=names, places_m=places, **arguments
@@ -198,7 +204,11 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
 
     def _names(self, content: TrackFile, where: str) -> list[str]:
         names = list(content.names) if self.points is None else self.points
-        for key, stated in (("points", names), ("places_m", [*self.places_m])):
+        for key, stated in (
+            ("points", names),
+            ("places_m", [*self.places_m]),
+            ("s_m", [*self.s_m]),
+        ):
             absent = [name for name in stated if name not in content.names]
             if absent:
                 known = ", ".join(content.names)

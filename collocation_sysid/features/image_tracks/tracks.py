@@ -16,6 +16,7 @@ from ...common.checked_arrays import float_array, read_only_floats, unconverted_
 from ...common.declarations import declaration, identity, key
 from ...common.validated_types import NotNegative, Positive
 from ...errors import InputError
+from ...fem.body import Body
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.lost_points import followed_samples
@@ -44,8 +45,9 @@ CAREFUL_REACH = 1.0
 class ImageTracks(CameraImages):
     """Pixels of points of the body in the images of one camera, as trackers of videos write them.
 
-    A point lies on the surface of the body. Where its place is unknown, it is found from the ray of
-    its first image and then estimated. Points with the same name in several cameras have one place.
+    A point lies on the surface of the body, or on the centreline of a rod. Where its place is
+    unknown, it is found from the ray of its first image and then estimated; on a rod a rough place
+    must be stated. Points with the same name in several cameras have one place.
 
     Parameters
     ----------
@@ -64,7 +66,8 @@ class ImageTracks(CameraImages):
     sigma_px : float
         Standard deviation of the noise of each pixel coordinate.
     place_sigma_m : float
-        Standard deviation of the known places along the surface; zero for exact ones.
+        Standard deviation of the known places along the surface, or along a rod; zero for exact
+        ones.
     drift_sigma_px : float
         Drift of the tracker: standard deviation of a random walk of each track after one second
         [pixels].
@@ -196,7 +199,7 @@ class ImageTracks(CameraImages):
                 yield IMAGE_DRIFT, label, drift_px
         for point, sigma in zip(self.names, self.place_sigmas_m(experiment), strict=True):
             if sigma:
-                for label in place_labels(point):
+                for label in place_labels(point, experiment.body):
                     yield SURFACE_PLACE, label, float(sigma)
 
     def other_views(self, experiment: Experiment) -> Iterator[tuple[str, Self]]:
@@ -275,6 +278,8 @@ def stated_places(experiment: Experiment) -> dict[str, tuple[Array, float]]:
     return places
 
 
-def place_labels(point: str) -> list[str]:
-    """Return the labels of the coordinates of a place on the surface."""
+def place_labels(point: str, body: Body) -> list[str]:
+    """Return the labels of the coordinates of a place on the surface, or on the centreline."""
+    if body.is_slender:
+        return [f"place of {point} along the rod [m]"]
     return [f"place of {point} on the surface, {direction} [m]" for direction in DIRECTIONS]
