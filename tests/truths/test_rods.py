@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from kit.checks import observed_order
+from kit.forces import forces_alone
 from kit.rods import (
     CABLE,
     DENSITY_KG_M3,
@@ -33,6 +34,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
+from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.fem.rods import CrossSection, rod_mesh
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.forces import Forces
@@ -345,6 +347,33 @@ def test_frequencies_of_a_cantilever():
         assert ratios[-1][name] == pytest.approx(1, abs=most), name
         first, second = np.diff([ratio[name] for ratio in ratios])
         assert np.log2(first / second) == pytest.approx(2, abs=0.3), name
+
+
+def test_a_beam_on_pins_sags_and_swings_as_a_simply_supported_one():
+    """The second and third node of a section are on a line along d₂: held, they are its pin. The
+    other end rolls along the beam.
+    """
+    bending, length_m, section = CABLE["bending_n_m2"], 0.5, CrossSection.round(0.006)
+    mass_kg_m = DENSITY_KG_M3 * section.area_m2
+    expected_hz = np.pi / (2 * length_m**2) * np.sqrt(bending / mass_kg_m)
+    expected_m = 5 * mass_kg_m * 9.81 * length_m**4 / (384 * bending)
+    errors = []
+    for count in (11, 21, 41):
+        beam = cable(straight(length_m, section, count))
+        n = len(beam.nodes_m)
+        pins = dofs_of(np.array([1, 2, n - 2, n - 1]))
+        free = np.append(np.setdiff1d(np.arange(3 * n), pins), [3 * n - 6, 3 * n - 3])
+        forces = forces_alone(beam, beam.theta_from_values(CABLE | UNDAMPED))
+        hz = natural_modes(forces, beam.nodes_m, np.sort(free), 1).frequencies_hz[0]
+        weight_n = np.full((n, 3), [0.0, mass_kg_m * 9.81 * length_m / (count - 1) / 3, 0.0])
+        weight_n[[0, 1, 2, n - 3, n - 2, n - 1]] /= 2
+        stiffness = beam.stiffness(beam.nodes_m, **CABLE).toarray()[np.ix_(free, free)]
+        moved_m = np.zeros(3 * n)
+        moved_m[free] = np.linalg.solve(stiffness, weight_n.ravel()[free])
+        sag_m = moved_m.reshape(-1, 3, 3).mean(axis=1)[count // 2, 1]
+        errors.append([hz / expected_hz - 1, sag_m / expected_m - 1])
+    assert np.abs(errors[-1]).max() < 1.5e-3
+    np.testing.assert_allclose(np.array(errors[0])[1] / np.array(errors[1])[1], 4, rtol=0.1)
 
 
 ROOTS = np.array([1.875104069, 4.694091133])
