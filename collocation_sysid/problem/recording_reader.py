@@ -528,7 +528,7 @@ class RecordingReader:
     def _select_tracks(self, table: MarkerTable) -> MarkerTable:
         """Return the tracks to fit; markers of a weight of 0 are noted."""
         markers = self.section.markers
-        for key in ("reference_m", "reference_sigma_m", "sigma_m", "weights"):
+        for key in ("s_m", "reference_m", "reference_sigma_m", "sigma_m", "weights"):
             if isinstance(by_name := getattr(markers, key), dict):
                 _require_known_markers(by_name, table.names, key=f"markers.{key}")
         unweighted = [name for name in table.names if markers.weights.get(name) == 0]

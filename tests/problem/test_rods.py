@@ -85,6 +85,7 @@ def test_the_rest_shape_of_a_curved_centreline_is_as_stated(rest_shape, problem)
         ("s_m = [0.0, 0.05] }", 'face = "top" }', "expected whole sections"),
         ('material = "cable"', 'material = "cable"\nelement = "tet10"', "element for a rod"),
         ("tip = 0.6 }", "tip = 0.7 }", "markers.s_m: found the arc length 0.7 m"),
+        ("tip = 0.6 }", "top = 0.6 }", "markers.s_m: found 'top'"),
         ("s_m = [0.0, 0.05]", "s_m = [0.0, 0.7]", "grasp.nodes: found [0, 0.7]"),
         ("diameter_m = 0.006", "diameter_m = 6", "object.section.* likely 0.006 m"),
         ("mass_per_length_kg_m = 0.034", "", "expected exactly one of mass_per_length_kg_m"),
