@@ -396,6 +396,7 @@ class FilmFigure:
             panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
         distance = f"distance from {self.measured}" if self.paths else "marker error"
         style_axes(panel, "", xlabel="time [s]", ylabel=f"{distance}, RMS [mm]")
+        panel.set_xlim(t_s[0], t_s[-1])
         panel.set_ylim(bottom=0.0)
         add_legend_above(panel, columns=1)
         return panel.axvline(0.0, color=BLACK, lw=0.8)
@@ -430,9 +431,9 @@ class FilmFigure:
             )
             distances = np.linalg.norm(markers_m[sample] - measured, axis=1)
             present = distances[np.isfinite(distances)]
-            off = f"{1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if len(present) else "no markers"
-            is_compared = measured.size and markers_m is not replay.measured_m
-            title.set_text(f"{name}: {off}" if is_compared else name)
+            is_compared = len(present) and markers_m is not replay.measured_m
+            off = f": {1e3 * np.sqrt(np.mean(present**2)):.2f} mm" if is_compared else ""
+            title.set_text(name + off)
         for path_mm, dot in self.paths:
             dot.set_data(*path_mm[sample].T)
         if self.cursor is not None:

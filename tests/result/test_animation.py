@@ -119,6 +119,16 @@ def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(ru
     assert [line.get_label() for line in errors.lines[:2]] == ["fitted", "simulated"]
     assert film.cursor is not None
     assert film.cursor.get_xdata()[0] == pytest.approx(swing.t_s[4] - swing.t_s[0])
+    # Of a plan, the body also moves after the end of the reference.
+    ended = replace(
+        swing,
+        measured_m=np.where(swing.t_s[:, None, None] > swing.t_s[3], np.nan, swing.measured_m),
+    )
+    film = FilmFigure(ended)
+    film.show_sample(len(ended.t_s) - 1)
+    assert film.drawings[0][-1].get_text() == "fitted"
+    end_s = swing.t_s[-1] - swing.t_s[0]
+    assert film.figure.axes[1].get_xlim() == pytest.approx((0, end_s))
     unmarked = replace(swing, measured_m=np.full_like(swing.measured_m, np.nan))
     assert FilmFigure(unmarked).cursor is None
 
