@@ -9,6 +9,8 @@ import re
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 _IN_WHEEL = Path(__file__).parents[1] / "documentation"
 _IN_CHECKOUT = Path(__file__).parents[2] / "docs"
 # Pages that Sphinx alone can show: lists of links and of names.
@@ -82,23 +84,46 @@ def page_text(topic: str) -> str:
 
 
 def search_pages(text: str) -> list[tuple[str, str, str]]:
-    """Return topic, heading and first line with a word of `text` of the five best pages that have all
-    its words in one section; a word in a heading counts as ten in the text.
+    """Return topic, heading and best line of the five pages with the best sections for `text`.
+
+    Words are compared with the beginnings of words, and a rare word counts more than a frequent one;
+    a word of a heading counts three times, further ones in a section less and less, and those of a
+    long section less than those of a short one (BM25).
     """
-    words = text.lower().split()
+    stems = {w.removesuffix("s") for w in re.findall(r"\w+", text.lower())}
+    patterns = [re.compile(rf"\b{stem}", re.IGNORECASE) for stem in sorted(stems)]
+    sections = _sections()
+    counts = np.array(
+        [
+            [3 * len(p.findall(heading)) + len(p.findall(body)) for p in patterns]
+            for _, heading, body in sections
+        ]
+    ).reshape(len(sections), len(patterns))
+    lengths = np.array([[len(body) + 1] for _, _, body in sections])
+    weights = np.log((len(sections) + 1) / (np.count_nonzero(counts, axis=0) + 1))
+    saturation = 0.5 + lengths / lengths.mean()
+    scores = (weights * counts / (counts + saturation)).sum(axis=1)
     found = {}
+    for k in np.argsort(-scores, kind="stable"):
+        topic, heading, body = sections[k]
+        if scores[k] > 0 and topic not in found and len(found) < 5:
+            present = [[bool(p.search(line)) for p in patterns] for line in body.splitlines()]
+            best = int(np.argmax(present @ weights)) if present else 0
+            line = body.splitlines()[best].strip() if present else ""
+            found[topic] = heading, re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)
+    return [(topic, *where) for topic, where in found.items()]
+
+
+@cache
+def _sections() -> list[tuple[str, str, str]]:
+    """Topic, heading and text of each section of the pages, without programs and formulas."""
+    sections = []
     for topic, file in page_files().items():
-        for section in re.split(r"^#+ ", file.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
+        text = re.sub(r"^```.*?^```", "", file.read_text(encoding="utf-8"), flags=re.M | re.DOTALL)
+        for section in re.split(r"^#+ ", text, flags=re.MULTILINE)[1:]:
             heading, _, body = section.partition("\n")
-            counts = [10 * heading.lower().count(w) + body.lower().count(w) for w in words]
-            if counts and all(counts) and sum(counts) > found.get(topic, (0,))[0]:
-                lines = [
-                    each for each in body.splitlines() if any(w in each.lower() for w in words)
-                ]
-                line = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", lines[0].strip()) if lines else ""
-                found[topic] = sum(counts), heading, line
-    best = sorted(found, key=lambda topic: -found[topic][0])[:5]
-    return [(topic, *found[topic][1:]) for topic in best]
+            sections.append((topic, heading, body.strip()))
+    return sections
 
 
 def explain_command(*topics: str) -> str:
