@@ -254,22 +254,20 @@ def _with_estimated_lengths(problem: Problem, solution: Solution) -> Problem:
 def _with_problem_notes(answer: Run) -> Run:
     problem = answer.problem
     substeps = answer.solution.collocation.substeps
-    coarse = (
-        concern.message
-        for experiment in problem.experiments
-        for concern in (
-            *rotation_step_concerns(experiment, substeps),
-            *impact_step_concerns(experiment, substeps),
-        )
-    )
+    may_strike = [each for each in problem.experiments if each.obstacles]
+    coarse = [
+        *(each for e in problem.experiments for each in rotation_step_concerns(e, substeps)),
+        *(each for e in may_strike for each in impact_step_concerns(e, substeps)),
+    ]
     tests: Iterable[str] = ()
     impacts = ()
     if all(each.specimen for each in problem.experiments):
         tests = one_kind_notes(problem.experiments, problem.parameters)
-    may_strike = any(each.obstacles for each in problem.experiments)
     if may_strike and problem.substeps == "auto" and problem.choose_first_substeps() > 1:
         impacts = (IMPACT_NOTE.format(substeps),)
-    return replace(answer, notes=(*coarse, *impacts, *tests, *answer.notes))
+    return replace(
+        answer, notes=(*(each.message for each in coarse), *impacts, *tests, *answer.notes)
+    )
 
 
 def _with_posterior(

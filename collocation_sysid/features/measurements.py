@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..common.display import quantity, short
 from ..common.serialisation import optional
 from ..errors import InputError
@@ -26,7 +26,7 @@ from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers
 from ..recording.measured_wrench import Wrench
-from ..recording.measurement import Measurement
+from ..recording.measurement import Measurement, root_mean
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen import STRESS_NAME
 from ..recording.specimen_files import moduli_of

@@ -348,7 +348,7 @@ class LocatedForce:
         InputError
             If the force is on faces and no face has all of its nodes selected.
         """
-        area, normal = surface_shares(mesh)
+        area, normal = mesh.surface_shares
         data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
         if force.on == "nodes":
             nodes = chosen[:, None]
@@ -396,24 +396,6 @@ def area_vector(places: Sequence[ca.SX]) -> ca.SX:
     return sum((ca.cross(a, b) for a, b in neighbours), start=ca.SX.zeros(3)) / 2
 
 
-def surface_shares(mesh: ElementNodes) -> tuple[Array, Array]:
-    """Return the surface area (n,) [m²] and outward unit normal (n, 3) of every node; zero inside.
-
-    The area belongs to the corners, a third of each face, or to the mid nodes of quadratic faces,
-    whose corners have zero area and normal. The normal is the mean by area over the faces.
-    """
-    faces = mesh.nodes_of_faces(mesh.mesh.surface)
-    a, b, c = np.moveaxis(mesh.points_m[faces[:, :3]], 1, 0)
-    share = np.cross(b - a, c - a) / 6 * mesh.mesh.surface_factor
-    normal = np.zeros((len(mesh.points_m), 3))
-    area = np.zeros(len(normal))
-    for node in faces[:, -3:].T:
-        np.add.at(normal, node, share)
-        np.add.at(area, node, np.linalg.norm(share, axis=1))
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return area, np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-
-
 # Air at 20 °C and sea level, half humid [kg/m³].
 AIR_KG_M3 = 1.2
 # Share of the displaced air that moves with a body: that of a sphere in an ideal fluid.
@@ -456,7 +438,7 @@ def placed_unit_drag(nodes: ElementNodes, volume_m3: Array) -> LocatedForce:
     volume_m3 : (n,)
         Lumped volume of every node of the body [m³], including nodes of obstacle frames.
     """
-    on_surface = np.flatnonzero(surface_shares(nodes)[0] > 0)
+    on_surface = np.flatnonzero(nodes.surface_shares[0] > 0)
     no_constants = np.zeros(0, dtype=np.int64)
     return LocatedForce.on_mesh(
         unit_drag(), nodes, chosen=on_surface, volume_m3=volume_m3, columns=no_constants

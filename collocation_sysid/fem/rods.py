@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 from typing import Literal
 
@@ -351,7 +351,7 @@ def strains_in_shape(points_m: Array, cells: Index, geometry: Array) -> Array:
 
 def _strains_of_shape(ends_m: Array, gradients: Array) -> Array:
     G = np.einsum("eai,eac->eic", ends_m, gradients)
-    return np.array([_STRAINS(each).full().ravel() for each in G]).reshape(-1, STRAINS)
+    return np.array([_strain_function()(each).full().ravel() for each in G]).reshape(-1, STRAINS)
 
 
 def midpoint_interpolation(s_m: Array) -> Array:
@@ -423,12 +423,11 @@ def strains_with_sections(G: ca.SX, half_m: ca.SX) -> ca.SX:
     return strain
 
 
+@cache
 def _strain_function() -> ca.Function:
     G = ca.SX.sym("G", 3, COLUMNS)
     return ca.Function("strains", [G], [strains_of(G)])
 
-
-_STRAINS = _strain_function()
 
 RodLaw = Literal["rod", "cable"]
 # Constants of each law.

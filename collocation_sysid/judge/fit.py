@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..methods.solution import Solution
 from ..program.collocation import ExperimentIterate
 from ..program.depth.comparison import depth_residuals
@@ -16,7 +16,7 @@ from ..program.measured_motion import fitted_values
 from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers
-from ..recording.measurement import Measurement
+from ..recording.measurement import Measurement, root_mean
 from ..statistics.budget.consider_analysis import changed_residuals
 from ..statistics.distributions import normal_isf
 from ..statistics.hypothesis import Hypothesis

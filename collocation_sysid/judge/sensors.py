@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..errors import InputError, SimulationError
 from ..methods.reduced_space import ReducedSpace
 from ..program.measured_motion import fitted_values
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
-from ..recording.measurement import Measurement
+from ..recording.measurement import Measurement, root_mean
 from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
 from ..statistics.axes import with_other_axes
 from ..statistics.thresholds import BETTER, NOISE

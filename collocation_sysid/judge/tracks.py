@@ -10,9 +10,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..program.experiment_iterate import ExperimentIterate
 from ..recording.experiment import Experiment
+from ..recording.measurement import root_mean
 from ..recording.nuisance import PLACE
 from ..statistics.distributions import normal_isf
 from ..statistics.hypothesis import Hypothesis

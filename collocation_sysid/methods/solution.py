@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..errors import InputError, SimulationError, hint_at
 from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation
@@ -25,6 +25,7 @@ from ..program.sweep import Sweep
 from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
+from ..recording.measurement import root_mean
 from .starts.start import Scan
 
 

@@ -167,11 +167,6 @@ class LocalForces:
     pattern: SymmetricPattern  # pattern of the matrices
 
     @property
-    def has_forces(self) -> bool:
-        """Whether there are local forces at all."""
-        return bool(self.parts)
-
-    @property
     def dof_count(self) -> int:
         """Number 3n of dofs."""
         return self.pattern.size

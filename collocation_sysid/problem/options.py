@@ -4,21 +4,13 @@ problem.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from ..common.validated_classes import validated
 from ..common.validated_types import Flag, Positive, Text
-from ..fem.body import Body
-from ..model.parameters import Parameters
-from ..statistics.budget.systematic_effects import (
-    Assumptions,
-    ExactIfNone,
-    limited_poisson_deviation,
-    usual_deviations,
-)
+from ..statistics.budget.systematic_effects import Assumptions, ExactIfNone
 from ..statistics.uncertainty import ErrorModel
 
 
@@ -56,21 +48,6 @@ class UncertaintyOptions(ErrorModel):
     profile: tuple[Text, ...] = ()
     numerical: Flag = False
     assumptions: Annotated[Assumptions, ExactIfNone()] = field(default_factory=Assumptions)
-
-    def collect_considered(
-        self, bodies: Iterable[Body] = (), parameters: Parameters | None = None
-    ) -> dict[str, float | None]:
-        """Return the standard deviations of systematic effects by name (None for exact ones), with
-        the defaults for `bodies`.
-
-        With `parameters`, that of Poisson's ratio ends before the incompressible body, see
-        `limited_poisson_deviation`.
-        """
-        deviations = self.assumptions.collect_deviations(usual_deviations(bodies))
-        stated = deviations["poisson"]
-        if parameters is not None and stated is not None:
-            deviations["poisson"] = limited_poisson_deviation(stated, parameters)
-        return deviations
 
 
 @dataclass(frozen=True)

@@ -202,7 +202,7 @@ class Problem:
         """Standard deviations of all systematic effects by name, None for what is exact: the stated
         ones, and the defaults of bodies that were made like those of the problem.
         """
-        return self.uncertainty.collect_considered(self.bodies, self.parameters)
+        return self.uncertainty.assumptions.collect_deviations(self.bodies, self.parameters)
 
     @property
     def is_declared_simulated(self) -> bool:

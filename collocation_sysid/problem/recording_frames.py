@@ -23,6 +23,7 @@ from ..recording.experiment import EARTH_M_S2
 from ..recording.poses import Frame
 from ..recording.rigid_fit import least_rigid_marker
 from ..recording.sources.log_frames import LogFrames, TopicFrames
+from ..recording.sources.logs import TopicAddress
 from .recording_schema import ExperimentSection, ForceSensorSection, MarkersSection, MovedSection
 
 # Names of frames that are level by convention, or their endings; the first are more reliable.
@@ -91,7 +92,11 @@ class RecordingFrames:
     folder: Path  # folder that contains the files
 
     def _frames_of(self, file: str | None) -> TopicFrames:
-        return TopicFrames.read(self.folder / file) if file else TopicFrames()
+        address = self._topic_of(file)
+        return TopicFrames() if address is None else TopicFrames.read(address)
+
+    def _topic_of(self, file: str | None) -> TopicAddress | None:
+        return TopicAddress.from_path(self.folder / file) if file else None
 
     @cached_property
     def poses(self) -> list[TopicFrames]:
@@ -124,10 +129,10 @@ class RecordingFrames:
             section.markers.file,
             *(section.file_of(each.sensor) for each in section.moved_sections),
         ]
-        for name in filter(None, names):
+        for name in names:
             with located(name):
-                if (frames := LogFrames.read(self.folder / name)).name:
-                    return frames
+                if (address := self._topic_of(name)) is not None:
+                    return LogFrames.read(address)
         return LogFrames()
 
     # Gravity --------------------------------------------------------------------------------------

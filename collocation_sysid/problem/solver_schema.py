@@ -60,7 +60,7 @@ class OptionTable:
 
 
 def _method_key(kind: type[MethodOptions]) -> Any:
-    return Field(default_factory=kind, alias=kind.name, description=method_summary(kind.name))
+    return Field(None, alias=kind.name, description=method_summary(kind.name))
 
 
 class SolverSection(Section):
@@ -77,18 +77,22 @@ class SolverSection(Section):
 
     method: MethodName = DEFAULT
     huber: Positive | None = None
-    interior_point: Annotated[InteriorPoint, OptionTable(InteriorPoint)] = _method_key(
+    interior_point: Annotated[InteriorPoint | None, OptionTable(InteriorPoint)] = _method_key(
         InteriorPoint
     )
-    reduced_space: Annotated[ReducedSpace, OptionTable(ReducedSpace)] = _method_key(ReducedSpace)
-    penalty: Annotated[Penalty, OptionTable(Penalty)] = _method_key(Penalty)
-    augmented_lagrangian: Annotated[AugmentedLagrangian, OptionTable(AugmentedLagrangian)] = (
-        _method_key(AugmentedLagrangian)
+    reduced_space: Annotated[ReducedSpace | None, OptionTable(ReducedSpace)] = _method_key(
+        ReducedSpace
     )
-    shooting: Annotated[Shooting, OptionTable(Shooting)] = _method_key(Shooting)
-    casadi_sqpmethod: Annotated[SqpMethod, OptionTable(SqpMethod)] = _method_key(SqpMethod)
-    casadi_sleqp: Annotated[Sleqp, OptionTable(Sleqp)] = _method_key(Sleqp)
-    continuation: Annotated[Continuation, OptionTable(Continuation)] = _method_key(Continuation)
+    penalty: Annotated[Penalty | None, OptionTable(Penalty)] = _method_key(Penalty)
+    augmented_lagrangian: Annotated[
+        AugmentedLagrangian | None, OptionTable(AugmentedLagrangian)
+    ] = _method_key(AugmentedLagrangian)
+    shooting: Annotated[Shooting | None, OptionTable(Shooting)] = _method_key(Shooting)
+    casadi_sqpmethod: Annotated[SqpMethod | None, OptionTable(SqpMethod)] = _method_key(SqpMethod)
+    casadi_sleqp: Annotated[Sleqp | None, OptionTable(Sleqp)] = _method_key(Sleqp)
+    continuation: Annotated[Continuation | None, OptionTable(Continuation)] = _method_key(
+        Continuation
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -104,14 +108,13 @@ class SolverSection(Section):
 
     @property
     def methods(self) -> dict[str, Method]:
-        """All methods by their names in the file, with the options of their tables, or default
-        options.
-        """
-        return {
+        """Methods with a table, by their names in the file."""
+        tables = {
             field.alias: getattr(self, name)
             for name, field in type(self).model_fields.items()
             if field.alias is not None
         }
+        return {name: method for name, method in tables.items() if method is not None}
 
 
 def _method_from_table(method: str, table: Any) -> Any:

@@ -127,7 +127,7 @@ class Depth(Measurement):
     t_s: Array = key(converter=unconverted)
     clouds: tuple[Array, ...] = key(converter=_unconverted_clouds)
     sigma_m: float = key(Positive)
-    camera: Camera = key(default=Camera())
+    camera: Camera = key(default_factory=Camera)
     spacing_m: float = key(Positive, default=SPACING_M)
     gate_m: float = key(Positive, default=GATE_M)
     faces: Selection | None = key(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..common.array_types import Array, Index, root_mean
+from ..common.array_types import Array, Index
 from ..common.checked_arrays import (
     as_array,
     as_array_or_none,
@@ -25,7 +25,7 @@ from ..common.time_dependence import over_time
 from ..common.validated_classes import validated
 from ..common.validated_types import Positive
 from ..errors import InputError
-from .measurement import Measurement, checked_ratios, split_sigma
+from .measurement import Measurement, checked_ratios, root_mean, split_sigma
 from .placement import AttachmentRule, LocatedBody, Placement, place_markers
 
 if TYPE_CHECKING:

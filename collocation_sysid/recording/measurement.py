@@ -14,11 +14,16 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..common.checked_arrays import float_array, read_only_floats
 from ..common.display import quantity
 from ..errors import InputError
 from .sample_times import TIME_TOLERANCE_S
+
+
+def root_mean(squares: Array) -> float:
+    """Return the square root of the mean of `squares`; 0 for an empty array."""
+    return float(np.sqrt(squares.mean())) if squares.size else 0.0
 
 
 class Measurement:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..errors import SimulationError
 from ..features.registry import FEATURES, present
 from ..features.specimens.concerns import as_specimen_concerns
@@ -17,6 +17,7 @@ from ..problem import Problem
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
 from ..program.transcription import Transcription
+from ..recording.measurement import root_mean
 from ..recording.nuisance import TIME
 from ..statistics.assessment import (
     DOUBTFUL_ANGLE_RAD,

@@ -14,13 +14,14 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ..common.array_types import Array, root_mean
+from ..common.array_types import Array
 from ..common.display import predicted_change
 from ..model.parameters import Parameters, is_default_bound
 from ..program.modes.stability import Instability
 from ..recording.deviation import Deviation, in_readable_unit
 from ..recording.experiment import Experiment
 from ..recording.impact_steps import impact_steps
+from ..recording.measurement import root_mean
 from .budget.discretisation_error import Refinement
 from .concerns import Concern, Grade, concern_if
 from .distributions import chi2_sf, normal_isf

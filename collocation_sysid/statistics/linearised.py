@@ -15,16 +15,16 @@ covariance B of the score Sᵀe becomes L (LᵀB L) Lᵀ for the parameters, wit
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, wraps
+from typing import NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
-from ..common.last_results import known_at_last
 from ..fem.kernels import map_experiments
 from ..model.parameters import ThetaMap
 from ..program.collocation import Collocation, ExperimentIterate
@@ -34,6 +34,28 @@ from ..program.measurement_residual import huber_as_weights
 from ..program.observable_response import ObservableResponse
 from ..program.reactions.forces import GraspForces
 from ..program.sweep import Sweep
+
+Owner = TypeVar("Owner")
+Result = TypeVar("Result")
+
+
+def known_at_last(function: Callable[[Owner, Array], Result]) -> Callable[[Owner, Array], Result]:
+    """Return a function of an object and an array that computes its result again only for another
+    array than the last one of this object: several checks of one answer need the same.
+
+    The object must be compared by identity, and the result must not be changed.
+    """
+    known: WeakKeyDictionary[Owner, tuple[bytes, Result]] = WeakKeyDictionary()
+
+    @wraps(function)
+    def of(owner: Owner, at: Array) -> Result:
+        key = at.tobytes()
+        last = known.get(owner)
+        if last is None or last[0] != key:
+            last = known[owner] = key, function(owner, at)
+        return last[1]
+
+    return of
 
 
 @one_blas_thread()

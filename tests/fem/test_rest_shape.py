@@ -28,7 +28,6 @@ from collocation_sysid.fem.meshes.selection import Indices
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.model.parameters import Unknown
-from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.simulation import simulate
@@ -412,12 +411,12 @@ def test_a_finer_mesh_keeps_stated_values():
 
 
 def test_an_unstated_rest_shape_counts_as_stress_free_unless_the_mesh_is_a_scan():
-    options = UncertaintyOptions()
-    assert options.collect_considered([scanned_body()])["rest_shape"] is None
+    usual = Assumptions()
+    assert usual.collect_deviations([scanned_body()])["rest_shape"] is None
     box = box_mesh((0.12, 0.03, 0.03), (2, 1, 1))
     mesh = TetMesh(box.points_m, box.tetrahedra)  # not generated from stated lengths
     assert cs.Body(mesh, density_kg_m3=100.0).rest_shape is None
     for origin, stated, deviation in (("scan", None, 0.58), ("cad", "stress_free", None)):
         body = cs.Body(mesh, density_kg_m3=100.0, mesh_from=origin)
         assert body.rest_shape == stated
-        assert options.collect_considered([body])["rest_shape"] == deviation
+        assert usual.collect_deviations([body])["rest_shape"] == deviation

@@ -26,7 +26,6 @@ from collocation_sysid import (
     Problem,
     Specimen,
     Tied,
-    UncertaintyOptions,
     Unknown,
     box_mesh,
     run,
@@ -303,20 +302,20 @@ def test_a_law_of_a_user_is_not_changed():
 def test_the_deviation_of_a_stated_poisson_ratio_ends_before_the_incompressible_body(
     poisson, limited
 ):
-    deviation = UncertaintyOptions().collect_considered((), parameters(poisson=poisson))["poisson"]
+    deviation = Assumptions().collect_deviations((), parameters(poisson=poisson))["poisson"]
     assert deviation == pytest.approx(limited, rel=0.01)
-    stated = UncertaintyOptions(assumptions=Assumptions(poisson=1e-6))
-    considered = stated.collect_considered((), parameters(poisson=poisson))
+    stated = Assumptions(poisson=1e-6)
+    considered = stated.collect_deviations((), parameters(poisson=poisson))
     assert considered["poisson"] == pytest.approx(1e-6, rel=0.01)
-    exact = UncertaintyOptions(assumptions=Assumptions(poisson="none"))
-    assert exact.collect_considered((), parameters(poisson=poisson))["poisson"] is None
+    exact = Assumptions(poisson="none")
+    assert exact.collect_deviations((), parameters(poisson=poisson))["poisson"] is None
 
 
 def test_the_largest_of_several_stated_poisson_ratios_limits_their_deviation():
     several = parameters(
         **{"poisson": 0.3, "core.poisson": Tied("rim.poisson"), "rim.poisson": 0.499}
     )
-    deviation = UncertaintyOptions().collect_considered((), several)["poisson"]
+    deviation = Assumptions().collect_deviations((), several)["poisson"]
     assert deviation == pytest.approx(1e-3 * np.log(21.0), rel=1e-6)
 
 

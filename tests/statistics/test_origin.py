@@ -34,8 +34,8 @@ def test_the_origin_selects_default_deviations():
     assert unknown["mass"] == cast["mass"] == foam["mass"]
     # Of several bodies the largest counts.
     assert usual_deviations([body(made="cast"), body(made="foam")]) == foam
-    options = cs.UncertaintyOptions(assumptions=cs.Assumptions(anisotropy=0.07))
-    assert options.collect_considered([body(made="foam")])["anisotropy"] == 0.07
+    stated = cs.Assumptions(anisotropy=0.07)
+    assert stated.collect_deviations([body(made="foam")])["anisotropy"] == 0.07
 
 
 @pytest.mark.parametrize(

@@ -404,3 +404,22 @@ class ElementNodes:
             return triangles
         pairs = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
         return np.hstack([triangles, self.mesh.mid_node_indices(pairs)])
+
+    @cached_property
+    def surface_shares(self) -> tuple[Array, Array]:
+        """Surface area (n,) [m²] and outward unit normal (n, 3) of every node; zero inside.
+
+        The area belongs to the corners, a third of each face, or to the mid nodes of quadratic
+        faces, whose corners have zero area and normal. The normal is the mean by area over the
+        faces.
+        """
+        faces = self.nodes_of_faces(self.mesh.surface)
+        a, b, c = np.moveaxis(self.points_m[faces[:, :3]], 1, 0)
+        share = np.cross(b - a, c - a) / 6 * self.mesh.surface_factor
+        normal = np.zeros((len(self.points_m), 3))
+        area = np.zeros(len(normal))
+        for node in faces[:, -3:].T:
+            np.add.at(normal, node, share)
+            np.add.at(area, node, np.linalg.norm(share, axis=1))
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return area, np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)

@@ -11,7 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ...common.array_types import Array, root_mean
+from ...common.array_types import Array
+from ...recording.measurement import root_mean
 from .surface_correspondences import SurfaceCorrespondences, initial_gate_m
 
 # Default threshold of Huber's loss [σ]: depth images contain other things too.

@@ -110,7 +110,7 @@ class StepEquations(ABC):
 
     def add_local_forces(self, residual: Array, x: Array) -> Array:
         """Return a residual (3n,) [N] without local forces at positions x (3n,) [m] plus these."""
-        if not self.local.has_forces:
+        if not self.local.parts:
             return residual
         return residual + self.local_weight * self.local.force(*self.states(x))
 
@@ -119,7 +119,7 @@ class StepEquations(ABC):
         x.
         """
         at = self.linearise_without_local(x)
-        if not self.local.has_forces:
+        if not self.local.parts:
             return at
         force_n, symmetric, local_skew = self.local.linearise(*self.states(x), self.rates)
         skew = at.skew

@@ -343,7 +343,7 @@ class _Stepper:
             correction_m = np.concatenate([known[1 - MOST_VALUES :], correction_m])
         v, a = equations.kinematics(x)
         local_n = None
-        if equations.local.has_forces:
+        if equations.local.parts:
             mass = equations.mass_kg
             xi, nu = equations.states(x)
             local_n = self._local_n(loads.forces, xi[0], nu[0])

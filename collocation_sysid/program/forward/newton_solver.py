@@ -279,7 +279,7 @@ class NewtonSolver:
         return solution
 
     def _solve_step(self, x: Array, equations: StepEquations) -> Array:
-        if equations.local.has_forces and self.has_no_inverted_element(x):
+        if equations.local.parts and self.has_no_inverted_element(x):
             improved, done = self._simplified_newton(x, _CondensedIteration(self, equations))
             if done:
                 return improved

@@ -314,7 +314,7 @@ class RowEquations(StepEquations):
         """
         states = self.states(x)
         rest = self.rest.total(*states)[0]
-        return rest + self.local.force(*states) if self.local.has_forces else rest
+        return rest + self.local.force(*states) if self.local.parts else rest
 
     def states(self, x: Array) -> tuple[Array, Array]:
         return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,18 +46,15 @@ class TopicFrames:
     child: str = ""  # frame whose pose the messages hold
 
     @classmethod
-    def read(cls, path: str | Path) -> TopicFrames:
+    def read(cls, address: TopicAddress) -> TopicFrames:
         """Return the frames of a topic from its address or its first message; of several topics,
-        separated by commas, those of the first. Both are empty if the path names no topic of a log,
-        or a topic that does not exist.
+        separated by commas, those of the first. Both are empty if the topic does not exist.
 
         Raises
         ------
         InputError
             If the log cannot be read.
         """
-        if (address := TopicAddress.from_path(path)) is None:
-            return cls()
         if address.frames is not None:
             return cls(*address.frames)
         topic = address.topic.partition(",")[0].strip()
@@ -79,16 +75,14 @@ class LogFrames:
     edges: Edges = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: str | Path) -> LogFrames:
-        """Read the transforms of all topics of the log of a path; none if that names no topic.
+    def read(cls, address: TopicAddress) -> LogFrames:
+        """Read the transforms of all topics of a log.
 
         Raises
         ------
         InputError
             If the log cannot be read.
         """
-        if (address := TopicAddress.from_path(path)) is None:
-            return cls()
         with open_log(address.log, address.episode) as log:
             topics = [
                 name

@@ -37,7 +37,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from ...common.array_types import Array, Index
-from ...common.last_results import known_at_last
 from ...errors import InputError
 from ...fem.body import Body
 from ...fem.meshes.refinement import refine_body
@@ -56,6 +55,7 @@ from ...program.linear_algebra.reused_factor import (
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.experiment_refinement import refined_experiment
+from ..linearised import known_at_last
 from .consider_analysis import changed_residuals
 from .systematic_effects import SMALL, Effect, ExperimentAtAnswer
 

@@ -19,7 +19,6 @@ from scipy.spatial import KDTree
 from ...common.array_types import Array, Index
 from ...fem.body import Body
 from ...fem.meshes.mesh import ElementNodes, TetMesh
-from ...fem.node_force import surface_shares
 
 # Modes of the error of the surface: with the correlation length below they have most of its
 # variance, and each costs one evaluation of the forces and one column of a sweep.
@@ -130,7 +129,7 @@ def surface_modes(body: Body, known: Index) -> Array:
     the others are zero.
     """
     corners = ElementNodes.corners(body.mesh)
-    area_m2, normals = surface_shares(corners)
+    area_m2, normals = corners.surface_shares
     surface = np.flatnonzero(area_m2 > 0)
     fields = np.zeros((len(corners.points_m), SURFACE_MODES))
     length_m = CORRELATION * float(extents_m(corners.points_m)[0])

@@ -9,7 +9,7 @@ residuals. Deviations that change only the measurements (cameras, clocks) are in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -1313,21 +1313,23 @@ class Assumptions:
         return Assumptions(**exact)
 
     def collect_deviations(
-        self, usual: Mapping[str, float | None] | None = None
+        self, bodies: Iterable[Body] = (), parameters: Parameters | None = None
     ) -> dict[str, float | None]:
         """Return the standard deviations by name, of all fields; None for what is exact, the
-        deviation about the mean for a known effect.
+        deviation about the mean for a known effect. Fields that are None have the defaults for
+        `bodies`.
 
-        Parameters
-        ----------
-        usual : mapping of str to float or None, optional
-            Deviations of the fields that are None, by default those of bodies of unknown origin.
+        With `parameters`, that of Poisson's ratio ends before the incompressible body, see
+        `limited_poisson_deviation`.
         """
-        defaults = usual_deviations(()) if usual is None else usual
+        defaults = usual_deviations(bodies)
         by_name: dict[str, float | None] = {}
         for name, deviation in vars(self).items():
             known = deviation.deviation if isinstance(deviation, KnownEffect) else deviation
             by_name[name] = defaults[name] if known is None else None if known == "none" else known
+        stated = by_name["poisson"]
+        if parameters is not None and stated is not None:
+            by_name["poisson"] = limited_poisson_deviation(stated, parameters)
         return by_name
 
     @property

@@ -9,9 +9,8 @@ import numpy as np
 from kit.problems import cube_with_nuisance
 
 import collocation_sysid as cs
-from collocation_sysid.common.last_results import known_at_last
 from collocation_sysid.methods.starts.initial_trajectories import initial_variables
-from collocation_sysid.statistics.linearised import linearise_fit
+from collocation_sysid.statistics.linearised import known_at_last, linearise_fit
 
 
 def test_a_result_is_computed_again_for_another_array_or_object_only():
