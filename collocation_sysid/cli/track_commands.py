@@ -80,6 +80,7 @@ def track(
         follow,
         images_of,
         read_image,
+        require_size,
         start_time,
         stated_points,
         tag_centres,
@@ -103,6 +104,7 @@ def track(
                 yield image
 
         _, first = next(images())
+        require_size(first, video)
         if not tags and not points:
             within = None if mask is None else read_image(mask, is_grey=True)
             if mask is not None and within is not None and within.shape != first.shape[:2]:

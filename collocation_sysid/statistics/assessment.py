@@ -29,7 +29,7 @@ from .estimates import Estimate, display_name, limitless_shares
 from .hypothesis import Hypothesis
 from .residuals.autocorrelation import Dependence
 from .residuals.diagnostics import MOST_WILD
-from .residuals.noise_level import NoiseLevel
+from .residuals.noise_level import ROUNDING, NoiseLevel
 from .thresholds import (
     ABSURD,
     AS_GOOD_AS_CERTAIN,
@@ -188,7 +188,10 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     least = GROSS_MISFIT if is_used and any(_correlations(uncertainty.dependence)) else MISFIT
     # The stated σ of instruments that may err slowly contains more than the noise of a sample.
     may_err_slowly = uncertainty.unexplained is not uncertainty.dependence
-    smaller = 0 < factor < 1 / least and level.smaller_p < RARE and not (larger or may_err_slowly)
+    # Where noise of the poses explains more than the residuals, σ is at its least value.
+    is_seen = factor > 10 * ROUNDING
+    smaller = factor < 1 / least and is_seen and level.smaller_p < RARE
+    smaller = smaller and not (larger or may_err_slowly)
     sigma_key = level.sigma_key
     return [
         *(each.to_concern() for each in uncertainty.outliers if each.deviations > GROSS_MISFIT),

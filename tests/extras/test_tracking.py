@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -223,6 +224,8 @@ def test_points_are_lost_rather_than_mistaken_where_the_surroundings_change(tmp_
         (("--points", "tip=999,4"), "a stated point is outside the first image of 320 × 240"),
         (("--tags", "DICT_WRONG"), "expected a dictionary of OpenCV"),
         (("--tags", "imread"), "expected a dictionary of OpenCV"),
+        (("--tags", "CORNER_REFINE_NONE"), "expected a dictionary of OpenCV"),
+        (("--points", "tip=nan,3"), "error: --points: found 'tip=nan,3'; expected NAME=U,V"),
         (("--tags", "DICT_4X4_50"), "found no point; expected texture, --points, or --tags"),
         (("--gripper", "1,2"), "--gripper: expected --poses"),
         (("--points", "a=1,2", "--tags", "DICT_4X4_50"), "expected one of them"),
@@ -260,6 +263,30 @@ def test_a_video_that_cannot_be_read_is_refused(
     assert (ended.code, ended.out) == (2, "")
     assert f"film.mp4: {message}" in ended.err
     assert not (tmp_path / "front.csv").exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--points", "tip=0,0"), ("--tags", "DICT_4X4_50")])
+@pytest.mark.parametrize("size", [1, 5, 20])
+def test_images_smaller_than_the_window_are_refused(size, options, tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    for k in range(3):
+        image = np.random.default_rng(k).integers(0, 255, (size, size, 3), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), image)
+    out = tmp_path / "front.csv"
+    ended = run_command("track", tmp_path / "frames", "--out", out, "--rate-hz", 30, *options)
+    assert (ended.code, ended.out) == (2, "")
+    assert f"found images of {size} × {size} pixels; expected at least 21 × 21" in ended.err
+    assert not out.exists()
+
+
+def test_what_libraries_print_about_a_damaged_image_is_not_shown(tmp_path: Path) -> None:
+    start = b"\0\0\0\x20ftypisom\0\0\2\0isomiso2avc1mp41"  # of an MP4 without its table
+    (tmp_path / "film.mp4").write_bytes(start + bytes(500))
+    command = [sys.executable, "-m", "collocation_sysid", "track", str(tmp_path / "film.mp4")]
+    command += ["--out", str(tmp_path / "front.csv")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert len(ended.stderr.splitlines()) == 1
 
 
 def test_images_of_different_sizes_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -4,7 +4,15 @@
 of the gripper, and `verdict` judges the tracks.
 """
 
-from .points import Tracks, corners_of, follow, stated_points, tag_centres, write_table
+from .points import (
+    Tracks,
+    corners_of,
+    follow,
+    require_size,
+    stated_points,
+    tag_centres,
+    write_table,
+)
 from .start_time import StartTime, start_time
 from .verdict import TrackVerdict
 from .video import images_of, read_image, write_film
@@ -17,6 +25,7 @@ __all__ = [
     "follow",
     "images_of",
     "read_image",
+    "require_size",
     "start_time",
     "stated_points",
     "tag_centres",

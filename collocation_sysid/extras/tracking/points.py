@@ -82,6 +82,16 @@ class Tracks:
         return cls(names, t_s, pixels, trust, sorted(losses, key=lambda each: each.image))
 
 
+def require_size(image: Image, video: Path) -> None:
+    """Raise an `InputError` if images are smaller than the window in which points are followed."""
+    height, width = image.shape[:2]
+    if min(height, width) < WINDOW_PX:
+        raise InputError(
+            f"found images of {width} × {height} pixels; expected at least {WINDOW_PX} × {WINDOW_PX}",
+            video,
+        )
+
+
 def corners_of(image: Image, mask: Image | None, most: int) -> Array:
     """Return up to `most` corners (N, 2) of an image within a mask, to a part of a pixel."""
     cv2 = opencv()
@@ -102,6 +112,8 @@ def stated_points(text: str, option: str) -> tuple[list[str], Array]:
         name, _, pixel = part.rpartition("=")
         try:
             u, v = map(float, pixel.split(","))
+            if not np.isfinite(u + v):
+                raise ValueError
         except ValueError:
             raise InputError(f"found {part!r}; expected NAME=U,V", where=option) from None
         names.append(name.strip() or f"{option.strip('-')}_{k}")
@@ -199,7 +211,7 @@ def tag_centres(images: Iterable[tuple[float, Image]], dictionary: str) -> Track
     """Return the centres of the ArUco or AprilTag markers that each image shows."""
     cv2 = opencv()
     number = getattr(cv2.aruco, dictionary, None)
-    if not isinstance(number, int):
+    if not dictionary.startswith("DICT_") or number is None:
         raise InputError(
             f"found {dictionary!r}; expected a dictionary of OpenCV, such as DICT_4X4_50",
             where="--tags",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ...common.array_types import Array
 from ...common.files import in_counting_order, require_regular
 from ...errors import InputError
+from ...recording.sources.depth_files import standard_error_silenced
 
 Image = NDArray[np.uint8]
 
@@ -48,7 +49,8 @@ def images_of(source: Path, rate_hz: float | None) -> Iterator[tuple[float, Imag
         return
     if not source.is_file():
         raise InputError("there is no such file; expected a video or a folder of images", source)
-    video = cv2.VideoCapture(str(source))
+    with standard_error_silenced():
+        video = cv2.VideoCapture(str(source))
     try:
         number = 0
         while (read := video.read())[0]:
@@ -65,7 +67,8 @@ def read_image(file: Path, *, is_grey: bool = False) -> Image:
     """Return an image (rows, columns, 3), or its grey values."""
     cv2 = opencv()
     require_regular(file)
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR)
+    with standard_error_silenced():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR)
     if image is None:
         raise InputError("this image cannot be read; expected a .png or .jpg", file)
     return image

@@ -271,7 +271,7 @@ def _read_npz(path: Path) -> DepthFileContent:
 
 
 @contextmanager
-def _standard_error_silenced() -> Iterator[None]:
+def standard_error_silenced() -> Iterator[None]:
     """Discard what compiled code writes to the standard error of this process."""
     try:
         saved_descriptor = os.dup(2)
@@ -297,7 +297,7 @@ def _read_exr(path: Path) -> Array:
             "'collocation-sysid[exr]', or convert the images to .npz"
         ) from missing
     # What the library writes on both streams it also raises.
-    with redirect_stdout(None), _standard_error_silenced():
+    with redirect_stdout(None), standard_error_silenced():
         channels: Mapping[str, Any] = library.File(str(path)).channels()
     names = [name for name in ("Z", "R", "Y", "V") if name in channels] or [*channels]
     return np.asarray(channels[names[0]].pixels, dtype=float)
