@@ -282,7 +282,7 @@ def test_a_frame_that_is_carried_along_is_off_as_the_poses_are(rng):
         return sensor.residuals(other.evaluate(motion, phi), phi)
 
     given = [np.tile(each, (rows, 1, 1)) for each in (shift, turn)]
-    carried = sensor.observable.frame_changes(grasp, motion, phi, *given)
+    carried = np.asarray(sensor.observable.frame_changes(grasp, motion, phi, *given))
     found = sensor.residual_changes(sensor.observable.evaluate(motion, phi), carried, phi)[..., 0]
     assert relative_error(found, (residual(1e-4) - residual(-1e-4)) / 2e-4) < 1e-5
 
