@@ -259,7 +259,7 @@ class SolvedProblem:
                     *farther,
                     *effects,
                     *(each for each in causes if each.code in OPEN_CAUSES),
-                    *of_fit,
+                    *(each for each in of_fit if each not in farther),
                     *of_fields,
                     *numerical,
                     *([] if effects else meshes),
