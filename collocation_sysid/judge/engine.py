@@ -181,8 +181,8 @@ def _together(code: str, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 class _Refits:
-    """Fits of some experiments, one or several of them corrected, with a limited number of sweeps; from the
-    problem's guess, or from the answer and its motion.
+    """Fits of some experiments, one or several of them corrected, with a limited number of sweeps;
+    from the problem's guess, or from the answer and its motion.
     """
 
     def __init__(self, solution: Solution, stated: Sequence[Experiment]) -> None:

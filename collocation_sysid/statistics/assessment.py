@@ -189,8 +189,7 @@ def _residual_concerns(uncertainty: ErrorBasis) -> list[Concern]:
     # The stated σ of instruments that may err slowly contains more than the noise of a sample.
     may_err_slowly = uncertainty.unexplained is not uncertainty.dependence
     # Where noise of the poses explains more than the residuals, σ is at its least value.
-    is_seen = factor > 10 * ROUNDING
-    smaller = factor < 1 / least and is_seen and level.smaller_p < RARE
+    smaller = 10 * ROUNDING < factor < 1 / least and level.smaller_p < RARE
     smaller = smaller and not (larger or may_err_slowly)
     sigma_key = level.sigma_key
     return [

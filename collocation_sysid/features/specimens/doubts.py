@@ -5,8 +5,7 @@ plausible curve: true in place of engineering stress, compression with positive 
 place of ratios, another unit or area, another kind of test, and columns of zeros that were not
 measured. All specimens are fitted again with one of them corrected in one table, or in all tables of
 one kind of test; the misfit contains the nuisance parameters, so that a wrong area does not explain
-all. A correction keeps all measurements,
-unless the mistake is that one was none.
+all. A correction keeps all measurements, unless the mistake is that one was none.
 
 A law that is too simple, a toe region or hysteresis also decrease the misfit of some correction. A
 mistake is therefore named only if its correction leaves noise.

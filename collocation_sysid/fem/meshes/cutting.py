@@ -36,21 +36,25 @@ def with_nodes_in_planes(
         done_m: list[float] = []
         for plane_m in planes_m.get(axis, ()):
             along_m = points_m[:, k]
-            margin_m = NEAR * edge_lengths(points_m, tetrahedra).mean()
-            if along_m.min() + margin_m < plane_m < along_m.max() - margin_m:
-                points_m = _moved_into_plane(points_m, tetrahedra, k, plane_m, done_m)
-                points_m, tetrahedra = _cut(points_m, tetrahedra, k, plane_m)
+            edge_m = float(edge_lengths(points_m, tetrahedra).mean())
+            if along_m.min() + NEAR * edge_m < plane_m < along_m.max() - NEAR * edge_m:
+                points_m = _moved_into_plane(points_m, tetrahedra, edge_m, k, plane_m, done_m)
+                points_m, tetrahedra = _cut(points_m, tetrahedra, edge_m, k, plane_m)
                 done_m.append(plane_m)
     return points_m, tetrahedra
 
 
 def _moved_into_plane(
-    points_m: np.ndarray, tetrahedra: np.ndarray, axis: int, plane_m: float, done_m: Sequence[float]
+    points_m: np.ndarray,
+    tetrahedra: np.ndarray,
+    edge_m: float,
+    axis: int,
+    plane_m: float,
+    done_m: Sequence[float],
 ) -> np.ndarray:
     """Return the nodes (n, 3), those near the plane in it where surface, elements and planes before
     it, `done_m`, allow it.
     """
-    edge_m = edge_lengths(points_m, tetrahedra).mean()
     away_m = np.abs(points_m[:, axis] - plane_m)
     faces, _ = boundary_of(tetrahedra)
     a, b, c = points_m[faces].swapaxes(0, 1)
@@ -74,11 +78,11 @@ def _moved_into_plane(
 
 
 def _cut(
-    points: np.ndarray, tetrahedra: np.ndarray, axis: int, plane_m: float
+    points: np.ndarray, tetrahedra: np.ndarray, edge_m: float, axis: int, plane_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bisect each edge that crosses the plane, and the elements around it."""
     height_m = points[:, axis] - plane_m
-    height_m[np.abs(height_m) <= ROUND_OFF * edge_lengths(points, tetrahedra).mean()] = 0.0
+    height_m[np.abs(height_m) <= ROUND_OFF * edge_m] = 0.0
     is_cut = height_m[tetrahedra].min(axis=1) * height_m[tetrahedra].max(axis=1) < 0
     cut = tetrahedra[is_cut]
     edges = unique_edges(cut)
