@@ -329,7 +329,7 @@ def thread_state() -> Threads:
     """Return the number of threads and what determines it; 1 if the environment variable is not a
     whole number.
     """
-    from .common.machine import machine_memory_mb
+    from .common.limits import machine_memory_mb
 
     variable = "COLLOCATION_SYSID_THREADS"
     override = os.environ.get(variable, "")

@@ -16,8 +16,8 @@ from numpy.linalg import LinAlgError
 
 from .common.array_types import Array
 from .common.display import plain_text
+from .common.limits import TimeLimitReached, time_limit
 from .common.step_counting import StepUnit, counted_phase
-from .common.time_limit import TimeLimitReached, time_limit
 from .common.validated_classes import validated
 from .errors import InputError, SimulationError
 from .features.specimens.notes import one_kind_notes, stress_offset_notes

@@ -33,7 +33,7 @@ from typer.main import get_command, get_command_from_info
 
 from ..common.files import reason
 from ..common.installation import package_version
-from ..common.machine import machine_memory_mb
+from ..common.limits import machine_memory_mb
 from ..common.signal_handling import INTERRUPTS, heed_interrupts, ignore_interrupts, leave
 from ..errors import ImplausibleMarkersError, InputError, SimulationError, hint_at
 from .common import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_NOT_CONVERGED, error_console

@@ -7,6 +7,6 @@
 - `serialisation`: results as JSON; `display`: output as text, HTML and Markdown, in the
   terminal too; `pages`: pages of the documentation.
 - `starting`, `signal_handling`, `isolated_process`: interrupts, and work in a process of its own.
-- `step_counting`: progress of long operations; `machine`: available memory; `cluster`: Dask.
+- `step_counting`: progress of long operations; `limits`: memory and time; `cluster`: Dask.
 - `array_types`: array types for annotations.
 """

@@ -13,7 +13,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .machine import machine_memory_mb
+from .limits import machine_memory_mb
 
 # Arrays below this are read in any case [bytes].
 SMALL_BYTES = 50_000_000

@@ -17,7 +17,7 @@ from typing import Any
 from zipfile import BadZipFile
 
 from ..errors import InputError
-from .machine import machine_memory_mb
+from .limits import machine_memory_mb
 from .written_files import add_to_list
 
 # What reading and drawing raise where files do not hold what they should. Errors of the disk tell

@@ -18,15 +18,11 @@ def leave_at_once(number: int, _: object) -> None:
     os._exit(128 + number)
 
 
-def _end_quietly() -> None:
-    """End the command line at Ctrl-C and SIGTERM during imports with its own exit codes."""
+# Ctrl-C and SIGTERM end the command line during its imports with its own exit codes.
+try:
     if os.path.splitext(os.path.basename(sys.argv[0]))[0] == COMMAND:
-        for number in (_signal.SIGINT, _signal.SIGTERM):
-            if _signal.getsignal(number) in (_signal.SIG_DFL, _signal.default_int_handler):
-                _signal.signal(number, leave_at_once)
-
-
-try:  # noqa: SIM105  (contextlib takes time to import)
-    _end_quietly()
+        for _number in (_signal.SIGINT, _signal.SIGTERM):
+            if _signal.getsignal(_number) in (_signal.SIG_DFL, _signal.default_int_handler):
+                _signal.signal(_number, leave_at_once)
 except ValueError:  # handlers can be set in the main thread alone
     pass

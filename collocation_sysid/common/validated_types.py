@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -47,6 +48,13 @@ def _no_nan(value: float) -> float:
     return value if math.isinf(value) else _of_usual_size(value)
 
 
+def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
+    is_ascending = all(a < b for a, b in pairwise(shares))
+    if not is_ascending or shares[-1:] != (1.0,):
+        raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
+    return shares
+
+
 def _number_unless_array(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
     return value if np.ndim(value) else validated(value)
 
@@ -68,6 +76,8 @@ AtLeastOne = Annotated[int, Field(strict=True, ge=1), _Scalar]
 # More steps between two samples than any motion needs.
 Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), _Scalar]
 Flag = Annotated[bool, Field(strict=True), _Scalar]
+# Growing first parts of a whole.
+Shares = Annotated[tuple[Positive, ...], AfterValidator(_require_ascending)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
 
 _EXPECTED = {

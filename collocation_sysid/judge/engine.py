@@ -12,7 +12,7 @@ import numpy as np
 
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
-from ..features.registry import present
+from ..features.measurements import present
 from ..methods.reduced_search import UNLIMITED
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status

@@ -1,20 +1,15 @@
 """Construction of methods from options by name, and shares of recordings.
 
-Use `method_from_options` to make a method from a table of the problem file. `Shares` is the type of
-options that list growing first parts of every recording, which are solved one after another.
+Use `method_from_options` to make a method from a table of the problem file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from itertools import pairwise
-from typing import Annotated, Any, ClassVar, TypeVar
-
-from pydantic import AfterValidator
+from typing import Any, ClassVar, TypeVar
 
 from ..common.validated_classes import validated
-from ..common.validated_types import Positive
 from ..errors import InputError, hint_at
 
 
@@ -71,15 +66,5 @@ def method_from_options(kind: type[T], options: Mapping[str, Any], key: str) -> 
 
 # Fewest samples, or rows of a grid, of a first part.
 FEWEST = 8
-
-
-def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
-    is_ascending = all(a < b for a, b in pairwise(shares))
-    if not is_ascending or shares[-1:] != (1.0,):
-        raise ValueError(f"found {list(shares)}; expected numbers above 0 that ascend to 1")
-    return shares
-
-
-Shares = Annotated[tuple[Positive, ...], AfterValidator(_require_ascending)]
 # Default shares of the recording that a method solves one after another.
 SHARES = (0.25, 0.5, 1.0)

@@ -17,12 +17,12 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..common.validated_classes import validated
-from ..common.validated_types import Count, NotNegative, Positive
+from ..common.validated_types import Count, NotNegative, Positive, Shares
 from ..errors import SimulationError
 from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
 from .horizon import Horizon, Iterate, motion_shares, rows_of_share
 from .loss_curvature import exact_curvature, secant_update, with_curvature
-from .options import FEWEST, SHARES, MethodOptions, Shares
+from .options import FEWEST, SHARES, MethodOptions
 from .solution import Iteration, Status
 from .solve_recorder import Recorder, misfit_of
 from .trajectory_sweeps import Feasibility

@@ -29,7 +29,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.time_limit import time_limit, unlimited
+from ..common.limits import time_limit, unlimited
 from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError

@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..common.array_types import Array
-from ..common.time_limit import TimeLimitReached, unlimited
+from ..common.limits import TimeLimitReached, unlimited
 from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.stopwatch import Stopwatch

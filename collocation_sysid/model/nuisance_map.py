@@ -11,6 +11,10 @@ The pose of the undeformed body in its grasp is H X = R(a_h) (X − c_h) + c_h +
 c_h of the grasped nodes; these are held at U_t H X.
 
 A tension T acts on the body as max(0, f T − b), a pressure p as f p − b.
+
+Experiments share those nuisance parameters whose `scope` is the same word in both, and whose label
+is the same: the place of a marker by its name, the pose of the cameras or of the clamp by its axis.
+Such a parameter is one entry of p with one prior, see `nuisance_indices`.
 """
 
 from __future__ import annotations
@@ -23,6 +27,7 @@ from typing import Any, NamedTuple, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
 from ..common.files import reason
@@ -657,3 +662,117 @@ def _timed_loads(experiment: Experiment) -> list[tuple[str, TimedLoad]]:
         for change in get_args(LoadTime)
         if experiment.changes_within(load, change)
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceIndices:
+    """Indices of an experiment's nuisance parameters φ in p."""
+
+    # (k,): index in p = (q, φ_1, φ_2, …) of each, that of the first experiment that shares it.
+    indices: Index
+    # (k,) of bool: false for those that an earlier experiment has already.
+    is_first: NDArray[np.bool_]
+    # (3,) or None: point about which the shared camera pose rotates [m]; None means the
+    # experiment's own.
+    pivot_m: Array | None = None
+
+
+def nuisance_indices(experiments: Sequence[Experiment], first: int) -> list[NuisanceIndices]:
+    """Assign the nuisance parameters of each experiment to entries of p.
+
+    A parameter gets a new entry, in the order of the experiments, unless an earlier experiment
+    shares it.
+
+    Parameters
+    ----------
+    first : int
+        Index in p of the first nuisance parameter.
+
+    Returns
+    -------
+    list of NuisanceIndices
+        One entry for each experiment.
+
+    Raises
+    ------
+    InputError
+        If experiments share a parameter of objects that differ, with different priors, or a marker
+        with different stated places.
+    """
+    indices = []
+    known = dict[Any, tuple[int, NuisanceEntry, Experiment]]()
+    leaders = dict[Any, Experiment]()
+    for experiment in experiments:
+        nuisance = NuisanceMap.from_experiment(experiment)
+        scopes = experiment.nuisance.scope
+        places = np.zeros(nuisance.size, dtype=np.int64)
+        before = first
+        for k, entry in enumerate(nuisance.entries):
+            scope = scopes.get(entry.row.name)
+            # What is not shared is nobody else's.
+            which = (len(indices), k) if scope is None else (scope, entry.label)
+            places[k], other, of = known.setdefault(which, (first, entry, experiment))
+            first += places[k] == first
+            leader = leaders.setdefault((scope, entry.row), experiment)
+            if scope is not None:
+                _require_same_objects(leader, experiment, row=entry.row)
+                _require_same_prior((of, other), (experiment, entry))
+        leader = leaders.get((scopes.get(POSE_TURN.name), POSE_TURN), experiment)
+        pivot_m = None if leader is experiment else NuisanceMap.from_experiment(leader).pivot_m
+        indices.append(NuisanceIndices(places, places >= before, pivot_m=pivot_m))
+    return indices
+
+
+def _require_same_objects(leader: Experiment, experiment: Experiment, row: Deviation) -> None:
+    theirs = row.same(leader)
+    ours = row.same(experiment)
+    for entry in ours:
+        if theirs[entry] != ours[entry]:
+            raise _sharing_error(
+                experiment,
+                row,
+                result=f"'{leader.name}', which has another {entry}",
+                expected=f"the same {entry}",
+            )
+
+
+def _require_same_prior(
+    one: tuple[Experiment, NuisanceEntry], other: tuple[Experiment, NuisanceEntry]
+) -> None:
+    """Check that a shared parameter has one prior, a marker one stated place."""
+    leader, first = one
+    experiment, second = other
+    row = second.row
+    label = second.label
+    if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
+        difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
+        raise _sharing_error(
+            experiment, row, result=difference, expected=f"the same prior as here, {second.sigma:g}"
+        )
+    if row == PLACE:
+        places = [_declared_place(*one), _declared_place(*other)]
+        if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
+            difference = (
+                f"'{leader.name}', which states another {label.partition(',')[0]} on the body"
+            )
+            raise _sharing_error(
+                experiment,
+                row,
+                result=difference,
+                expected="the same position in both recordings, or in neither",
+            )
+
+
+def _declared_place(experiment: Experiment, entry: NuisanceEntry) -> Array:
+    """Return the stated place (3,) of a marker on the undeformed body [m], NaN if there is none."""
+    markers = experiment.markers
+    at = markers.predict_positions(experiment.body.nodes_m)[entry.number]
+    return at if markers.located[entry.number] else np.full(3, np.nan)
+
+
+def _sharing_error(
+    experiment: Experiment, row: Deviation, result: str, expected: str
+) -> InputError:
+    key = row.key or row.name
+    message = f"{key} is shared with {result}; expected {expected}, or a separate scope"
+    return InputError(message, None, where=f"experiment '{experiment.name}'")

@@ -1,7 +1,7 @@
 """Estimation problems, and the problem file (TOML).
 
 `problem` defines `Problem`, and `options` its options for checks and uncertainties. The
-other modules read a problem file: `reading` parses and validates it, `loading` converts it
+other modules read a problem file: `loading` reads it, with `overrides`, and converts it
 to a problem, `recording_reader` reads the files of one experiment (`recording_frames` its
 markers and the frames of logs, `code_loader` Python files, `bench_files` tables of a test bench), and
 `size` estimates memory and time; `specimen_reader` reads tests without a mesh, and `gripper_transforms`

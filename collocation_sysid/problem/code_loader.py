@@ -137,9 +137,9 @@ class CodeLoader:
 
         return self._load(file, name, key=key, kind="function", is_kind=is_function)
 
-    def require_harmless(self, solvers: Mapping[str, Any]) -> None:
-        """Refuse options of IPOPT and of CasADi by which a file could run code, unless running code
-        is allowed; `solvers` are the methods by name.
+    def require_harmless(self, name: str, method: object) -> None:
+        """Refuse options of IPOPT and of CasADi by which the table of a method, by its name, could
+        run code, unless running code is allowed.
 
         Raises
         ------
@@ -148,16 +148,15 @@ class CodeLoader:
         """
         if self.is_allowed:
             return
-        for name, method in solvers.items():
-            for table in ("ipopt", "casadi"):
-                option = next(_code_options(getattr(method, table, {}), table), None)
-                if option is not None:
-                    message = (
-                        f"found {option}, with which a solver may load or write a file, or start a "
-                        "program; allow that with --allow-code (allow_code=True from Python) if "
-                        "you trust the file"
-                    )
-                    raise InputError(message, where=f"solver.{name}.{table}")
+        for table in ("ipopt", "casadi"):
+            option = next(_code_options(getattr(method, table, {}), table), None)
+            if option is not None:
+                message = (
+                    f"found {option}, with which a solver may load or write a file, or start a "
+                    "program; allow that with --allow-code (allow_code=True from Python) if "
+                    "you trust the file"
+                )
+                raise InputError(message, where=f"solver.{name}.{table}")
 
     def _load(
         self, name: str, value_name: str, key: str, kind: str, is_kind: Callable[[Any], bool]

@@ -1,4 +1,4 @@
-"""Conversion of a validated problem file to the arguments of `Problem`."""
+"""Reading of a problem file, and its conversion to the arguments of `Problem`."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import tomli_w
+from pydantic import ValidationError
 
 from ..common.declarations import keys_of
 from ..common.schema_tables import Section, declared_in
 from ..common.step_counting import StepUnit, complete_steps, counted_phase
+from ..common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
 from ..errors import InputError, located
 from ..fem.body import Body
 from ..fem.laws.constants import (
@@ -50,7 +53,7 @@ from ..statistics.plausibility import SIZES_M, size_and_density_hypotheses
 from .code_loader import CodeLoader
 from .measurement_section import existing_file
 from .options import Origin, RolloutOptions, UncertaintyOptions
-from .reading import read_problem_file
+from .overrides import apply_override
 from .recording_reader import RecordingReader
 from .recording_schema import LOADS
 from .schema import (
@@ -64,9 +67,44 @@ from .schema import (
 from .size import Say, Size, announce_reading, require_feasible
 from .specimen_reader import SpecimenReader
 from .specimen_schema import SpecimenSection
+from .validation_messages import explain_validation_error
 
 # The key of `Experiment` that stands in a table of its own, of all experiments.
 AIR_KEY = "air_density_kg_m3"
+
+
+def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[ProblemFile, str]:
+    """Read and validate a problem file.
+
+    Parameters
+    ----------
+    overrides : sequence of str
+        Overrides "dotted.key=value", with values in TOML syntax. Words without quotes are strings.
+        Items of a list are selected by index, counted from 0, and tables of a list also by name.
+
+    Returns
+    -------
+    tuple of ProblemFile and str
+        Validated content, and the text of the problem: that of the file, or, with overrides, the
+        overridden content written as TOML, without comments.
+
+    Raises
+    ------
+    InputError
+        Names the file, the key or line, what was found and what was expected.
+    """
+    path = Path(path)
+    text = read_text(path, "a problem file (TOML)", HAND_WRITTEN_BYTES)
+    content = parse_toml(text, path)
+    with located("--set"):
+        for override in overrides:
+            apply_override(content, override)
+    if overrides:
+        text = tomli_w.dumps(content)
+    try:
+        return ProblemFile.model_validate(content), text
+    except ValidationError as error:
+        raise explain_validation_error(error, content, path=path) from error
 
 
 def problem_arguments(
@@ -97,7 +135,8 @@ def problem_arguments(
     unknowns = _with_natural_strains(file.parameters)
     code = CodeLoader(folder, allow_code)
     with located(path):
-        code.require_harmless(file.solver.methods)
+        for name, method in file.solver.methods.items():
+            code.require_harmless(name, method)
     if say is not None:
         announce_reading({*_named_files(file, folder)}, say)
     size = None

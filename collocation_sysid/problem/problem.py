@@ -20,10 +20,10 @@ from ..fem.schemes import Scheme, as_scheme
 from ..methods import METHODS, require_method
 from ..methods.interior_point import InteriorPoint
 from ..methods.solution import Method
+from ..model.nuisance_map import nuisance_indices
 from ..model.parameters import Parameters, Tied, Unknown
 from ..program.collocation import Collocation
 from ..program.lifted.collocation import with_lifted_variables
-from ..program.shared_nuisances import nuisance_indices
 from ..program.simulation import require_steps
 from ..recording import Experiment
 from ..recording.impact_steps import impact_steps

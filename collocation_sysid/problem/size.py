@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..common.display import duration
 from ..common.files import require_size
-from ..common.machine import machine_memory_mb
+from ..common.limits import machine_memory_mb
 from ..errors import InputError
 
 Say = Callable[[str], None]

@@ -4,10 +4,9 @@ solved.
 Transcription
     `collocation` is the whole program (objective, constraints, derivatives) of several experiments.
     `transcription` is one experiment of it, of which `motion_transcription` is the part without
-    measurements; `association` states where on the body and in time these are evaluated,
-    `experiment_iterate` is one experiment at given variables, and `shared_nuisances` has the
-    nuisance parameters that experiments have in common. `motion_jacobian` lays out the sparse
-    Jacobian, and `lifted` the program in which variables that are otherwise eliminated have
+    measurements; `association` states where on the body and in time these are evaluated, and
+    `experiment_iterate` is one experiment at given variables. `motion_jacobian` lays out the
+    sparse Jacobian, and `lifted` the program in which variables that are otherwise eliminated have
     equations of their own.
 Measurements
     `observables` are measurable quantities, `observable_response` linearises them along the

@@ -8,15 +8,26 @@ tolerances of its parts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from ..common.array_types import Array
+from ..model.nuisance_map import NuisanceIndices, NuisanceMap
+from ..recording.nuisance import PLACE
 from .correspondences import Correspondences
 from .markers.association import MarkerAssociation
 
 # The clock leaves its sample when its shift differs by more than this [samples].
 SAMPLES_OFF = 1.0
+# Attributes of a `MarkerAssociation` with one row for each marker.
+OF_MARKERS = (
+    "prior_places_m",
+    "cells",
+    "centre_places_m",
+    "axes",
+    "crossed_edges",
+    "crossing_counts",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,3 +85,40 @@ class Association:
         if is_same:
             return self
         return Association(markers, clock_samples, tuple(correspondences))
+
+
+def shared_associations(
+    experiments: Iterable[tuple[NuisanceIndices, NuisanceMap, Association]],
+) -> list[Association]:
+    """Return the association of each experiment, with shared places and clocks equal to those of
+    the first experiment that shares them; an association without such differences is returned as it
+    is.
+
+    Parameters
+    ----------
+    experiments : iterable of (NuisanceIndices, NuisanceMap, Association)
+        The experiments in their order.
+    """
+    leaders = dict[int, tuple[MarkerAssociation, int]]()
+    samples = dict[int, int]()
+    associations = []
+    for local, nuisance, own in experiments:
+        association = own
+        replaced = []
+        for k in nuisance.indices_of_rows(PLACE):
+            number = nuisance.entries[k].number
+            leader = leaders.setdefault(int(local.indices[k]), (own.markers, number))
+            if leader[0] is not own.markers:
+                replaced.append((number, *leader))
+        for k in nuisance.clock_indices:
+            shared = samples.setdefault(int(local.indices[k]), own.clock_samples)
+            if shared != association.clock_samples:
+                association = replace(association, clock_samples=shared)
+        if replaced:
+            places = {name: getattr(own.markers, name).copy() for name in OF_MARKERS}
+            for name, values in places.items():
+                for number, leader, theirs in replaced:
+                    values[number] = getattr(leader, name)[theirs]
+            association = replace(association, markers=replace(own.markers, **places))
+        associations.append(association)
+    return associations

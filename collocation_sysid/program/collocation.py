@@ -11,7 +11,7 @@ x_{e,t,i} / ℓ_e    positions: experiment e, grid time t, dof i = 3·node + axi
                    index fastest; ℓ_e is the mean edge length
 φ_e                nuisance parameters of experiment e, see `model.nuisance_map`, experiment by
                    experiment; shared ones are those of the first experiment that has them,
-                   see `program.shared_nuisances`
+                   see `model.nuisance_map.nuisance_indices`
 =================  =========================================================================
 
 History variables, reaction forces, their resultants and pressures of obstacles are eliminated. A
@@ -45,15 +45,15 @@ from ..common.validated_classes import validated
 from ..common.validated_types import Positive, Substeps
 from ..errors import InputError, require_among
 from ..fem.schemes import Scheme, as_scheme
+from ..model.nuisance_map import nuisance_indices
 from ..model.parameters import Parameters
 from ..recording.experiment import Experiment
-from .association import Association
+from .association import Association, shared_associations
 from .casadi_functions import CasadiProgram, Hessian
 from .experiment_iterate import ExperimentIterate
 from .linear_algebra.sparse_assembly import SparseAssembly
 from .measurement_models import belongs_to, first_association
 from .motion_transcription import Offsets, RowWeights, WeightedHistory
-from .shared_nuisances import nuisance_indices, shared_associations
 from .transcription import Transcription
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from ..model.equations_at_parameters import EquationsAtParameters
 from ..model.grasp_constraint import GraspConstraint, PrescribedDisplacements
 from ..model.inputs import Inputs, inputs_from_experiment, with_inputs
 from ..model.internal_variables import AnyHistory
-from ..model.nuisance_map import NuisanceMap
+from ..model.nuisance_map import NuisanceIndices, NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
 from ..model.rod_stresses import bending_moment_n_m
 from ..recording.experiment import Experiment
@@ -43,7 +43,6 @@ from .measurement_model import MeasurementModel, MotionGrid
 from .measurement_models import measurement_models
 from .motion_jacobian import MotionJacobian, shifted_back
 from .reactions.resultant import ReactionGrid, sensed_dofs
-from .shared_nuisances import NuisanceIndices
 
 T = TypeVar("T", bound=np.generic)
 # Coefficients of ∂²φ/∂x² and ∂²φ/∂x∂v from the stencils (p, q) of two positions, see

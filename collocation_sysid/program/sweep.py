@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array, Index
+from ..common.limits import require_time
 from ..common.step_counting import StepUnit, complete_steps
-from ..common.time_limit import require_time
 from ..errors import SimulationError
 from ..fem.body import Linearisation
 from ..model.dynamics import Dynamics, StencilRow, weighted_sum_of_past

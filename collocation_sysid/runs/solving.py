@@ -11,12 +11,12 @@ from typing import Protocol
 from numpy.typing import ArrayLike
 
 from ..common.array_types import Array
+from ..common.limits import TimeLimitReached, time_limit
 from ..common.step_counting import search_activity
-from ..common.time_limit import TimeLimitReached, time_limit
 from ..common.validated_classes import validated
 from ..errors import InputError
-from ..features.measurements import lost_samples
-from ..features.registry import FEATURES, present
+from ..features.measurements import lost_samples, present
+from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
 from ..methods.interior_point import InteriorPoint

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..errors import SimulationError
-from ..features.registry import FEATURES, present
+from ..features.measurements import present
+from ..features.registry import FEATURES
 from ..features.specimens.concerns import as_specimen_concerns
 from ..fem.schemes import as_scheme
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION

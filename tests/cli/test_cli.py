@@ -41,7 +41,7 @@ from collocation_sysid.judge import engine
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.starts import stiffness_scan
 from collocation_sysid.methods.starts.start import Start
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.loading import read_problem_file
 from collocation_sysid.problem.schema import AssumptionsSection, ProblemFile
 from collocation_sysid.recording import read_markers, read_poses
 from collocation_sysid.recording.experiment import usual_air_density

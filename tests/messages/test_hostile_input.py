@@ -36,7 +36,7 @@ from kit.problem_files import (
 )
 
 from collocation_sysid import cli
-from collocation_sysid.common import files, machine
+from collocation_sysid.common import files, limits
 from collocation_sysid.common.files import read_json
 from collocation_sysid.common.isolated_process import Failed, ProcessLimits, run_isolated
 from collocation_sysid.common.signal_handling import (
@@ -436,12 +436,12 @@ def test_where_the_memory_is_not_known_nothing_is_refused(tiny: Path, monkeypatc
 
 def test_limits_of_containers_count_as_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(machine, "CGROUP_LIMITS", (limit,))
-    whole_mb = machine.machine_memory_mb()
+    monkeypatch.setattr(limits, "CGROUP_LIMITS", (limit,))
+    whole_mb = limits.machine_memory_mb()
     limit.write_text("max\n")
-    assert machine.machine_memory_mb() == whole_mb
+    assert limits.machine_memory_mb() == whole_mb
     limit.write_text("5000000\n")
-    assert machine.machine_memory_mb() == 5.0
+    assert limits.machine_memory_mb() == 5.0
 
 
 # Interrupts ---------------------------------------------------------------------------------------

@@ -8,12 +8,7 @@ from kit.problems import TRUTH, hung_cube, measured
 
 import collocation_sysid as cs
 from collocation_sysid import pipeline
-from collocation_sysid.common.time_limit import (
-    TimeLimitReached,
-    require_time,
-    time_limit,
-    unlimited,
-)
+from collocation_sysid.common.limits import TimeLimitReached, require_time, time_limit, unlimited
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.methods.starts.stiffness_scan import TrialSimulation
 from collocation_sysid.runs import solving

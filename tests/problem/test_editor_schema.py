@@ -19,8 +19,8 @@ from collocation_sysid.problem.editor_schema import (
     schema_url,
     with_schema_reference,
 )
+from collocation_sysid.problem.loading import read_problem_file
 from collocation_sysid.problem.new import TEMPLATES, create_problem
-from collocation_sysid.problem.reading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 
 ROOT = Path(__file__).parents[2]

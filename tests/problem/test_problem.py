@@ -31,7 +31,7 @@ from collocation_sysid.fem.laws.materials import MATERIALS, neo_hookean
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.problem import Problem
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.loading import read_problem_file
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.runs.check import check_problem

@@ -12,7 +12,7 @@ from kit.problem_files import EXPERIMENT, PROBLEM, run_command
 from collocation_sysid.common.field_descriptions import documented
 from collocation_sysid.errors import InputError
 from collocation_sysid.methods import METHODS
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.loading import read_problem_file
 from collocation_sysid.problem.schema import ProblemFile
 from collocation_sysid.problem.solver_schema import SolverSection
 

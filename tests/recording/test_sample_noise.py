@@ -11,7 +11,7 @@ from kit.problems import hung_cube, measured
 
 import collocation_sysid as cs
 from collocation_sysid.features.measurements import instrument_misfits
-from collocation_sysid.problem.reading import read_problem_file
+from collocation_sysid.problem.loading import read_problem_file
 from collocation_sysid.problem.specimen_reader import layout_from_section
 from collocation_sysid.recording.marker_files import read_markers
 from collocation_sysid.recording.specimen_files import specimen_columns

@@ -20,7 +20,7 @@ from ...fem.laws.constants import MOST_TERMS, usual_value, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import ELASTIC, elastic_names
 from ...problem import Problem
-from ...problem.reading import read_problem_file
+from ...problem.loading import read_problem_file
 from ...recording.measurement_selection import measured_count
 from .arguments import unique_items
 

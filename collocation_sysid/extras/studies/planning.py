@@ -17,7 +17,7 @@ from ...common.validated_classes import validated
 from ...common.validated_types import AtLeastOne, Count, OneOrMore
 from ...errors import InputError
 from ...problem import Problem
-from ...problem.reading import read_problem_file
+from ...problem.loading import read_problem_file
 from ...problem.schema import ParameterSection, ProblemFile
 from .model_variants import ModelVariant
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
 from ...common.array_types import Array
-from ...common.time_limit import require_time
+from ...common.limits import require_time
 from .merit import MeritFunction, MeritPoint
 
 # The line search interpolates values, so that one out of the domain must be a number: this many

@@ -25,7 +25,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.time_limit import time_limit
+from ...common.limits import time_limit
 from ...common.validated_classes import validated
 from ...common.validated_types import AboveOne, AtLeastOne, Count, Positive
 from ...errors import InputError

@@ -15,6 +15,7 @@ from typing import ClassVar
 
 from ...common.array_types import Array
 from ...common.validated_classes import validated
+from ...common.validated_types import Shares
 from ...errors import InputError, hint_at
 from ...program.collocation import Collocation
 from ...recording.experiment import Experiment
@@ -25,7 +26,7 @@ from ..comparison.penalty import AugmentedLagrangian, Penalty
 from ..comparison.shooting import Shooting
 from ..horizon import motion_shares, rows_of_share
 from ..interior_point import InteriorPoint
-from ..options import SHARES, MethodOptions, Shares, method_from_options
+from ..options import SHARES, MethodOptions, method_from_options
 from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Method, Solution, Status, Watch
 from ..solve_recorder import Recorder, best_iterate

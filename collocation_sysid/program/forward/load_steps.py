@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...common.array_types import Array
-from ...common.time_limit import require_time
+from ...common.limits import require_time
 from ...model.forces import Forces
 from ..linear_algebra.factorisation import Factor
 from .newton_linearisation import LaggedStress

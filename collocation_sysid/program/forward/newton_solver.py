@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
-from ...common.time_limit import require_time
+from ...common.limits import require_time
 from ...errors import InputError, SimulationError
 from ...recording.experiment import Experiment
 from ..linear_algebra.factorisation import Factor, Factoriser

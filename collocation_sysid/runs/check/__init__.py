@@ -15,11 +15,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...common.array_types import Array
+from ...common.limits import TimeLimitReached, time_limit
 from ...common.serialisation import content
-from ...common.time_limit import TimeLimitReached, time_limit
 from ...errors import SimulationError
-from ...features.measurements import lost_samples
-from ...features.registry import FEATURES, present
+from ...features.measurements import lost_samples, present
+from ...features.registry import FEATURES
 from ...fem.schemes import as_scheme
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solve_recorder import best_iterate

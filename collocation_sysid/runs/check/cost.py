@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.array_types import Array
-from ...common.machine import machine_memory_mb
+from ...common.limits import machine_memory_mb
 from ...errors import InputError, SimulationError
 from ...methods.interior_point import InteriorPoint
 from ...methods.reduced_space import ReducedSpace, memory_mb

@@ -1,61 +1,20 @@
-"""Reading of a problem file: TOML syntax, overrides, and validation."""
+"""Overrides of a problem file: values of keys, stated beside the file."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
-import tomli_w
-from pydantic import ValidationError
-
-from ..common.text_files import DEEPEST, HAND_WRITTEN_BYTES, beyond_limits, parse_toml, read_text
-from ..errors import InputError, located
-from .schema import ProblemFile
-from .validation_messages import explain_validation_error
+from ..common.text_files import DEEPEST, beyond_limits
+from ..errors import InputError
 
 
-def read_problem_file(path: str | Path, overrides: Sequence[str] = ()) -> tuple[ProblemFile, str]:
-    """Read and validate a problem file.
+def apply_override(content: dict[str, Any], override: str) -> None:
+    """Set the value of an override "dotted.key=value" in the content of a problem file.
 
-    Parameters
-    ----------
-    overrides : sequence of str
-        Overrides "dotted.key=value", with values in TOML syntax. Words without quotes are strings.
-        Items of a list are selected by index, counted from 0, and tables of a list also by name.
-
-    Returns
-    -------
-    tuple of ProblemFile and str
-        Validated content, and the text of the problem: that of the file, or, with overrides, the
-        overridden content written as TOML, without comments.
-
-    Raises
-    ------
-    InputError
-        Names the file, the key or line, what was found and what was expected.
+    An experiment gets a copy of a table of [experiment_defaults] of which a part is set.
     """
-    path = Path(path)
-    text = read_text(path, "a problem file (TOML)", HAND_WRITTEN_BYTES)
-    content = parse_toml(text, path)
-    with located("--set"):
-        for override in overrides:
-            _apply_override(content, override)
-    if overrides:
-        text = tomli_w.dumps(content)
-    try:
-        return ProblemFile.model_validate(content), text
-    except ValidationError as error:
-        raise explain_validation_error(error, content, path=path) from error
-
-
-# Overrides ----------------------------------------------------------------------------------------
-
-
-def _apply_override(content: dict[str, Any], override: str) -> None:
-    """An experiment gets a copy of a table of [experiment_defaults] of which a part is set."""
     key, equals, value = override.partition("=")
     key = key.strip()
     parts = key.split(".")
