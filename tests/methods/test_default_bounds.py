@@ -11,7 +11,7 @@ from kit.problems import hung_cube
 import collocation_sysid as cs
 from collocation_sysid.fem.laws.constants import KNOWN, constant_named
 from collocation_sysid.methods.solution import Status
-from collocation_sysid.methods.starts.stiffness_scan import ScanState
+from collocation_sysid.methods.starts.stiffness_scan import ScanState, TrialSimulation
 from collocation_sysid.model.parameters import (
     Parameter,
     Parameters,
@@ -189,6 +189,45 @@ def test_a_scan_continues_where_stiffer_bodies_fit_ever_better(misfit, least, mo
         state.misfits[young_pa] = misfit(young_pa)
     state.extend_range(1e7, 2.0)
     assert least <= max(state.misfits) <= most
+
+
+@pytest.mark.parametrize(("rigid_pa", "stiffest"), [(1e14, 1e12), (3e9, 7.2e9)])
+def test_a_scan_passes_local_minima_while_stiffer_bodies_move_otherwise(rigid_pa, stiffest):
+    # Misfit of a vibrating steel ruler.
+    misfits = {
+        1.39e9: 50.4, 3.16e9: 50.0, 7.2e9: 53.0, 1.64e10: 59.5, 3.73e10: 52.0, 8.48e10: 26.5,
+        1.93e11: 2.4, 4.39e11: 37.5, 1e12: np.nan,
+    }  # fmt: skip
+
+    class Ruler:
+        bounds_pa = (0.0, np.inf)
+
+        def evaluate_at(self, young_pa, _):
+            nearest = min(misfits, key=lambda each: abs(np.log(each / young_pa)))
+            return misfits[nearest], [np.array([young_pa])]
+
+        def differ(self, positions, others):
+            return min(*positions[0], *others[0]) < rigid_pa
+
+    state = ScanState(Ruler())  # pyright: ignore[reportArgumentType]
+    factor = 10 ** (5 / 14)
+    for young_pa in (1.39e9 / factor, 1.39e9):
+        state.misfits[young_pa] = 51.6 if young_pa < 1e9 else 50.4
+        state.last_trajectories = [np.array([young_pa])]
+    state.extend_range(1.39e9, factor)
+    assert max(state.misfits) == pytest.approx(stiffest, rel=0.02)
+
+
+@pytest.mark.long
+def test_motions_differ_by_more_than_the_noise():
+    unknown = {"young_pa": cs.Unknown(lower=1.0, upper=1e13)}
+    problem = cs.Problem([shaken_beam(7e10)], BEAM | unknown, substeps=1)
+    trial = TrialSimulation(problem.collocation())
+    flexible, metal, rigid, more_rigid = (
+        trial.evaluate_at(young_pa, None)[1] or [] for young_pa in (1e10, 2e10, 4e12, 8e12)
+    )
+    assert trial.differ(flexible, metal)
+    assert not trial.differ(rigid, more_rigid)
 
 
 @pytest.mark.parametrize("guess", [2e11, 0.01])

@@ -60,6 +60,9 @@ WORSE = 3.0
 # The scan continues beyond an end as long as the misfit decreases by this share, or by more than in
 # the step before: a body that is much too soft, such as a metal, moves alike at every stiffness.
 BETTER = 0.01
+# Largest number of stiffer bodies in a row that fit worse, but move otherwise than the one before:
+# a steel ruler that vibrates over five periods fits worse at two between 3 and 37 GPa.
+MOST_WORSE = 4
 # Misfit up to which the measurements are explained, so that no other stiffness is sought [sigma].
 EXPLAINED = 1.5
 # Number of other starts where there are local minima: each costs a solve, and the right one was
@@ -544,6 +547,21 @@ class TrialSimulation:
         self.failure = failure or self.failure
         return failure is None
 
+    def differ(self, positions: list[Array], others: list[Array]) -> bool:
+        """Return whether the measurements tell two motions (N, 3n) of each recording apart: their
+        residuals differ by more than the noise, as a root mean square.
+        """
+        p = self._p(SOFT_PA)  # of what is measured only viscous forces depend on it
+        first, second = (
+            [
+                residual.ravel()
+                for part in self.collocation.iterates_at(p, motion)
+                for residual, _ in part.linearise_fixed_motion()
+            ]
+            for motion in (positions, others)
+        )
+        return any(np.mean((a - b) ** 2) > 1 for a, b in zip(first, second, strict=True))
+
     @cached_property
     def bounds_pa(self) -> tuple[float, float]:
         """Young's moduli [Pa] between which the moduli without a guess are within their bounds."""
@@ -616,6 +634,9 @@ class ScanState:
         the share `BETTER`, or by more than the modulus before, within `LIMITS_PA`; their misfits
         are stored, also that of the last one.
 
+        Towards stiffer ones also `MOST_WORSE` in a row may be worse, as long as each moves otherwise
+        than the one before: the misfit of a body that vibrates has local minima over the stiffness.
+
         It also ends where a simulation fails, where the measurements are `EXPLAINED`, or where moduli
         leave their bounds.
 
@@ -626,18 +647,24 @@ class ScanState:
         factor : float
             Ratio of successive moduli, below one towards softer ones.
         """
-        best = self.misfits[young_pa]
+        last = self.misfits[young_pa]
         inside = min(self.misfits, key=lambda each: abs(np.log(each * factor / young_pa)))
-        decrease = self.misfits[inside] - best
+        decrease = self.misfits[inside] - last
         beyond = young_pa * factor
         softest = max(LIMITS_PA[1], self.trial.bounds_pa[0])
         stiffest = min(LIMITS_PA[0], self.trial.bounds_pa[1])
-        while softest < beyond < stiffest and best > EXPLAINED:
+        worse = 0
+        while softest < beyond < stiffest and last > EXPLAINED:
+            before = self.last_trajectories
             misfit = self._try(beyond)
-            gain = best - misfit
-            if not (gain > BETTER * best or gain > max(decrease, 0.0)):
+            gain = last - misfit
+            is_better = gain > BETTER * last or gain > max(decrease, 0.0)
+            worse = 0 if is_better else worse + 1
+            after = self.last_trajectories
+            moves = factor > 1 and before and after and self.trial.differ(before, after)
+            if np.isnan(misfit) or not (is_better or (moves and worse <= MOST_WORSE)):
                 return
-            best, decrease = misfit, gain
+            last, decrease = misfit, gain
             beyond = beyond * factor
 
     @property
