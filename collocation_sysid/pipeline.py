@@ -456,6 +456,8 @@ def _solve_from_parameters(
     positions, failure = simulate_trajectories(collocation, p)
     if failure is not None:
         raise failure
+    if isinstance(solver, ReducedSpace):
+        solver = replace(solver, tolerance=max(solver.tolerance, solver.coarse_start_tolerance))
     with connect_executor(scheduler) as workers:
         method = with_workers(solver, workers)
         solution = solve_with_renewed_correspondences(

@@ -71,8 +71,9 @@ class ReducedSpace(SearchOptions):
     coarse_start_nodes : int
         Number of nodes above which a body is large.
     coarse_start_tolerance : float
-        Tolerance of the search on the given mesh after a coarse start, if it is larger than
-        `tolerance`. The default is far below the error of any mesh, and saves a sweep or two.
+        Tolerance of the search on the given mesh after a coarse start, and of a search with finer
+        time steps after the first one, if it is larger than `tolerance`. The default is far below
+        the error of any mesh, and saves a sweep or two.
     max_time_s : float
         Time limit of a run [s]: the search ends with the best iterate, and later steps, such as
         error bars, are left out. If none is stated, the search for a start ends after 40 s where
