@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,6 +18,8 @@ from .command_options import OutputOptions, command, option
 from .common import EXIT_NOT_CONVERGED, shown_progress
 
 commands = typer.Typer()
+
+NO_POINT = "found no point; expected texture, --points, or --tags"
 
 RateHz = Annotated[
     Positive | None,
@@ -93,6 +96,14 @@ def track(
         raise InputError("found several of --mask, --points and --tags; expected one of them")
     if gripper and poses is None:
         raise InputError("expected --poses, the poses of the gripper, too", where="--gripper")
+    if film is not None and film.suffix != ".mp4":
+        raise InputError(f"found {str(film)!r}; expected FILE.mp4", where="--film")
+    read = [os.path.realpath(file) for file in (video, mask, poses) if file is not None]
+    for file, name in ((out, "--out"), (film, "--film")):
+        if file is not None and os.path.realpath(file) in read:
+            raise InputError(
+                f"found {str(file)!r}, which is read; expected another file", where=name
+            )
     names, start = stated_points(points, "--points")
     gripper_names, gripper_px = stated_points(gripper, "--gripper")
     motion = None if poses is None else read_poses(poses)
@@ -113,11 +124,15 @@ def track(
                 raise InputError(f"found {found} pixels; expected those of the video, {size}", mask)
             start = corners_of(first, within, most)
             names = [f"p{k + 1}" for k in range(len(start))]
+        if not tags and not len(start):
+            raise InputError(NO_POINT, video)
         tracks = (
             tag_centres(images(), tags) if tags else follow(images(), names, start, lost_px=lost_px)
         )
         if not len(tracks.names):
-            raise InputError("found no point; expected texture, --points, or --tags", video)
+            raise InputError(NO_POINT, video)
+        if len(tracks.t_s) < 2:
+            raise InputError("found one image; expected several", video)
         moved = tracks if not gripper else follow(images(), gripper_names, gripper_px, lost_px)
         start_s = (
             None

@@ -243,6 +243,10 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
         the block.
     """
     target = Path(path)
+    if target.is_dir():
+        with naming(target, target):
+            yield target
+        return
     draft = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.partial{target.suffix}")
     try:
         with naming(target, draft):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -231,6 +232,14 @@ def test_points_are_lost_rather_than_mistaken_where_the_surroundings_change(tmp_
         (("--points", "a=1,2", "--tags", "DICT_4X4_50"), "expected one of them"),
         (("--mask", "frames/frame_0.png", "--points", "a=1,2"), "expected one of them"),
         (("--mask", "missing.png"), "missing.png: this image cannot be read"),
+        (("--out", "."), ".: this cannot be written"),
+        (("--out", "frames/frame_0.png", "--mask", "frames/frame_0.png"), "which is read"),
+        (("--mask", "black.png"), "found no point; expected texture"),
+        (("--points", ";;"), "found no point; expected texture"),
+        (("--points", "a\x1b=100,100"), "expected NAME=U,V"),
+        (("--mask", "many.png"), "many.png: this image cannot be read"),
+        (("--film", "film.avi"), "--film: found 'film.avi'; expected FILE.mp4"),
+        (("--film", "poses.mp4", "--poses", "poses.mp4"), "'poses.mp4', which is read"),
         (("--mask", "small.png"), "small.png: found 8 × 9 pixels; expected those of the video"),
     ],
 )
@@ -239,6 +248,9 @@ def test_wrong_options_end_with_a_remedy(
 ) -> None:
     monkeypatch.chdir(folder.parent)
     cv2.imwrite("small.png", np.zeros((9, 8), dtype=np.uint8))
+    cv2.imwrite("black.png", np.zeros(SIZE[::-1], dtype=np.uint8))
+    size = struct.pack("<IIiiHH", 54, 40, 2**30, 2**30, 1, 24)  # of 2³⁰ × 2³⁰ pixels
+    Path("many.png").write_bytes(b"BM" + bytes(8) + size + bytes(24))
     ended = run_command("track", "frames", "--out", "front.csv", "--rate-hz", 30, *options)
     assert (ended.code, ended.out) == (2, "")
     assert message in ended.err
@@ -289,6 +301,53 @@ def test_what_libraries_print_about_a_damaged_image_is_not_shown(tmp_path: Path)
     assert len(ended.stderr.splitlines()) == 1
 
 
+def write_video(file: Path, count: int = COUNT) -> None:
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, SIZE)
+    for image in images()[:count]:
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
+
+
+def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
+    write_video(tmp_path / "other.mp4")
+    (tmp_path / "film.mp4").write_text("ffconcat version 1.0\nfile other.mp4\n")
+    ended = run_command("track", tmp_path / "film.mp4", "--out", tmp_path / "front.csv")
+    assert ended.code == 2
+    assert "film.mp4: this has no image" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("count", "first_ticks", "message"),
+    [(1, None, "found one image; expected several"), (COUNT, 0, "expected --rate-hz")],
+)
+def test_images_without_increasing_times_are_refused(
+    count: int, first_ticks: int | None, message: str, tmp_path: Path
+) -> None:
+    write_video(tmp_path / "film.mp4", count)
+    if first_ticks is not None:
+        content = bytearray((tmp_path / "film.mp4").read_bytes())
+        table = content.find(b"stts")  # of the durations of images
+        content[table + 12 : table + 20] = struct.pack(">II", count, first_ticks)
+        (tmp_path / "film.mp4").write_bytes(content)
+    ended = run_command("track", tmp_path / "film.mp4", "--out", tmp_path / "front.csv")
+    assert (ended.code, ended.out) == (2, "")
+    assert message in ended.err
+    assert not (tmp_path / "front.csv").exists()
+
+
+def test_what_libraries_print_while_they_decode_is_not_shown(tmp_path: Path) -> None:
+    write_video(tmp_path / "film.mp4")
+    content = np.frombuffer((tmp_path / "film.mp4").read_bytes(), dtype=np.uint8).copy()
+    rng = np.random.default_rng(1)
+    content[rng.integers(500, len(content) - 2000, 80)] = 0xFF
+    (tmp_path / "film.mp4").write_bytes(content.tobytes())
+    command = [sys.executable, "-m", "collocation_sysid", "track", str(tmp_path / "film.mp4")]
+    command += ["--out", str(tmp_path / "front.csv"), "-q"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "@" not in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
 def test_images_of_different_sizes_are_refused(folder: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "frame_5.png"), np.zeros((20, 30), dtype=np.uint8))
     ended = run_command("track", folder, "--out", tmp_path / "front.csv", "--rate-hz", 30)
@@ -298,10 +357,7 @@ def test_images_of_different_sizes_are_refused(folder: Path, tmp_path: Path) -> 
 
 
 def test_the_times_of_a_video_and_a_film_with_the_points(folder: Path, tmp_path: Path) -> None:
-    video = cv2.VideoWriter(str(tmp_path / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 25.0, SIZE)
-    for image in images():
-        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    video.release()
+    write_video(tmp_path / "film.mp4")
     words = ("--out", tmp_path / "front.csv", "--film", tmp_path / "seen.mp4")
     assert run_command("track", tmp_path / "film.mp4", *words).code == 0
     times = read_tracks(tmp_path / "front.csv").t_s

@@ -96,7 +96,9 @@ def corners_of(image: Image, mask: Image | None, most: int) -> Array:
     """Return up to `most` corners (N, 2) of an image within a mask, to a part of a pixel."""
     cv2 = opencv()
     plain = grey(image)
-    found = cv2.goodFeaturesToTrack(plain, most, LEAST_QUALITY, LEAST_DISTANCE_PX, mask=mask)
+    found = cv2.goodFeaturesToTrack(
+        plain, min(most, plain.size), LEAST_QUALITY, LEAST_DISTANCE_PX, mask=mask
+    )
     if found is None:
         return np.zeros((0, 2))
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-3)
@@ -112,7 +114,7 @@ def stated_points(text: str, option: str) -> tuple[list[str], Array]:
         name, _, pixel = part.rpartition("=")
         try:
             u, v = map(float, pixel.split(","))
-            if not np.isfinite(u + v):
+            if not (np.isfinite(u + v) and part.isprintable()):
                 raise ValueError
         except ValueError:
             raise InputError(f"found {part!r}; expected NAME=U,V", where=option) from None

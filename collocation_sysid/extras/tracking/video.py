@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,13 @@ from ...recording.sources.depth_files import standard_error_silenced
 Image = NDArray[np.uint8]
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-# Rate of a film of a single image [Hz].
-SINGLE_RATE_HZ = 30.0
+# Settings of FFmpeg in OpenCV: formats that contain images, no list of other files or addresses; and
+# no messages, which its threads print at any time.
+FFMPEG = {
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS": "format_whitelist;"
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,gif,yuv4mpegpipe",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+}
 
 
 def opencv() -> Any:
@@ -49,14 +55,25 @@ def images_of(source: Path, rate_hz: float | None) -> Iterator[tuple[float, Imag
         return
     if not source.is_file():
         raise InputError("there is no such file; expected a video or a folder of images", source)
+    os.environ |= FFMPEG
     with standard_error_silenced():
-        video = cv2.VideoCapture(str(source))
+        video = cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
     try:
-        number = 0
-        while (read := video.read())[0]:
-            stated_s = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
-            yield (number / rate_hz if rate_hz else stated_s), read[1]
+        number, last_s = 0, -np.inf
+        while True:
+            is_read, image = video.read()
+            if not is_read:
+                break
+            t_s = number / rate_hz if rate_hz else 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
             number += 1
+            if not t_s > last_s:
+                raise InputError(
+                    f"image {number} is at {t_s:.6g} s, not after the one before; expected --rate-hz, "
+                    "the frame rate, where a video has no increasing times",
+                    source,
+                )
+            yield t_s, image
+            last_s = t_s
     finally:
         video.release()
     if not number:
@@ -67,8 +84,11 @@ def read_image(file: Path, *, is_grey: bool = False) -> Image:
     """Return an image (rows, columns, 3), or its grey values."""
     cv2 = opencv()
     require_regular(file)
-    with standard_error_silenced():
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR)
+    try:
+        with standard_error_silenced():
+            image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR)
+    except cv2.error:  # such as too many pixels
+        image = None
     if image is None:
         raise InputError("this image cannot be read; expected a .png or .jpg", file)
     return image
@@ -86,7 +106,7 @@ def write_film(
     """Write images with circles around points (S, N, 2), as MP4."""
     cv2 = opencv()
     writer: Any = None
-    rate_hz = 1 / float(np.median(np.diff(t_s))) if len(t_s) > 1 else SINGLE_RATE_HZ
+    rate_hz = 1 / float(np.median(np.diff(t_s)))
     for (_, image), points in zip(images, pixels, strict=True):
         if writer is None:
             size = (image.shape[1], image.shape[0])
