@@ -14,7 +14,7 @@ not determine the constants of the stated law that it lacks.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -30,6 +30,7 @@ from ...recording.experiment import Experiment
 from ...recording.homogeneous_deformation import AXES
 from ...recording.specimen import LATERAL_NAME, SECOND_STRESS_NAME, STRESS_NAME
 from ...recording.specimen_files import deformed_gradients
+from .initial_trajectories import simulate_trajectories
 from .start import Start
 
 # Sizes of the exponents of the grid, each with both signs.
@@ -121,6 +122,8 @@ class _Fit:
     beta: Array | None  # (n,) or None: none for an incompressible law
     has_one_beta: bool  # whether all terms share one estimated β
     constants: int  # number of fitted constants of the law
+    # Errors of strains and stresses over their prior standard deviations; none without them.
+    deviations: Array
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
@@ -139,6 +142,18 @@ class PowerLawStart(Start):
     young_pa: float = 0.0
     loss: float = np.inf  # χ² of the closed form at the start
     is_at_bound: bool = False  # whether an exponent is at the largest one that is allowed
+    # Errors of strains and stresses of all tests over their prior standard deviations.
+    deviations: Array = field(default_factory=lambda: np.zeros(0))
+
+    def fitted_variables(self, collocation: Collocation) -> Array | None:
+        """Return z of a simulation at the guesses of `collocation` with the errors of the closed
+        forms; None if they are not all nuisance parameters, or the simulation fails.
+        """
+        p = np.append(collocation.parameters.guess_q, self.deviations)
+        if len(p) != len(collocation.guess_p):
+            return None
+        positions, failure = simulate_trajectories(collocation, p)
+        return collocation.pack(p, positions) if failure is None else None
 
 
 def power_law_start(collocation: Collocation) -> PowerLawStart | None:
@@ -341,7 +356,7 @@ class _PowerLawFits:
         alpha, betas, shares, _ = linear(result.x)
         if not self._may_be_first(alpha, shares).any():
             return None
-        return _Fit(2 * float(result.cost), alpha, shares, betas, True, 2 * n + count)
+        return _Fit(2 * float(result.cost), alpha, shares, betas, True, 2 * n + count, np.zeros(0))
 
     def _improve(self, fit: _Fit, has_one_beta: bool = True) -> _Fit | None:
         """Return the fit with deviations and, unless `has_one_beta`, a β of each term."""
@@ -369,10 +384,13 @@ class _PowerLawFits:
             fit.alpha[0], np.diff(fit.alpha), np.ones(n), free_beta, np.zeros(len(others))
         ]
         result = _least_squares(lambda x: self._residuals(*unpacked(x)), start, lower, upper)
-        alpha, shares, betas, _ = unpacked(result.x)
+        alpha, shares, betas, deviations = unpacked(result.x)
         if not self._may_be_first(alpha, shares).any():
             return None
-        return _Fit(2 * float(result.cost), alpha, shares, betas, has_one_beta, 2 * n + count)
+        constants = 2 * n + count
+        return _Fit(
+            2 * float(result.cost), alpha, shares, betas, has_one_beta, constants, deviations
+        )
 
     def _is_stable(self, fit: _Fit) -> bool:
         """Return whether the law resists shear in each principal plane at all measured stretches.
@@ -493,6 +511,7 @@ class _PowerLawFits:
             young_pa=young_pa,
             loss=fit.loss,
             is_at_bound=is_at_bound,
+            deviations=fit.deviations,
         )
 
     def _notes(

@@ -115,7 +115,8 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
     start = power_law_start(collocation) if unguessed and are_specimens else None
     if start is not None:
         usual = typical_parameters(start.collocation.parameters, start.young_pa)
-        return Start(collocation.with_parameters(usual), note=start.note)
+        found = collocation.with_parameters(usual)
+        return Start(found, start.fitted_variables(found), note=start.note)
     if any(is_modulus(name) for name in unguessed):
         result = scan_stiffness(collocation, is_complete=is_complete)
         return Start(collocation.with_parameters(result.parameters), scan=result)
