@@ -78,7 +78,7 @@ TOPICS: dict[str, Topic] = {
             "depends on them; mesh the body with a layer of nodes where the fingers end, and let "
             "the box of grasp.nodes end slightly beyond it",
             "grasp-extent": "the box of the grasp of '{experiment}' ends {gap_mm:.3g} mm beyond "
-            "the outermost nodes that it selects along {axis}, {percent:.2g} % of the free length "
+            "the elements that it holds along {axis}, {percent:.2g} % of the free length "
             "of {free_mm:.4g} mm: if the fingers end where the box does, the modelled body is too "
             "long, and its stiffness is estimated too high, in bending by three to four times "
             "this share; mesh the body with a layer of nodes where the fingers end "

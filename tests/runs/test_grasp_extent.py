@@ -4,24 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from kit.problems import times, vertex_markers
 
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.selection import Box
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.body import grasp_extent_concerns, grasp_extent_notes
+from collocation_sysid.runs.check.body import grasp_extent_concerns, grasp_extent_notes, grasp_gaps
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 # A cube of 100 mm with layers of nodes every 20 mm along z.
 CUBE = Body(box_mesh((0.1, 0.1, 0.1), (1, 1, 5)), density_kg_m3=30.0)
 
 
-def held_above(height_m: float, axes: str = "xyz", support: str = "") -> Problem:
+def held_above(height_m: float, axes: str = "xyz", support: str = "", body: Body = CUBE) -> Problem:
     """A problem with a cube whose nodes above a height are held along `axes`, and those of the
     lowest layer along the axes of `support`.
     """
@@ -31,7 +33,7 @@ def held_above(height_m: float, axes: str = "xyz", support: str = "") -> Problem
     if support:
         lowest = Box((-1, -1, -1), (1, 1, 0.001))
         grasps.append(Grasp(lowest, PoseSequence.fixed(), axes=support))
-    experiment = Experiment(CUBE, t_s, grasps, vertex_markers(CUBE, [0], t_s), name="cube")
+    experiment = Experiment(body, t_s, grasps, vertex_markers(body, [0], t_s), name="cube")
     unknown = Unknown(1000.0, 10.0, 1e5)
     return Problem(
         [experiment],
@@ -62,6 +64,24 @@ def test_a_box_that_ends_beyond_its_nodes_is_reported(height_m, gap_mm):
         assert "of the free length of 80 mm" in concern.message
 
 
+@pytest.mark.parametrize("element", ["tet4", "tet10"])
+def test_a_held_part_that_ends_raggedly_is_as_short_as_its_volume(rng, element):
+    """Single nodes are close to the face of the box, but elements end up to an edge before it."""
+    mesh = box_mesh((0.1, 0.1, 0.1), (6, 6, 6))
+    inside = (mesh.points_m[:, 2] > 0.01) & (mesh.points_m[:, 2] < 0.09)
+    points_m = mesh.points_m.copy()
+    points_m[inside, 2] += rng.uniform(-0.006, 0.006, inside.sum())
+    body = Body(TetMesh(points_m, mesh.tetrahedra), element=element, density_kg_m3=30.0)
+    height_m = 0.0635
+    corners_m = points_m[mesh.tetrahedra]
+    held = corners_m[(corners_m[:, :, 2] > height_m).all(axis=1)]
+    volume_m3 = np.abs(np.linalg.det(held[:, 1:] - held[:, :1])).sum() / 6
+    assert points_m[points_m[:, 2] > height_m, 2].min() < height_m + 0.001
+    problem = held_above(height_m, body=body)
+    ((_, gap_m, _),) = grasp_gaps(problem.experiments[0], problem.experiments[0].body_grasps[0])
+    assert gap_m == pytest.approx(0.1 - height_m - volume_m3 / 0.01, rel=0.1)
+
+
 def test_planes_of_symmetry_and_platens_are_no_grippers():
     free_along_y = held_above(0.075, axes="xz", support="y")
     assert grasp_extent_concerns(free_along_y) == []
@@ -80,4 +100,4 @@ def test_the_extent_of_a_simulated_grasp_is_a_note():
 
 def test_check_warns_before_a_solve():
     messages = [each.message for each in check_problem(held_above(0.075)).concerns]
-    assert any("ends 5 mm beyond the outermost nodes" in m for m in messages)
+    assert any("ends 5 mm beyond the elements" in m for m in messages)

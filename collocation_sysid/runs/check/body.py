@@ -17,7 +17,7 @@ from ...common.array_types import Array
 from ...errors import listed
 from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
-from ...fem.meshes.checks import edge_lengths, mean_ratios
+from ...fem.meshes.checks import boundary_of, edge_lengths, mean_ratios
 from ...fem.meshes.mesh import TetMesh
 from ...fem.meshes.selection import Box
 from ...fem.rods import RodMesh
@@ -446,8 +446,8 @@ LAYER_SHARE = 1e-6
 
 def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, float, float]]:
     """Yield the gaps of a grasp that exceed `LARGEST_SHARE` of the free length: axis, distance [m] of
-    the outermost held nodes from the face of the box, and length [m] of the free part of the body
-    beyond these nodes.
+    the end of the held part from the face of the box, and length [m] of the free part of the body
+    beyond it. The part ends where elements of which all corners are held end, on average.
 
     None for grasps that are not selected by a box, that hold some axes only (platens and planes of
     symmetry), or whose nodes are one layer along the axis, and for faces of the box beyond which
@@ -457,17 +457,37 @@ def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, floa
     if not isinstance(box, Box) or len(grasp.axes) < 3:
         return
     points_m = experiment.body.nodes.points_m
+    centres_m, areas_m2 = _ends_of_held(experiment.body.mesh, grasp)
     for k, axis in enumerate("xyz"):
         along_m = points_m[:, k]
         held_m = along_m[grasp.nodes]
         if np.ptp(held_m) <= LAYER_SHARE * np.ptp(along_m):
             continue
         for direction, face_m in ((1, box.high_m[k]), (-1, box.low_m[k])):
-            reach_m = (direction * held_m).max()
+            facing_m2 = (direction * areas_m2[:, k]).clip(0)
+            if facing_m2.any():
+                reach_m = direction * np.average(centres_m[:, k], weights=facing_m2)
+            else:
+                reach_m = (direction * held_m).max()
             free_m = (direction * along_m).max() - reach_m
             gap_m = direction * face_m - reach_m
             if LARGEST_SHARE * free_m < gap_m < free_m:
                 yield axis, float(gap_m), float(free_m)
+
+
+def _ends_of_held(mesh: TetMesh | RodMesh, grasp: Grasp) -> tuple[Array, Array]:
+    """Return centres (F, 3) [m] and areas with normals (F, 3) [m²] of the faces between the elements
+    of which all corners are held, and others.
+    """
+    if isinstance(mesh, RodMesh):
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    is_held = np.isin(mesh.tetrahedra, grasp.nodes).all(axis=1)
+    held, free = (boundary_of(mesh.tetrahedra[chosen])[0] for chosen in (is_held, ~is_held))
+    faces = np.sort(np.concatenate([held, free]), axis=1)
+    _, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+    corners_m = mesh.points_m[held[count[which[: len(held)]] == 2]]
+    a, b, c = corners_m.transpose(1, 0, 2)
+    return corners_m.mean(axis=1), np.cross(b - a, c - a) / 2
 
 
 def grasp_extent_concerns(problem: Problem) -> list[Concern]:
