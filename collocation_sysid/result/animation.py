@@ -35,6 +35,7 @@ from .figure_style import (
     TEXT_PT,
     VERMILION,
     add_legend_above,
+    is_alone,
     own_settings,
     style_axes,
 )
@@ -344,7 +345,11 @@ class FilmFigure:
         if self.paths:  # which would hide them
             style = {"color": VERMILION, "lw": 1.2, "zorder": 3.6, "ls": (0, (3, 3))}
         for path_m in np.moveaxis(replay.measured_m, 1, 0):
-            axes.plot(*view.to_sheet_mm(path_m).T, **style)
+            path_mm = view.to_sheet_mm(path_m)
+            axes.plot(*path_mm.T, **style)
+            if self.paths:
+                alone = path_mm[is_alone(path_mm[:, 0])]
+                axes.plot(*alone.T, **style | {"ls": "", "marker": "o", "ms": 7, "mfc": "none"})
         for k, (name, positions, markers) in enumerate(trajectories):
             wire = GREEN if k else None
             title = axes.text(
@@ -393,7 +398,10 @@ class FilmFigure:
         for (name, markers), colour in zip(trajectories, (BLUE, GREEN), strict=False):
             squares = np.sum((markers - self.replay.measured_m) ** 2, axis=2)
             style = {"color": colour, "lw": LINE_PT, "ls": "-" if colour == BLUE else (0, (4, 2))}
-            panel.plot(t_s, 1e3 * rms_over_markers(squares), label=name, **style)
+            rms_mm = 1e3 * rms_over_markers(squares)
+            panel.plot(t_s, rms_mm, label=name, **style)
+            if (alone := is_alone(rms_mm)).any():
+                panel.plot(t_s[alone], rms_mm[alone], color=colour, ls="", marker="o", ms=3)
         distance = f"distance from {self.measured}" if self.paths else "marker error"
         style_axes(panel, "", xlabel="time [s]", ylabel=f"{distance}, RMS [mm]")
         panel.set_xlim(t_s[0], t_s[-1])

@@ -12,13 +12,16 @@ from io import BytesIO
 from math import inf
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context, rcdefaults
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatterSciNotation, LogLocator, NullLocator
+from numpy.typing import NDArray
 
+from ..common.array_types import Array
 from ..fem.laws.constants import symbol_of
 
 # Okabe & Ito's palette, distinguishable with any colour vision.
@@ -146,6 +149,12 @@ def style_axes(axes: Axes, title: str = "", xlabel: str = "", ylabel: str = "") 
     for side, spine in axes.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set(linewidth=0.6, color=_GREY)
+
+
+def is_alone(values: Array) -> NDArray[np.bool_]:
+    """Return at which of some values (T,) no line is drawn, because both neighbours are missing."""
+    known = np.pad(np.isfinite(values), 1)
+    return known[1:-1] & ~known[:-2] & ~known[2:]
 
 
 def add_legend_above(axes: Axes, columns: int) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.array_types import Array
+from ..common.display import rounded, two_digits
 from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
 from ..fem.elements import EDGES
@@ -505,8 +506,8 @@ def run_headline(result: Result) -> str:
     sentences = []
     for name, each in moduli.items():
         deviation = each.combined_std_error
-        bar = f" ± {float(format(deviation, '.2g')):g}" if deviation else ""
-        sentences.append(f"{name} = {each.value:.5g}{bar} Pa")
+        bar = f" ± {two_digits(deviation)}" if deviation else ""
+        sentences.append(f"{name} = {rounded(each.value, deviation)}{bar} Pa")
     return "; ".join([*sentences, f"verdict: {result.trust.verdict}"])
 
 

@@ -56,6 +56,7 @@ from collocation_sysid.extras.planning.trajectory_log import write_trajectory_mc
 from collocation_sysid.recording import read_markers, write_markers_csv
 from collocation_sysid.recording.pose_files import read_poses
 from collocation_sysid.recording.time_tables import read_pressure
+from collocation_sysid.result.animation import FilmFigure
 from collocation_sysid.statistics.budget.effect_estimates import EFFECT, JointPosterior
 from collocation_sysid.statistics.budget.systematic_effects import DEVIATIONS
 from collocation_sysid.statistics.linearised import linearise_fit
@@ -1931,6 +1932,25 @@ def test_the_film_of_a_plan_has_reference_point_and_hand():
     middle_m = hung_bar().experiments[0].grasps[0].nodes
     held_m = plan.fine.positions_m[:, middle_m].mean(axis=1)
     assert paths_m["hand"][:, 0] == pytest.approx(held_m, abs=1e-5)
+
+
+def test_a_reference_at_one_time_is_drawn_as_a_point():
+    plan = bar_plan()
+    record = planning_folder.motion_record(plan)
+    once_m = np.full_like(record.measured_m, np.nan)
+    once_m[3] = record.markers_m[3] + [0.0, 0.0, 1e-3]
+    picture = FilmFigure(
+        replace(record, measured_m=once_m),
+        measured="reference",
+        paths_m=planning_folder.drawn_paths_m(plan),
+    )
+    body, errors = picture.figure.axes
+    rings = [line for line in body.lines if line.get_markersize() == 7]
+    assert [len(line.get_xdata()) for line in rings] == [1]
+    points = [line for line in errors.lines if line.get_marker() == "o"]
+    assert [line.get_xydata().ravel() for line in points] == [
+        pytest.approx([record.t_s[3] - record.t_s[0], 1.0])
+    ]
 
 
 @pytest.mark.parametrize("interrupted", ["save_pictures", "film"])

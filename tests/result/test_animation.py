@@ -220,7 +220,7 @@ def test_the_film_states_the_answer(run):
     one = a_result(
         {"core.young_pa": value(1543.21, 123.4)}, trust=Assessment((Concern("solve/moves"),))
     )
-    assert run_headline(one) == "E core = 1543.2 ± 120 Pa; verdict: check"
+    assert run_headline(one) == "E core = 1540 ± 120 Pa; verdict: check"
     texts = [
         text.get_text()
         for text in FilmFigure(swing, headline=run_headline(result)).figure.axes[0].texts

@@ -50,7 +50,7 @@ REPORT_FILE = "report.html"
 CAPTIONS = {
     "hand": "The hand over time",
     "commands": "Tensions and pressures, with their limits",
-    "tracking": "Displacements of the points with their 95 % band, and their references, dashed",
+    "tracking": "Displacements of the points with their 95 % band, and references, dashed or dots",
 }
 # What reduces sources of the band that no budget has.
 REMEDIES = {

@@ -12,6 +12,7 @@ from ...result.figure_style import (
     PAGE_MM,
     VERMILION,
     add_legend_above,
+    is_alone,
     new_figure,
     own_settings,
     style_axes,
@@ -105,6 +106,8 @@ def tracking_picture(plan: MotionPlan) -> Figure:
             panel.plot(plan.t_s, middle, color=colour, lw=LINE_PT, label="xyz"[axis])
             wanted = 1e3 * (reference.position_m[:, axis] - points[0, axis])
             panel.plot(plan.t_s, wanted, color=colour, lw=LINE_PT, ls="--")
+            alone = is_alone(wanted)  # of a reference at one time, for example
+            panel.plot(plan.t_s[alone], wanted[alone], color=colour, ls="", marker="o", ms=3)
             if half_widths is not None:
                 half = 1e3 * half_widths[reference.name][:, axis]
                 panel.fill_between(
