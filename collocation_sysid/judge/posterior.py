@@ -18,8 +18,7 @@ The error of the mesh and of the time step are effects with a mean: that of the 
 elements, or steps, of half the length, extrapolated to infinitely small ones. The data learn its
 size, but not its shape, which is known as badly: each channel (one number of a marker over time), and
 the part that parameters reproduce, of which residuals show nothing, have amplitudes of their own with
-the same deviation, which are considered. A size that no error of a mesh or of a time step has (`SHARES`)
-is that of another cause that looks alike: the fit says so, and the effect is considered, not learnt.
+the same deviation, which are considered.
 
 A single curve of a static test does not tell effects from each other, nor from the law of the
 material, which is never exact. There effects are considered but not learnt: the estimates are
@@ -52,13 +51,11 @@ from ..statistics.budget.effect_estimates import (
     EffectEstimate,
     JointPosterior,
     effect_row,
-    surprise_limit,
 )
 from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
 from ..statistics.distributions import student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
-from ..statistics.thresholds import CHANCE
 from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 NOISE = "noise"
@@ -68,8 +65,6 @@ BETWEEN = "between recordings"
 ALIKE = 0.9
 # Share of the prior variance of an effect below which the data say nothing about it.
 UNSEEN = 1e-6
-# Shares of its estimate that the error of a mesh or a time step may be: up to that of order one half.
-SHARES = (0.0, 2.6)
 
 
 @dataclass(frozen=True)
@@ -235,7 +230,6 @@ class Posterior:
     step: Array  # (p + a,): step of all parameters and learnt effects
     uncertainty: Uncertainty  # of the fit after the step
     reported_q: Array  # (nq,): q of `uncertainty`, after the step
-    refuted: tuple[EffectEstimate, ...] = ()  # that are considered because of their size
 
     @classmethod
     def from_fit(
@@ -260,36 +254,8 @@ class Posterior:
         derived_at : callable, optional
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
-
-        def found(unlearnt: Iterable[str]) -> Posterior:
-            is_out = np.isin(np.array(effects.names, dtype=str), list(unlearnt))
-            learnt, considered = (effects.only(np.flatnonzero(o)) for o in (~is_out, is_out))
-            return cls._by_one_step(fit, learnt, considered, parameters, q, error_model, derived_at)
-
-        whole = found(() if is_learnt else effects.names)
-        limit = surprise_limit(len(whole.effect_estimates), CHANCE)
-        refuted = tuple(
-            each
-            for each in whole.effect_estimates
-            if effect_row(each.name) in DISCRETISATION
-            and abs(each.surprise) > limit
-            and not SHARES[0] <= each.value <= SHARES[1]
-        )
-        if not refuted:
-            return whole
-        return replace(found(each.name for each in refuted), refuted=refuted)
-
-    @classmethod
-    def _by_one_step(
-        cls,
-        fit: LinearisedFit,
-        learnt: Effects,
-        considered: Effects,
-        parameters: Parameters,
-        q: Array,
-        error_model: ErrorModel,
-        derived_at: Callable[[Array], object] | None,
-    ) -> Posterior:
+        none = effects.only(())
+        learnt, considered = (effects, none) if is_learnt else (none, effects)
         wide, definition = learnt.added_to(fit, parameters)
         step = gauss_newton_step(wide)
         after = wide.after_step(step)
@@ -381,15 +347,8 @@ class Posterior:
         omitted = self.effects.only(np.flatnonzero(~np.array(is_kept, dtype=bool)))
         step = step + estimate_changes(fit, omitted.blocks) @ omitted.means
         step[:first] -= estimate_changes(alone, omitted.blocks) @ omitted.means
-        refuted = tuple(e for e in self.refuted if e.name not in left_out)
         return replace(
-            self,
-            fit=fit,
-            effects=learnt,
-            considered=considered,
-            definition=definition,
-            step=step,
-            refuted=refuted,
+            self, fit=fit, effects=learnt, considered=considered, definition=definition, step=step
         )
 
     def joint(self, transcriptions: Iterable[Transcription]) -> JointPosterior:
@@ -587,7 +546,7 @@ class Posterior:
         by_shape = self.sources[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
-        found = [*self.refuted]
+        found = []
         for k, name in enumerate(self.fit.names[len(self.fit.names) - count :]):
             if predicted[k] < UNSEEN:
                 continue

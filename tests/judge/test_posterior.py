@@ -176,26 +176,6 @@ def test_effects_without_some_are_those_of_a_fit_without_them(rng):
     np.testing.assert_allclose(whole.without(["mass"]).covariance, part.covariance, atol=1e-9)
 
 
-def test_a_time_step_that_data_reverse_does_not_move_the_constants_but_is_a_surprise(rng):
-    """What looks like an error of the time step of the opposite sign has another cause."""
-    by_parameters, column = slopes(rng, 4), 10.0 * slopes(rng, 1)
-    own = effects(column, "time_step", means=2.0)
-    for share, is_learnt in ((-2.0, False), (-0.2, True), (1.5, True), (4.0, False)):
-        fit = linear_fit(by_parameters, -share * 2.0 * column[:, 0])
-        found, without, corrected = (
-            Posterior.from_fit(fit, each, PARAMETERS, Q, GIVEN, is_learnt=learnt)
-            for each, learnt in ((own, True), (own, False), (own.only(()), True))
-        )
-        (surprise,) = found.effect_estimates
-        assert surprise.value == pytest.approx(share, abs=0.01)
-        assert found.effects.names == (("time_step",) if is_learnt else ())
-        assert np.abs(corrected.q - without.q).max() > 0.01
-        if not is_learnt:
-            np.testing.assert_array_equal(found.q, without.q)
-            assert abs(surprise.surprise) > 2.5
-            assert not found.without(["time_step"]).effect_estimates
-
-
 def test_other_effects_are_learnt_beside_the_mean_of_one_that_a_refinement_measures(rng):
     """The refinement corrects the constants alone for the measured change of the residuals."""
     by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
