@@ -457,7 +457,7 @@ def _solve_from_parameters(
     if failure is not None:
         raise failure
     if isinstance(solver, ReducedSpace):
-        solver = replace(solver, tolerance=max(solver.tolerance, solver.coarse_start_tolerance))
+        solver = replace(solver, tolerance=solver.tolerance_after_coarse)
     with connect_executor(scheduler) as workers:
         method = with_workers(solver, workers)
         solution = solve_with_renewed_correspondences(

@@ -87,6 +87,11 @@ class ReducedSpace(SearchOptions):
     coarse_start_tolerance: Positive = 1e-6
     max_time_s: Positive = UNLIMITED_S
 
+    @property
+    def tolerance_after_coarse(self) -> float:
+        """Tolerance of a search from the answer with a coarser mesh or coarser time steps."""
+        return max(self.tolerance, self.coarse_start_tolerance)
+
     @one_blas_thread()
     def __call__(
         self,

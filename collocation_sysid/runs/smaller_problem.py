@@ -254,7 +254,7 @@ class CoarseStart(SmallerProblem):
         return "solve", f"on {self.describe_size()}"
 
     def tolerance(self, method: ReducedSpace) -> float:
-        return max(method.tolerance, method.coarse_start_tolerance)
+        return method.tolerance_after_coarse
 
     @property
     def edge_ratio(self) -> float:

@@ -19,7 +19,7 @@ from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import boundary_of, edge_lengths, mean_ratios
 from ...fem.meshes.mesh import TetMesh
-from ...fem.meshes.selection import Box
+from ...fem.meshes.selection import Box, rows_of_faces
 from ...fem.rods import RodMesh
 from ...fem.spatial_field import FieldResolution
 from ...problem import Problem
@@ -164,9 +164,12 @@ def _covariance(mesh: TetMesh) -> Array:
     return (squares + np.einsum("e,ei,ej->ij", shares, sums, sums)) / 20
 
 
+def _area_vectors(triangles: Array) -> Array:
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) / 2
+
+
 def _areas(triangles: Array) -> Array:
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return np.linalg.norm(normals, axis=1) / 2
+    return np.linalg.norm(_area_vectors(triangles), axis=1)
 
 
 # Shapes that hold less of a field's variance leave most of it to the interval.
@@ -482,12 +485,9 @@ def _ends_of_held(mesh: TetMesh | RodMesh, grasp: Grasp) -> tuple[Array, Array]:
     if isinstance(mesh, RodMesh):
         return np.zeros((0, 3)), np.zeros((0, 3))
     is_held = np.isin(mesh.tetrahedra, grasp.nodes).all(axis=1)
-    held, free = (boundary_of(mesh.tetrahedra[chosen])[0] for chosen in (is_held, ~is_held))
-    faces = np.sort(np.concatenate([held, free]), axis=1)
-    _, which, count = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
-    corners_m = mesh.points_m[held[count[which[: len(held)]] == 2]]
-    a, b, c = corners_m.transpose(1, 0, 2)
-    return corners_m.mean(axis=1), np.cross(b - a, c - a) / 2
+    faces, _ = boundary_of(mesh.tetrahedra[is_held])
+    triangles_m = mesh.points_m[faces[rows_of_faces(faces, mesh.surface) < 0]]
+    return triangles_m.mean(axis=1), _area_vectors(triangles_m)
 
 
 def grasp_extent_concerns(problem: Problem) -> list[Concern]:
