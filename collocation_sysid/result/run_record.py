@@ -28,6 +28,7 @@ from ..features.measurements import recorded_series
 from ..features.outlines.outlines import edge_pixels
 from ..features.outlines.residual import OutlinesResidual
 from ..fem.body import Body
+from ..methods.reduced_space import ReducedSpace
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation
 from ..runs.result_content import Result
@@ -174,8 +175,8 @@ def _result_text(result: Result) -> str:
 def write_pictures(
     finished: SolvedProblem, result: Result, folder: Path, say: Callable[[str], None]
 ) -> None:
-    """Draw all pictures of a run, including the structure of the Jacobian unless that of a
-    specimen, and write them into its folder as PNG files; existing ones are replaced.
+    """Draw all pictures of a run, including the structure of the Jacobian if the method of a body is not
+    reduced space, and write them into its folder as PNG files; existing ones are replaced.
 
     Parameters
     ----------
@@ -198,7 +199,8 @@ def write_pictures(
 
     solution = finished.solution
     pictures = all_pictures(replays(finished), result)
-    if solution.collocation.transcriptions[0].experiment.specimen is None:
+    has_body = solution.collocation.transcriptions[0].experiment.specimen is None
+    if has_body and solution.method != ReducedSpace.name:
         pictures["jacobian"] = jacobian_sparsity(solution.collocation, solution.z)
     save_pictures(folder, pictures, say=say)
 

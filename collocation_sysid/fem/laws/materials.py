@@ -37,9 +37,9 @@ from ...common.validated_types import Text
 from ...errors import InputError, hint_at
 from ..chain_rule import ChainRule
 from ..kernel import from_lower_triangle
-from .constants import GAMMA_R, MOST_TERMS, SHARE, TAU, Constant, constant_named
+from .constants import GAMMA_R, SHARE, TAU, Constant, constant_named
 from .invariants import isochoric_invariants
-from .ogden import PowerLawEnergy, hyperfoam, ogden
+from .ogden import HYPERFOAM, OGDEN, PowerLawEnergy
 
 T = TypeVar("T")
 Energy = Callable[..., ca.SX]
@@ -321,11 +321,8 @@ MATERIALS: dict[str, Material] = {
     }.items()
 }
 MATERIALS |= {
-    f"{name}-{terms}": Material(
-        f"{name}-{terms}", energy(terms), constants=tuple(map(constant_named, energy(terms).names))
-    )
-    for name, energy in (("ogden", ogden), ("hyperfoam", hyperfoam))
-    for terms in range(1, MOST_TERMS + 1)
+    name: Material(name, energy, constants=tuple(map(constant_named, energy.names)))
+    for name, energy in (OGDEN | HYPERFOAM).items()
 }
 
 

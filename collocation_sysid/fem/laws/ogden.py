@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from ..chain_rule import ChainRule, PartialIndex, SymbolicFunction
+from .constants import MOST_TERMS
 from .invariants import reduced_invariants
 from .power_traces import PowerTraces
 
@@ -86,26 +87,6 @@ class PowerLawEnergy:
         return SymbolicFunction(arguments, evaluate)
 
 
-def ogden(terms: int) -> PowerLawEnergy:
-    """Return the energy of Ogden's material with a number of terms.
-
-    Its constants are ``mu_1_pa, alpha_1, mu_2_pa, …`` and, last, ``kappa_pa``.
-    """
-    names = [name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}")]
-    return PowerLawEnergy(_ogden_density, (*names, "kappa_pa"))
-
-
-def hyperfoam(terms: int) -> PowerLawEnergy:
-    """Return the energy of Hill's compressible foam with a number of terms.
-
-    Its constants are ``mu_1_pa, alpha_1, beta_1, mu_2_pa, …``.
-    """
-    names = [
-        name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}", f"beta_{p}")
-    ]
-    return PowerLawEnergy(_hyperfoam_density, tuple(names))
-
-
 def is_power_law(material: str) -> bool:
     """Return whether a material of this name is Ogden's or a compressible foam: "ogden-…" or
     "hyperfoam-…".
@@ -158,3 +139,25 @@ def _exponential_remainder(rate: ca.SX, x: ca.SX) -> ca.SX:
     for k in range(8, 0, -1):
         series = 1 + small / (k + 2) * series
     return ca.if_else(is_small, x**2 / 2 * series, quotient)
+
+
+# Energies of Ogden's material, "ogden-1" to "ogden-4", with the constants mu_1_pa, alpha_1,
+# mu_2_pa, … and, last, kappa_pa.
+OGDEN = {
+    f"ogden-{terms}": PowerLawEnergy(
+        _ogden_density,
+        (*(name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}")), "kappa_pa"),
+    )
+    for terms in range(1, MOST_TERMS + 1)
+}
+# Energies of Hill's compressible foam, "hyperfoam-1" to "hyperfoam-4", with the constants mu_1_pa,
+# alpha_1, beta_1, mu_2_pa, ….
+HYPERFOAM = {
+    f"hyperfoam-{terms}": PowerLawEnergy(
+        _hyperfoam_density,
+        tuple(
+            name for p in range(1, terms + 1) for name in (f"mu_{p}_pa", f"alpha_{p}", f"beta_{p}")
+        ),
+    )
+    for terms in range(1, MOST_TERMS + 1)
+}

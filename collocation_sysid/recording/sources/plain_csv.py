@@ -20,8 +20,8 @@ import numpy as np
 from ...errors import InputError, listed
 from ..sample_times import first_unordered_time
 from .columns import find_time
-from .raw_tracks import LabelChooser, RawTracks, tracks_of_table
-from .text import Table, numeric_cells
+from .raw_tracks import LabelChooser, RawTracks
+from .text import Table, numeric_cells, times_in_column
 from .units import METRES_PER_UNIT, length_unit_of_spelling
 
 _BRACKETED = re.compile(r"(?P<name>.*?)\s*[(\[](?P<unit>[^()\[\]]+)[)\]]")
@@ -88,12 +88,11 @@ def _read_wide(table: Table, choose: LabelChooser, to_seconds: float) -> RawTrac
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
     chosen = choose(labels)
-    tracks = tracks_of_table(
-        table,
-        labels,
-        coordinate_columns=places,
-        chosen=chosen,
-        time=(place["t_s"], to_seconds),
+    cells = numeric_cells(table, [k for at in chosen for k in places[at]], blank_allowed=True)
+    tracks = RawTracks(
+        [labels[k] for k in chosen],
+        cells.reshape(-1, len(chosen), 3),
+        t_s=times_in_column(table, place["t_s"], to_seconds),
         zeros_are_missing=False,
         default_unit="m",
     )
