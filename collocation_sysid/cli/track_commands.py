@@ -80,6 +80,7 @@ def track(
     from ..extras.tracking import (
         TrackVerdict,
         corners_of,
+        damage_of,
         follow,
         images_of,
         read_image,
@@ -133,6 +134,8 @@ def track(
             raise InputError(NO_POINT, video)
         if len(tracks.t_s) < 2:
             raise InputError("found one image; expected several", video)
+        progress.say("checking the video")
+        damage = damage_of(video)
         moved = tracks if not gripper else follow(images(), gripper_names, gripper_px, lost_px)
         start_s = (
             None
@@ -144,7 +147,7 @@ def track(
             if film is not None:
                 draft = stack.enter_context(replaced_file(film))
                 write_film(draft, images(), tracks.t_s, tracks.pixels)
-    verdict = TrackVerdict(tracks, start_s)
+    verdict = TrackVerdict(tracks, start_s, damage)
     answer = {
         "file": str(out),
         "verdict": verdict.verdict,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from kit.problem_files import Outcome, run_command
 
-from collocation_sysid.extras.tracking import tag_centres
+from collocation_sysid.extras.tracking import tag_centres, video
 from collocation_sysid.features.image_tracks.files import read_tracks
 from collocation_sysid.recording import PoseSequence, write_poses_csv
 
@@ -372,3 +372,48 @@ def test_without_opencv_the_extra_is_named(folder: Path, tmp_path: Path, monkeyp
     ended = run_command("track", folder, "--out", tmp_path / "front.csv", "--rate-hz", 30)
     assert ended.code == 2
     assert "tracking needs OpenCV: pip install 'collocation-sysid[video]'" in ended.err
+
+
+def write_damaged(file: Path, damage: Callable[[bytearray], object]) -> None:
+    video = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SIZE)
+    for image in images():
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
+    content = bytearray(file.read_bytes())
+    damage(content)
+    file.write_bytes(content)
+
+
+def half_of_a_picture(content: bytearray) -> None:
+    middle = len(content) // 2
+    content[middle : middle + 3000] = bytes(3000)
+
+
+def last_third(content: bytearray) -> None:
+    del content[2 * len(content) // 3 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (half_of_a_picture, "announced images are decoded; the decoder reports "),
+        (last_third, "8 of 12 announced images are decoded"),
+        (lambda content: None, None),
+    ],
+)
+def test_a_damaged_video_is_never_good(damage, message: str | None, tmp_path: Path) -> None:
+    write_damaged(tmp_path / "film.avi", damage)
+    ended = run_command("track", tmp_path / "film.avi", "--out", tmp_path / "front.csv", "--json")
+    answer = json.loads(ended.out)
+    assert answer["verdict"] == ("good" if message is None else "check")
+    damaged = [each for each in answer["remedies"] if "announced" in each]
+    assert [message in each for each in damaged] == ([] if message is None else [True])
+
+
+def test_a_video_that_crashes_the_decoder_is_refused(tmp_path: Path, monkeypatch) -> None:
+    write_damaged(tmp_path / "film.avi", lambda content: None)
+    monkeypatch.setattr(video, "_DECODE", "import os; os.abort()")
+    ended = run_command("track", tmp_path / "film.avi", "--out", tmp_path / "front.csv")
+    assert (ended.code, ended.out) == (2, "")
+    assert "film.avi: decoding this video crashes" in ended.err
+    assert not (tmp_path / "front.csv").exists()

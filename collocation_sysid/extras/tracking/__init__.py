@@ -15,13 +15,14 @@ from .points import (
 )
 from .start_time import StartTime, start_time
 from .verdict import TrackVerdict
-from .video import images_of, read_image, write_film
+from .video import damage_of, images_of, read_image, write_film
 
 __all__ = [
     "StartTime",
     "TrackVerdict",
     "Tracks",
     "corners_of",
+    "damage_of",
     "follow",
     "images_of",
     "read_image",

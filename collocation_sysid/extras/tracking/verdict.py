@@ -26,6 +26,7 @@ class TrackVerdict:
 
     tracks: Tracks
     start: StartTime | None = None
+    damage: str = ""  # a sentence on errors of the video; empty without any
 
     @property
     def surviving(self) -> int:
@@ -34,21 +35,23 @@ class TrackVerdict:
 
     @property
     def verdict(self) -> str:
-        """Return "good", "check" (fewer than half of the points or than four survive) or "doubtful"."""
+        """Return "good", "check" (fewer than half of the points or than four survive, or the video is
+        damaged) or "doubtful".
+        """
         count = len(self.tracks.names)
         if not self.surviving:
             return "doubtful"
         is_enough = self.surviving >= min(FEWEST_POINTS, count) and 2 * self.surviving >= count
-        return "good" if is_enough else "check"
+        return "good" if is_enough and not self.damage else "check"
 
     @property
     def remedies(self) -> list[str]:
-        """Sentences on what helps against the losses; empty without any."""
+        """Sentences on what helps against damage and losses; empty without any."""
         losses = self.tracks.losses
         left = [each for each in losses if each.has_left]
         fast = [each for each in losses if not each.has_left and each.step_px > FAST_PX]
         changed = len(losses) - len(left) - len(fast)
-        found = []
+        found = [self.damage] if self.damage else []
         if left:
             found.append(f"{len(left)} left the image: film with more room around the motion")
         if fast:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...common.array_types import Array
 from ...common.files import in_counting_order, require_regular
+from ...common.installation import python_command
 from ...errors import InputError
 from ...recording.sources.depth_files import standard_error_silenced
 
@@ -25,6 +28,22 @@ FFMPEG = {
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,asf,gif,yuv4mpegpipe",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
 }
+# Decodes a video with the messages of FFmpeg, of which each line begins with `MESSAGE`, and prints a
+# list: number of images that the file announces, number that are decoded, announced duration, and
+# end of the last image by the times before [s].
+MESSAGE = "[OPENCV:FFMPEG:"
+_DECODE = """
+import json, sys, cv2
+video = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG)
+count = video.get(cv2.CAP_PROP_FRAME_COUNT)
+duration_s = count / (video.get(cv2.CAP_PROP_FPS) or 1)
+times_s = []
+while video.grab():
+    times_s.append(1e-3 * video.get(cv2.CAP_PROP_POS_MSEC))
+steps_s = [b - a for a, b in zip(times_s, times_s[1:])]
+end_s = times_s[-1] + 2 * max(steps_s, default=0) if times_s else 0
+print(json.dumps([count, len(times_s), duration_s, end_s]))
+"""
 
 
 def opencv() -> Any:
@@ -78,6 +97,39 @@ def images_of(source: Path, rate_hz: float | None) -> Iterator[tuple[float, Imag
         video.release()
     if not number:
         raise InputError("this has no image; expected a video that OpenCV can decode", source)
+
+
+def damage_of(source: Path) -> str:
+    """Return a sentence if a video has errors, or fewer images than it announces; else "".
+
+    It is decoded in a process of its own, because FFmpeg conceals errors by similar images and only
+    prints them.
+
+    Raises
+    ------
+    InputError
+        If the decoder crashes.
+    """
+    if source.is_dir():
+        return ""
+    environment = os.environ | FFMPEG | {"OPENCV_FFMPEG_LOGLEVEL": "16"}
+    command = python_command(_DECODE, str(source))
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, errors="replace", check=False
+    )
+    lines = done.stdout.splitlines()
+    errors = [line.partition("]")[2].strip() for line in lines if line.startswith(MESSAGE)]
+    counts = [line for line in lines if line.startswith("[") and not line.startswith(MESSAGE)]
+    if done.returncode or not counts:
+        raise InputError("decoding this video crashes; expected an undamaged video", source)
+    announced, decoded, duration_s, end_s = json.loads(counts[-1])
+    if not errors and not (decoded < announced and end_s < duration_s):
+        return ""
+    reported = f'; the decoder reports {len(errors)} errors, first "{errors[0]}"' if errors else ""
+    return (
+        f"{decoded:.0f} of {announced:.0f} announced images are decoded{reported}: the video was cut "
+        "or damaged, and images may be wrong or missing; record or copy it again"
+    )
 
 
 def read_image(file: Path, *, is_grey: bool = False) -> Image:
