@@ -410,6 +410,15 @@ def test_a_damaged_video_is_never_good(damage, message: str | None, tmp_path: Pa
     assert [message in each for each in damaged] == ([] if message is None else [True])
 
 
+def test_an_image_that_ends_early_is_refused(folder: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "whole.jpg"), texture())
+    content = (tmp_path / "whole.jpg").read_bytes()
+    (folder / "frame_5.png").write_bytes(content[: len(content) // 2])
+    ended = run_command("track", folder, "--out", tmp_path / "front.csv", "--rate-hz", 30)
+    assert (ended.code, ended.out) == (2, "")
+    assert "frame_5.png: this image cannot be read" in ended.err
+
+
 def test_a_video_that_crashes_the_decoder_is_refused(tmp_path: Path, monkeypatch) -> None:
     write_damaged(tmp_path / "film.avi", lambda content: None)
     monkeypatch.setattr(video, "_DECODE", "import os; os.abort()")

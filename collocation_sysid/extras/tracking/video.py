@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
 
 from ...common.array_types import Array
 from ...common.files import in_counting_order, require_regular
 from ...common.installation import python_command
 from ...errors import InputError
+from ...features.outlines.masks import UNREADABLE
 from ...recording.sources.depth_files import standard_error_silenced
 
 Image = NDArray[np.uint8]
@@ -137,9 +140,13 @@ def read_image(file: Path, *, is_grey: bool = False) -> Image:
     cv2 = opencv()
     require_regular(file)
     try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PillowImage.open(file) as whole:
+                whole.load()  # OpenCV fills what a file lacks
         with standard_error_silenced():
             image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR)
-    except cv2.error:  # such as too many pixels
+    except (*UNREADABLE, cv2.error):  # such as too many pixels
         image = None
     if image is None:
         raise InputError("this image cannot be read; expected a .png or .jpg", file)
