@@ -361,7 +361,7 @@ class FilmFigure:
                 view,
                 surface=replay.surface,
                 parts=replay.surface_parts,
-                nodes=replay.surface_nodes,
+                face_outlines=replay.face_outlines,
                 edge_colour=wire,
             )
             self.drawings.append((name, positions, markers, body, title))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import MISSING, dataclass, field, fields
+from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
 from types import MappingProxyType
@@ -131,10 +132,10 @@ class MotionRecord:
     # (F,): index of the part of the body that each boundary triangle belongs to.
     surface_parts: NDArray[np.integer]
     # (F, 3) or (F, 6): nodes of each boundary triangle; of quadratic elements also those on its
-    # sides.
+    # sides, behind the corners.
     surface_nodes: NDArray[np.integer]
     part_names: Sequence[str]  # (P,) str: names of the parts; "" for elements outside all regions
-    # (T, n) bool: whether a node has a prescribed displacement along some axis.
+    # (T, n) bool: whether a node is grasped; those of planes of symmetry are not.
     is_prescribed: NDArray[np.bool_]
     up: Array  # (3,): unit vector against gravity; z where there is no gravity
     marker_names: Sequence[str]  # (M,) str: names of the markers
@@ -235,7 +236,7 @@ class MotionRecord:
             body.part_of_place_cells[body.mesh.surface_cells],
             nodes_of_faces(body.place_cells[body.mesh.surface_cells], body.mesh.surface),
             [part.name for part in body.parts],
-            np.asarray(experiment.is_prescribed(experiment.t_s).any(axis=2))[:, : len(nodes_m)],
+            _are_grasped(experiment)[:, : len(nodes_m)],
             experiment.upward_direction,
             markers.names,
             declared_m if places_m is None else places_m,
@@ -281,6 +282,18 @@ class MotionRecord:
             if differences_s.min(initial=np.inf) <= tolerance_s:
                 nearest.append(points[points[:, 0] == times[differences_s.argmin()], 5:])
         return np.concatenate(nearest)
+
+    @cached_property
+    def face_outlines(self) -> NDArray[np.integer]:
+        """Nodes along the edge of each boundary triangle, (F, 3), or (F, 6) of quadratic elements."""
+        if self.surface_nodes.shape[1] == 3:
+            return self.surface
+        at_m = self.undeformed_m
+        middles_m = (at_m[self.surface] + at_m[np.roll(self.surface, -1, axis=1)]) / 2
+        on_sides = self.surface_nodes[:, 3:]
+        apart_m = np.linalg.norm(at_m[on_sides][:, None] - middles_m[:, :, None], axis=3)
+        ordered = np.take_along_axis(on_sides, apart_m.argmin(axis=2), axis=1)
+        return np.stack([self.surface, ordered], axis=2).reshape(len(self.surface), 6)
 
     def has_shapes(self) -> bool:
         """Return whether at least one sample has finite positions of all nodes."""
@@ -397,6 +410,18 @@ def _join_polylines(lines_m: Sequence[Array]) -> Array | None:
     if not lines_m:
         return None
     return np.concatenate([np.vstack([line, np.full(3, np.nan)]) for line in lines_m])
+
+
+def _are_grasped(experiment: Experiment) -> NDArray[np.bool_]:
+    """Return whether each node is in a grasp at each sample (T, n). Fixed grasps along one axis
+    without a wrench are left out: planes of symmetry, and supports on which the body slides.
+    """
+    is_grasped = np.zeros((len(experiment.t_s), len(experiment.body.nodes_m)), dtype=bool)
+    for grasp in experiment.grasps:
+        is_fixed = not np.ptp(grasp.poses.positions_m, axis=0).any()
+        if len(grasp.axes) > 1 or grasp.wrench is not None or not is_fixed:
+            is_grasped[np.ix_(grasp.is_active(experiment.t_s), grasp.nodes)] = True
+    return is_grasped
 
 
 def nodes_of_faces(cells: NDArray[np.integer], faces: NDArray[np.integer]) -> NDArray[np.integer]:

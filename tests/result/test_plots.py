@@ -35,6 +35,7 @@ from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme
 from collocation_sysid.program.simulation import simulate
+from collocation_sysid.recording import PoseSequence
 from collocation_sysid.result.figure_style import (
     COLOUR_CYCLE,
     COLUMN_MM,
@@ -393,8 +394,8 @@ def test_up_is_up_in_the_picture(up):
 def test_only_faces_towards_the_viewer_are_drawn_the_nearest_last():
     mesh = box_mesh((1.0, 1.0, 1.0), (1, 1, 1))
     camera = ParallelCamera.from_direction((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
-    polygons, brightness, chosen = camera.visible_faces(mesh.points_m, mesh.surface)
-    assert polygons.shape == (2, 3, 2)
+    brightness, chosen = camera.visible_faces(mesh.points_m, mesh.surface)
+    assert len(chosen) == 2
     assert (mesh.points_m[mesh.surface[chosen], 2] == 1.0).all()  # of the top
     assert ((brightness > 0.5) & (brightness <= 1.0)).all()
     oblique = ParallelCamera.from_direction((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))
@@ -698,11 +699,35 @@ def test_grasped_nodes_on_the_sides_are_marked():
     _, axes = sheet(80, 60)
     camera = ParallelCamera.facing_motion(body.nodes_m[None], seen.up)
     view = SheetView.fit_points(camera, body.nodes_m, (70, 50), (5, 5))
-    drawn = BodyDrawing(axes, view, seen.surface, nodes=seen.surface_nodes)
+    drawn = BodyDrawing(axes, view, seen.surface, face_outlines=seen.face_outlines)
     drawn.update(body.nodes_m, np.ones(len(body.nodes_m), bool), np.empty((0, 3)))
     marked = len(drawn.grasped.get_xdata())
-    *_, faces = camera.visible_faces(body.nodes_m, seen.surface)
+    _, faces = camera.visible_faces(body.nodes_m, seen.surface)
     assert marked == len(np.unique(seen.surface_nodes[faces])) > len(np.unique(seen.surface[faces]))
+
+
+def test_faces_of_quadratic_elements_are_drawn_through_the_nodes_on_their_sides():
+    experiment = quadratic_bar()
+    body = experiment.body
+    seen = MotionRecord.from_experiment(
+        experiment, (np.tile(body.nodes_m, (len(experiment.t_s), 1, 1)), None)
+    )
+    outlines_m = body.nodes_m[seen.face_outlines]
+    before, after = (np.roll(outlines_m, k, axis=1)[:, 1::2] for k in (1, -1))
+    np.testing.assert_allclose(outlines_m[:, 1::2], (before + after) / 2, atol=1e-12)
+    bulged_m = (
+        0.5
+        + (body.nodes_m - 0.5)
+        * np.where(np.isin(np.arange(len(body.nodes_m)), seen.surface), 1.0, 1.3)[:, None]
+    )
+    _, axes = sheet(80, 60)
+    camera = ParallelCamera.facing_motion(body.nodes_m[None], seen.up)
+    view = SheetView.fit_points(camera, bulged_m, (70, 50), (5, 5))
+    drawn = BodyDrawing(axes, view, seen.surface, face_outlines=seen.face_outlines)
+    drawn.update(bulged_m, np.ones(len(bulged_m), bool), np.empty((0, 3)))
+    edges_mm = np.concatenate([path.vertices for path in drawn.faces.get_paths()])
+    for place in np.asarray(drawn.grasped.get_xydata()):
+        assert np.linalg.norm(edges_mm - place, axis=1).min() < 1e-6
 
 
 def test_letters_that_the_font_lacks_are_no_news(tmp_path):
@@ -727,3 +752,16 @@ def test_commands_hide_messages_of_matplotlib_about_its_files(tmp_path):
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "not a run folder" in done.stderr
+
+
+def test_planes_of_symmetry_are_not_marked_as_grasped():
+    bar = bar_in_two_hands(4)
+    still, moving = bar.grasps
+    nodes_m = bar.body.nodes_m
+    along = int(np.ptp(nodes_m[moving.nodes], axis=0).argmin())
+    fixed = replace(moving, axes="xyz"[along], poses=PoseSequence.fixed())
+    marked = MotionRecord.from_experiment(replace(bar, grasps=(still, fixed))).is_prescribed
+    np.testing.assert_array_equal(np.flatnonzero(marked[0]), np.sort(still.nodes))
+    platen = replace(moving, axes="xyz"[along])
+    marked = MotionRecord.from_experiment(replace(bar, grasps=(still, platen))).is_prescribed
+    assert marked[0].sum() == len(still.nodes) + len(moving.nodes)

@@ -103,7 +103,11 @@ def mesh_picture(replay: MotionRecord) -> Figure:
     for camera, corner, mine in zip((front, behind), corners, (first, ~first), strict=True):
         view = SheetView.fit_points(camera, everything, room_mm=(width, height), corner_mm=corner)
         BodyDrawing(
-            axes, view, surface=surface, parts=replay.surface_parts, nodes=replay.surface_nodes
+            axes,
+            view,
+            surface=surface,
+            parts=replay.surface_parts,
+            face_outlines=replay.face_outlines,
         ).update(nodes_m, is_grasped, markers_m=places_m)
         marks |= _draw_declared_positions(axes, view, places_m=places_m, declared_m=declared_m)
         if replay.tendons_m is not None:

@@ -63,6 +63,11 @@ def drawn_models(
 # Left, bottom, width and height of axes, in shares of the figure.
 Box = tuple[float, float, float, float]
 
+# Style of measured samples.
+DOTS: dict[str, Any] = {
+    "ls": "", "marker": ".", "ms": 3.5, "color": BLACK, "mec": "none", "alpha": 0.7, "zorder": 3
+}  # fmt: skip
+
 # Largest number of markers, with which the figure fits on a page.
 MAX_SHOWN_MARKERS = 3
 
@@ -123,7 +128,6 @@ def marker_tracks(
     margin = 0.03 * (t_s[-1] - t_s[0]) or 1.0
     start = t_s[0] - margin
     stop = t_s[-1] + margin
-    dots = {"ls": "", "marker": ".", "ms": 3.5, "color": BLACK, "mec": "none", "alpha": 0.7}
     for row, marker in enumerate(shown):
         for axis, letter in enumerate("xyz"):
             upper_box, lower_box = _axes_boxes(row, axis, height=height, head=head)
@@ -140,7 +144,7 @@ def marker_tracks(
                 each.yaxis.set_label_coords(
                     (3.5 - TRACK_LAYOUT.first_margin_mm) / _column_width_mm(), 0.5
                 )
-            upper.plot(t_s, measured, label="measured", zorder=3, **dots)
+            upper.plot(t_s, measured, label="measured", **DOTS)
             lower.axhline(0.0, color=BLACK, lw=0.6)
             for label, model_m, style in drawn:
                 model = 1e3 * model_m[:, marker, axis]
@@ -304,8 +308,7 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
             ylabel=f"[{units[k]}]" if units else "",
         )
         each.yaxis.set_major_locator(MaxNLocator(4))
-        dots = {"ls": "", "marker": ".", "ms": 3.0, "color": BLACK, "mec": "none", "alpha": 0.5}
-        each.plot(t_s[:, 0], measured[:, k], label="measured", **dots)
+        each.plot(t_s[:, 0], measured[:, k], label="measured", **DOTS)
         for label, values, style in drawn:
             each.plot(t_s[:, 0], values[:, k], label=label, **style)
     for each in grid.flat[len(shown) :]:

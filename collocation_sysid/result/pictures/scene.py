@@ -125,8 +125,9 @@ class BodyDrawing:
     parts : (F,), optional
         Index of the part of the body of each triangle, which defines its colour; one part by
         default.
-    nodes : (F, k), optional
-        Nodes of each triangle, of which grasped ones are marked; the corners by default.
+    face_outlines : (F, k), optional
+        Nodes along the edge of each triangle, of which grasped ones are marked; the corners by
+        default.
     edge_colour : str, optional
         Colour of the triangles' edges; then only these edges are drawn, above everything else.
     """
@@ -137,13 +138,13 @@ class BodyDrawing:
         view: SheetView,
         surface: Triangles,
         parts: NDArray[np.integer] | None = None,
-        nodes: NDArray[np.integer] | None = None,
+        face_outlines: NDArray[np.integer] | None = None,
         edge_colour: str | None = None,
     ) -> None:
         self.view = view
         self.surface = surface
         self.edge_colour = edge_colour
-        self.nodes = surface if nodes is None else nodes
+        self.face_outlines = surface if face_outlines is None else face_outlines
         indices = (
             np.zeros(len(surface), dtype=np.int64) if parts is None else parts % len(PART_COLOURS)
         )
@@ -196,7 +197,8 @@ class BodyDrawing:
             Points of cameras [m]; unchanged by default.
         """
         camera = self.view.camera
-        polygons, brightness, faces = camera.visible_faces(positions_m, self.surface)
+        brightness, faces = camera.visible_faces(positions_m, self.surface)
+        polygons = positions_m[self.face_outlines[faces]] @ camera.axes[:2].T
         if colours is not None:
             # Colours of a field are shaded half as much, so that they can be compared.
             brightness = (1 + brightness) / 2
@@ -208,7 +210,7 @@ class BodyDrawing:
         self.faces.set_facecolor(shaded)
         if not self.has_edges:
             self.faces.set_edgecolor(shaded)
-        visible = np.unique(self.nodes[faces])
+        visible = np.unique(self.face_outlines[faces])
         self.grasped.set_data(*self.view.to_sheet_mm(positions_m[visible[is_grasped[visible]]]).T)
         if outlines_m is not None:
             self.outlines.set_data(*self.view.to_sheet_mm(outlines_m).T)
@@ -395,10 +397,9 @@ class ParallelCamera:
 
     def visible_faces(
         self, positions_m: Array, surface: Triangles
-    ) -> tuple[Array, Array, NDArray[np.int64]]:
+    ) -> tuple[Array, NDArray[np.int64]]:
         """Return the triangles that are turned towards the viewer, from far to near; those that
-        others hide are included: corners (k, 3, 2) in the picture [m], brightness (k,) up to 1, and
-        indices (k,) in the surface.
+        others hide are included: brightness (k,) up to 1, and indices (k,) in the surface.
 
         Parameters
         ----------
@@ -414,7 +415,7 @@ class ParallelCamera:
         order = front[np.argsort(corners[front, :, 2].mean(axis=1), kind="stable")]
         light = np.clip(normals[order] @ LIGHT_DIRECTION, 0.0, 1.0)
         brightness = AMBIENT_BRIGHTNESS + (1 - AMBIENT_BRIGHTNESS) * light
-        return corners[order, :, :2], brightness, order
+        return brightness, order
 
     def are_hidden(
         self, points_m: Array, positions_m: Array, surface: Triangles

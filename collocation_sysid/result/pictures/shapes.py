@@ -122,7 +122,7 @@ def shapes_picture(
             view,
             surface=replay.surface,
             parts=replay.surface_parts,
-            nodes=replay.surface_nodes,
+            face_outlines=replay.face_outlines,
         )
         obstacles_m = None if replay.obstacles_m is None else replay.obstacles_m[t]
         body.update(
