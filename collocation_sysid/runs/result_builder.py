@@ -131,7 +131,7 @@ def _provenance(problem: Problem) -> Provenance:
         numpy=np.__version__,
         python=platform.python_version(),
         platform=platform.platform(),
-        problem_file=None if origin is None else str(origin.path),
+        problem_file=None if origin is None else str(origin.path.resolve()),
         problem_sha256=None if text is None else hashlib.sha256(text).hexdigest(),
         mesh_sha256=tuple(body.mesh.sha256 for body in problem.bodies),
     )

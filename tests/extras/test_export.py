@@ -1278,3 +1278,14 @@ def test_constants_of_a_specimen_are_exported_as_a_material_but_not_as_a_body(tm
     assert "*DENSITY" not in (exported(body, "abaqus", tmp_path) / "material.inc").read_text()
     with pytest.raises(InputError, match="no body that moves"):
         exported(body, "mujoco", tmp_path)
+
+
+@pytest.mark.long
+def test_a_run_is_exported_from_any_working_folder(tmp_path: Path, monkeypatch) -> None:
+    write_problem(tmp_path, {"swing": 8})
+    monkeypatch.chdir(tmp_path)
+    solve = ("solve", "problem.toml", "--out", "run", "-q", "--method", "reduced-space")
+    assert run_command(*solve).code == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert run_command("export", "../run", "--to", "calculix", "--out", "calculix").code == 0
