@@ -51,11 +51,13 @@ from ..statistics.budget.effect_estimates import (
     EffectEstimate,
     JointPosterior,
     effect_row,
+    surprise_limit,
 )
 from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
 from ..statistics.distributions import student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
+from ..statistics.thresholds import CHANCE
 from ..statistics.uncertainty import ErrorModel, Uncertainty, uncertainty_from_fit
 
 NOISE = "noise"
@@ -296,8 +298,23 @@ class Posterior:
     def sources(self) -> tuple[tuple[str, ...], Array]:
         """Names of the effects, and changes (p + a, …) of parameters and learnt effects if each is off
         by the standard deviation of its prior; mesh and time step occur again, once for each amplitude
-        of their shape.
+        of their shape, and a surprising effect for all that it changes, because another error may
+        look alike.
         """
+        names, ways = self._priors
+        count = len(self.effects.names)
+        for each in self.effect_estimates:
+            if abs(each.surprise) > surprise_limit(len(self.effect_estimates), CHANCE):
+                k = self.fit.names.index(each.name)
+                off = self.step[k] - self.effects.means[k - len(self.fit.names) + count]
+                own = self.covariance[:, k, None]
+                ways = np.hstack([ways, own / own[k] * off])
+                names += (each.name,)
+        return names, ways
+
+    @cached_property
+    def _priors(self) -> tuple[tuple[str, ...], Array]:
+        """`sources` without surprises."""
         ways = [self.covariance[:, self._of_effects]]
         ways.append(estimate_changes(self.fit, self.considered.blocks))
         rows = {row.name for row in DISCRETISATION}
@@ -543,7 +560,7 @@ class Posterior:
         actual = np.diag(self.uncertainty.nuisance_covariance)[-count:] if count else own
         predicted = np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
         # The shape of the errors of mesh and time step is not known.
-        by_shape = self.sources[1][places, count + len(self.considered.names) :]
+        by_shape = self._priors[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
         found = []

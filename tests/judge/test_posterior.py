@@ -176,6 +176,23 @@ def test_effects_without_some_are_those_of_a_fit_without_them(rng):
     np.testing.assert_allclose(whole.without(["mass"]).covariance, part.covariance, atol=1e-9)
 
 
+def test_the_interval_of_a_surprising_effect_contains_the_estimate_without_it(rng):
+    """What looks like the reverse of an error of the time step has another cause, which need not move
+    the constants.
+    """
+    by_parameters, column = 30.0 * slopes(rng, 4), 10.0 * slopes(rng, 1)
+    fit = linear_fit(by_parameters, 3.0 * 2.0 * column[:, 0])
+    own = effects(column, "time_step", means=2.0)
+    found, without = (
+        Posterior.from_fit(fit, own, PARAMETERS, Q, GIVEN, is_learnt=each) for each in (True, False)
+    )
+    assert of_effect(found, "time_step").value == pytest.approx(-3.0, abs=0.01)
+    moved = found.reported_q - without.reported_q
+    for k, name in enumerate(PARAMETERS.names):
+        deviation = np.diff(np.log(found.reported(name).combined95))[0] / 3.92
+        assert abs(moved[k]) < deviation < 1.5 * abs(moved[k]), name
+
+
 def test_other_effects_are_learnt_beside_the_mean_of_one_that_a_refinement_measures(rng):
     """The refinement corrects the constants alone for the measured change of the residuals."""
     by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)

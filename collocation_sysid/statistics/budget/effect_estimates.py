@@ -88,6 +88,11 @@ def effect_row(name: str) -> Deviation:
     return DEVIATIONS[name.partition(" ")[0]]
 
 
+def surprise_limit(count: int, chance: float) -> float:
+    """Return the surprise that one of several effects exceeds by chance with this probability."""
+    return float(normal_isf(chance / 2 / max(count, 1)))
+
+
 def effect_concerns(
     effects: Sequence[EffectEstimate], suspects: Sequence[EffectEstimate] = ()
 ) -> list[Concern]:
@@ -103,7 +108,7 @@ def effect_concerns(
     if not named:
         return []
     worst = max(named, key=lambda each: abs(each.surprise))
-    limit, gross = (float(normal_isf(p / 2 / len(named))) for p in (CHANCE, RARE))
+    limit, gross = (surprise_limit(len(named), p) for p in (CHANCE, RARE))
     if abs(worst.surprise) <= limit:
         return []
     known = sorted((*suspects, *effects), key=lambda each: -abs(each.surprise))
