@@ -347,27 +347,36 @@ class Discretisation(ConstantsModel):
         """Return the lower triangle (m,) of Σ_e σ_e ∂²v_e/∂x² [N/m], with the current volumes v_e of
         the elements at positions (3n,) [m] and stresses σ_e (E,) [Pa] that do not change.
         """
-        count, points = self.geometry.shape[:2]
-        gradients = self.gradients
         at_nodes = positions.reshape(-1, 3)[self.cells]
-        F = np.einsum("eai,eqaj->eqij", at_nodes, gradients, optimize=True)
-        spatial = gradients @ np.linalg.inv(F)
-        weights = stress_pa[:, None] * self.geometry[..., -1] * np.linalg.det(F)
-        size = 3 * self.element.nodes
-        spatial = spatial.reshape(count, points, size)
-        products = (spatial * weights[..., None]).swapaxes(1, 2) @ spatial
-        shape = (count, self.element.nodes, 3, self.element.nodes, 3)
-        exchanged = products.reshape(shape).swapaxes(2, 4).reshape(products.shape)
-        columns, rows = np.triu_indices(size)
-        values = (products - exchanged)[:, rows, columns]
-        entries = self._entries_of_cells.ravel()
-        summed = np.bincount(entries, values.ravel(), minlength=self.pattern.entry_count)
+        F = np.einsum("eai,eqaj->eqij", at_nodes, self.gradients, optimize=True)
+        a, b, c = np.moveaxis(F, -1, 0)
+        adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
+        ratios = np.einsum("eqi,eqi->eq", a, adjugate[..., 0, :])
+        spatial = self.gradients @ adjugate  # times the volume ratio
+        weights = stress_pa[:, None] * self.geometry[..., -1] / ratios
+        # ∂²v/∂x² of two nodes is the skew matrix of the vector product of their gradients.
+        weighted = (spatial * weights[..., None, None]).transpose(3, 0, 2, 1)
+        spatial = spatial.transpose(3, 0, 1, 2)
+        products = np.stack([weighted[k - 2] @ spatial[k - 1] for k in range(3)], axis=1)
+        upper, lower = np.triu_indices(self.element.nodes, 1)
+        axial = (products - products.swapaxes(2, 3))[:, :, upper, lower]
+        values = np.concatenate([-axial, axial], axis=1).ravel()
+        summed = np.bincount(self._entries_of_pairs, values, minlength=self.pattern.entry_count)
         return np.asarray(summed, dtype=float)
 
     @cached_property
-    def _entries_of_cells(self) -> Index:
-        """Positions in `pattern` of the lower triangles of the cells (E, any)."""
-        return element_destinations(self.pattern, self.cells)[1]
+    def _entries_of_pairs(self) -> Index:
+        """Positions in `pattern` of the entries of two nodes of each cell: of components (j, k) and
+        then (k, j) for each i, where (i, j, k) is an even permutation.
+        """
+        size = 3 * self.element.nodes
+        position = np.zeros((size, size), dtype=np.int64)
+        columns, rows = np.triu_indices(size)
+        position[columns, rows] = np.arange(len(rows))
+        upper, lower = 3 * np.array(np.triu_indices(self.element.nodes, 1))
+        j, k = np.array([[1, 2, 0], [2, 0, 1]])[:, :, None]
+        of_cell = np.concatenate([position[upper + k, lower + j], position[upper + j, lower + k]])
+        return element_destinations(self.pattern, self.cells)[1][:, of_cell].ravel()
 
     @property
     def is_slender(self) -> bool:
