@@ -45,7 +45,13 @@ from .runs.solving import (
     with_workers,
 )
 from .statistics.assessment import impact_step_concerns, rotation_step_concerns
-from .statistics.budget.discretisation_error import MESH_ORDER, MOST_SUBSTEPS, extrapolated
+from .statistics.budget.discretisation_error import (
+    MESH_ORDER,
+    MOST_SUBSTEPS,
+    NEGLIGIBLE,
+    NEGLIGIBLE_IN_SIMULATIONS,
+    extrapolated,
+)
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
 from .statistics.profile_likelihood import Profile, profile_of_solution
@@ -418,7 +424,8 @@ def _fine_enough(
     error = step_error(coarse.problem, first, fit, steps, known)
     problem = coarse.problem
     before = first.collocation.substeps
-    factor = error.suggested_substeps(known, as_scheme(problem.scheme).order)
+    negligible = NEGLIGIBLE_IN_SIMULATIONS if problem.is_declared_simulated else NEGLIGIBLE
+    factor = error.suggested_substeps(known, as_scheme(problem.scheme).order, negligible)
     substeps = min(before * factor, MOST_SUBSTEPS)
     number = "one time step" if before == 1 else f"{before} time steps"
     worst, many = error.largest_correction(known)

@@ -200,15 +200,18 @@ def test_a_number_that_is_stated_is_kept():
 
 def test_substeps_have_an_upper_limit():
     estimates = {"mu_pa": Estimate(100.0, 0.1, (99.8, 100.2))}
+
+    def suggested(half: float, order: float, negligible: float, each: dict = estimates) -> int:
+        error = discretisation_error("mu_pa", each["mu_pa"], [half], [], order)
+        return Refinement({"mu_pa": error}).suggested_substeps(each, order, negligible)
+
     for half, order, needed in ((100.01, 2, 1), (100.14, 2, 2), (100.14, 1, 6), (110.0, 2, 8)):
-        error = discretisation_error("mu_pa", estimates["mu_pa"], [half], [], order)
-        assert Refinement({"mu_pa": error}).suggested_substeps(estimates, order) == needed
+        assert suggested(half, order, 1e-4) == needed
     precise = {"mu_pa": replace(estimates["mu_pa"], statistical_std_error=1e-3)}
-    for half, needed in ((100.07, 1), (100.08, MOST_SUBSTEPS)):  # corrections of 0.093 and 0.107 %
-        error = discretisation_error("mu_pa", precise["mu_pa"], [half], [], 2)
-        assert Refinement({"mu_pa": error}).suggested_substeps(precise, 2) == needed
-    nothing = {"mu_pa": replace(estimates["mu_pa"], statistical_std_error=None)}
-    assert Refinement({"mu_pa": error}).suggested_substeps(nothing, order) == 1
+    # Corrections of 0.93, 1.07, 6.7 and 80 %.
+    for half, needed in ((100.7, 1), (100.8, 2), (105.0, 3), (160.0, MOST_SUBSTEPS)):
+        assert suggested(half, 2, 1e-2, precise) == needed
+    assert suggested(160.0, 2, 1e-2, {"mu_pa": Estimate(100.0)}) == 1
 
 
 def fails_at_finer_steps(how: BaseException | cs.Status) -> Method:

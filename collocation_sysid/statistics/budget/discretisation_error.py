@@ -50,7 +50,9 @@ LEAST_ORDER = 0.5
 LITTLE = 0.5
 # Change of an estimate over its value that needs no more steps, although many precise samples make it
 # larger than that: systematic effects of a percent are usual, and estimates are corrected for it.
-NEGLIGIBLE = 1e-3
+NEGLIGIBLE = 1e-2
+# The same where recordings are declared to be simulated.
+NEGLIGIBLE_IN_SIMULATIONS = 1e-3
 # Largest number of steps per sample that is chosen.
 MOST_SUBSTEPS = 8
 
@@ -144,7 +146,9 @@ class Refinement:
         # Moduli that move alike differ by rounding: the first is the parameter itself.
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
-    def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
+    def suggested_substeps(
+        self, estimates: Mapping[str, Estimate], order: float, negligible: float = NEGLIGIBLE
+    ) -> int:
         """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
         correction small if the present errors are those of one step per sample.
 
@@ -155,22 +159,19 @@ class Refinement:
 
         Notes
         -----
-        Small means at most `LITTLE` statistical standard errors, or `NEGLIGIBLE`. Without a
-        correction the number is 1.
+        Small means at most `LITTLE` statistical standard errors, or the negligible share of the
+        value. Without a correction the number is 1.
         """
-        many = self.largest_correction(estimates, self._errors_of_notable(estimates))[1]
-        return max(1, ceil(min((many / LITTLE) ** (1 / order), MOST_SUBSTEPS)))
-
-    def _errors_of_notable(self, estimates: Mapping[str, Estimate]) -> dict[str, float | None]:
-        changes = {
-            name: abs(estimates[name].value - error.extrapolated)
-            for name, error in self.errors.items()
-        }
-        return {
-            name: estimates[name].statistical_std_error
-            for name, change in changes.items()
-            if change > NEGLIGIBLE * abs(estimates[name].value)
-        }
+        many = max(
+            (
+                abs(estimates[name].value - error.extrapolated)
+                / max(LITTLE * spread, negligible * abs(estimates[name].value))
+                for name, error in self.errors.items()
+                if (spread := estimates[name].statistical_std_error)
+            ),
+            default=0.0,
+        )
+        return max(1, ceil(min(many ** (1 / order), MOST_SUBSTEPS)))
 
 
 @dataclass(frozen=True)
