@@ -69,6 +69,9 @@ SMALLEST_TRUST = 1e-10
 # The last step is accepted without another sweep if its error, estimated from the rate at which
 # steps become shorter, is below this share of the tolerance.
 SAFETY = 0.3
+# So is one within so many times the tolerance of standard errors: 1e-3 by default, and at most. Losses
+# below 1, of data without noise, are to be known to that share.
+SIGNIFICANCE = 1e5
 # Largest residual of the equations of motion after that step, in the scaling of the NLP.
 FEASIBLE_FORCE = 1e-10
 # Largest step of the logarithm of a parameter, and of nuisance parameters.
@@ -109,6 +112,9 @@ RUNG_DECREASE = 0.05
 # Standard deviation of a prior of the logarithm of each parameter about its guess on these shares: a
 # short part of a recording does not determine all parameters, and those would move to their bounds.
 RUNG_PRIOR = 2.3
+# Largest number of rows of a share over that of the next one: a longer one would cost a simulation
+# and sweeps, and prepare nothing.
+LONGEST_RUNG = 0.7
 
 
 @validated
@@ -119,6 +125,8 @@ class SearchOptions(MethodOptions):
     ----------
     tolerance : float
         The search ends when a step changes the logarithm of no parameter by more than this value.
+        It ends also when a step is predicted to be within 1e-3 standard errors, or within less with
+        a tolerance below the default.
     least_decrease : float
         The search ends also when the next step is predicted to decrease the loss by less than this
         fraction times the largest change of a parameter's logarithm, if that is below 1; 0 by
@@ -310,31 +318,33 @@ class ReducedSearch:
             return None
         try:
             rows = [transcription.grid_times for transcription in self.collocation.transcriptions]
-            horizon = self._horizon(rows, last=True)
+            horizon = self.horizon(rows, last=True)
             accuracy = self._accuracy_at_start(horizon)
             return self.minimise(horizon, is_last=True, accuracy=accuracy)
         except SimulationError:
             self.trajectories = self.point = None
             return None
 
-    @property
-    def ladder(self) -> Shares:
-        """Shares of the recordings that are solved one after another: only the last one of the
-        options for tables of moduli over frequency, of which a part determines few branches.
-        """
-        complete = all(map(_oscillates, self.collocation.transcriptions))
-        return self.options.ladder[-1:] if complete else self.options.ladder
-
     @cached_property
-    def _motion_shares(self) -> list[Array]:
-        return motion_shares(self.collocation)
+    def rungs(self) -> list[list[int]]:
+        """First rows of each experiment that are solved one after another: those with the shares of
+        the motion that the options state, if they differ enough, and at last all. Tables of moduli
+        over frequency, of which a part determines few branches, are solved at once.
+        """
+        *shares, complete = self.options.ladder
+        if all(map(_oscillates, self.collocation.transcriptions)):
+            shares = []
+        motions = motion_shares(self.collocation)
+        every = [rows_of_share(motion, complete) for motion in motions]
+        rungs: list[list[int]] = []
+        for share in shares:
+            rows = [rows_of_share(motion, share) for motion in motions]
+            shortest = sum(rungs[-1]) / LONGEST_RUNG if rungs else 0.0
+            if shortest <= sum(rows) <= LONGEST_RUNG * sum(every):
+                rungs.append(rows)
+        return [*rungs, every]
 
-    def horizon_of_share(self, share: float) -> Horizon:
-        """Return the problem on a share of the motion, one of `ladder`."""
-        rows = [rows_of_share(motion, share) for motion in self._motion_shares]
-        return self._horizon(rows, last=share == self.options.ladder[-1])
-
-    def _horizon(self, rows: list[int], last: bool) -> Horizon:
+    def horizon(self, rows: list[int], last: bool) -> Horizon:
         """Return the problem on the given numbers of first rows of each experiment; unless it is
         the last horizon, with the prior of the options.
         """
@@ -387,7 +397,7 @@ class ReducedSearch:
             furthest = sum(rows)
             self.trajectories = reached
             self._associate_initially(horizon, is_first=previous is None)
-            self.minimise(self._horizon(rows, last=False), is_last=False)
+            self.minimise(self.horizon(rows, last=False), is_last=False)
 
     # Steps on one horizon ---------------------------------------------------------------------
 
@@ -420,6 +430,7 @@ class ReducedSearch:
         self.ended_by_association = False
         self.feasible_length = np.inf
         tolerance = self.options.tolerance
+        least_decrease = min(INSIGNIFICANT, (SIGNIFICANCE * tolerance) ** 2)
         self.trust = min(self.options.trust, self.largest_trust)
         point = self._accept(
             horizon,
@@ -441,9 +452,13 @@ class ReducedSearch:
             is_short = is_full_step and length <= tolerance
             if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
                 return Status.CONVERGED
+            decrease = point.loss - point.predicted_loss(step)
+            is_insignificant = is_full_step and decrease <= least_decrease * min(1.0, point.loss)
             # The first step tells nothing of the rate of convergence.
             rate = min(1.0, length / previous) if 0.0 < previous < np.inf else 1.0
-            if is_last and is_full_step and length * rate <= SAFETY * tolerance:
+            if is_last and (
+                is_insignificant or (is_full_step and length * rate <= SAFETY * tolerance)
+            ):
                 final_positions = horizon.extrapolate(point, step)
                 reached = horizon.feasibilities(point.p + step, final_positions)
                 if self._are_feasible(reached):

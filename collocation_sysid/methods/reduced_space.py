@@ -123,14 +123,15 @@ class ReducedSpace(SearchOptions):
         try:
             with time_limit(self.max_time_s):
                 found = search.solve_from_start()
-                for share in () if found else search.ladder:
-                    horizon = search.horizon_of_share(share)
+                for rows in () if found else search.rungs:
+                    is_last = rows is search.rungs[-1]
+                    horizon = search.horizon(rows, is_last)
                     search.extend_to(horizon)
-                    found = search.minimise(horizon, share == search.ladder[-1])
+                    found = search.minimise(horizon, is_last)
                     if found is Status.ITERATION_LIMIT:
                         break
                     assert search.point is not None  # a solve accepts one
-                    if share != search.ladder[-1] and search.point.loss > self.largest_loss:
+                    if not is_last and search.point.loss > self.largest_loss:
                         found = Status.STALLED
                         break
             status = found or Status.CONVERGED

@@ -34,6 +34,7 @@ from script_arguments import make_parser
 from studies import markdown
 
 from collocation_sysid.common.array_types import Array
+from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.least_squares import SquareRootInformation
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.profile_likelihood import THRESHOLD, profile_of_solution
@@ -70,7 +71,7 @@ def slopes(regression: Regression) -> Any:
 def solved(regression: Regression, start: Array) -> Any:
     """Solve the identification and return its solution, linearised fit and uncertainty."""
     problem = as_problem(regression, start, NOISE_SHARE * float(np.ptp(regression.y)))
-    solution = problem.solver()(problem.collocation())
+    solution = ReducedSpace(tolerance=1e-12)(problem.collocation())
     fit = linearise_fit(solution.collocation, solution.z)
     parameters = solution.collocation.parameters
     return solution, fit, uncertainty_from_fit(fit, parameters, solution.q, ESTIMATED)

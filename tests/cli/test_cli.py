@@ -38,6 +38,7 @@ from collocation_sysid import cli, pipeline
 from collocation_sysid.cli import COMMAND_GROUPS, command_options, command_sources, common
 from collocation_sysid.common.display import PlainConsole
 from collocation_sysid.judge import engine
+from collocation_sysid.methods import reduced_search
 from collocation_sysid.methods.solution import Iteration, Status
 from collocation_sysid.methods.starts import stiffness_scan
 from collocation_sysid.methods.starts.start import Start
@@ -405,6 +406,7 @@ def test_an_interrupted_first_rung_keeps_its_iterate(tiny, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
+    monkeypatch.setattr(reduced_search, "LONGEST_RUNG", 1.0)
     assert run_command("solve", "problem.toml", "--out", "run").code == 130
     result = result_in(tiny / "run")
     assert result["status"] == "interrupted"

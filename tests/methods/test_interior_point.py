@@ -197,8 +197,8 @@ def test_ipopt_starts_near_the_optimum_with_a_note():
     seen: list[Iteration] = []
     solution = PRECISE(cube(), watch=seen.append)
     assert re.fullmatch(
-        r"initial point: \d+ sweeps of reduced space, which determined the parameters to 1e-08 %; "
-        "from there the complete program was given to IPOPT",
+        r"initial point: \d+ sweeps of reduced space \(converged\); from there the complete program "
+        "was given to IPOPT",
         note_of(solution),
     )
     assert solution.iterations <= 4
@@ -295,7 +295,6 @@ def test_a_refinement_that_fails_keeps_the_coarse_point(monkeypatch: pytest.Monk
     """Without sweeps for the refinement, IPOPT begins at the coarse solution."""
     monkeypatch.setattr(initial_point, "REFINING_SWEEPS", 0)
     solution = PRECISE(cube())
-    assert "which determined the parameters to 0.1 %" in note_of(solution)
     assert 1 <= solution.iterations <= 4
     np.testing.assert_allclose(solution.theta, as_theta(TRUTH), rtol=1e-5)
 

@@ -51,6 +51,9 @@ def with_parameter(name: str, **changes) -> Parameters:
     )
 
 
+PRECISE = ReducedSpace(tolerance=1e-12)
+
+
 @cache
 def cube() -> Collocation:
     return Collocation([measured(hung_cube())], GUESS)
@@ -77,7 +80,7 @@ def test_the_true_parameters_are_recovered(experiment: str, scheme: str):
 @pytest.mark.parametrize("make", [hung_cube, released_cube, bar_in_two_hands])
 def test_the_answer_with_noise_is_that_of_interior_point(make):
     collocation = Collocation([noisy(make(15))], GUESS)
-    solution = ReducedSpace()(collocation)
+    solution = PRECISE(collocation)
     reference = InteriorPoint(tolerance=1e-12)(collocation)
     assert solution.status.converged
     assert reference.status.converged
@@ -108,7 +111,7 @@ def test_every_layout_is_fitted(options: dict):
 def test_a_bound_that_excludes_the_truth_is_active_at_the_answer(bound: dict):
     parameters = with_parameter("mu_pa", guess=next(iter(bound.values())), **bound)
     collocation = Collocation([measured(hung_cube())], parameters)
-    solution = ReducedSpace()(collocation)
+    solution = PRECISE(collocation)
     reference = InteriorPoint(tolerance=1e-11)(collocation)
     assert solution.status is Status.CONVERGED
     assert solution.parameters["mu_pa"] == pytest.approx(next(iter(bound.values())), rel=1e-12)
@@ -168,13 +171,13 @@ def test_reduced_space_starts_from_given_variables():
 def test_a_start_near_the_optimum_is_solved_to_the_tolerance(distance: float):
     """The first step tells nothing of the rate of convergence."""
     collocation = Collocation([noisy(hung_cube(), noise_m=2e-3)], GUESS)
-    expected = ReducedSpace(tolerance=1e-12)(collocation)
+    expected = PRECISE(collocation)
     p, _ = expected.collocation.unpack(expected.z)
     near = p + distance * np.array([1, -1, 1, 1])
     positions, failure = simulate_trajectories(collocation, near)
     assert failure is None
     start = collocation.pack(near, positions)
-    found = ReducedSpace()(collocation, start=start)
+    found = PRECISE(collocation, start=start)
     assert found.status is Status.CONVERGED
     np.testing.assert_allclose(found.q, expected.q, rtol=0, atol=1e-8)
 

@@ -93,7 +93,7 @@ def test_the_true_parameters_are_recovered(experiment: str):
 def test_the_answer_with_noise_is_that_of_the_reduced_space(make, gradient):
     collocation = with_noise(make())
     solution = Shooting(gradient)(collocation)
-    reference = ReducedSpace()(collocation)
+    reference = ReducedSpace(tolerance=1e-12)(collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-6)
     np.testing.assert_allclose(solution.positions_m[0], reference.positions_m[0], atol=1e-8)
@@ -104,7 +104,10 @@ def test_the_answer_with_noise_is_that_of_the_reduced_space(make, gradient):
 @pytest.mark.parametrize("gradient", GRADIENTS)
 def test_hubers_loss_and_nuisance_parameters_have_the_same_optimum(gradient):
     collocation = with_noise(bar_let_go(), 2e-3, huber=2.0)
-    solution, reference = (Shooting(gradient)(collocation), ReducedSpace()(collocation))
+    solution, reference = (
+        Shooting(gradient)(collocation),
+        ReducedSpace(tolerance=1e-12)(collocation),
+    )
     np.testing.assert_allclose(solution.q, reference.q, atol=1e-5)
 
 

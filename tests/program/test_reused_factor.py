@@ -215,10 +215,11 @@ def test_the_answer_of_a_large_body_is_the_same(request):
     problem = Problem(
         [noisy(hung_cube(16, divisions=(4, 4, 4)))], {name: Unknown() for name in TRUTH}
     )
-    options = {"coarse_start_nodes": 60, "coarse_start_tolerance": 1e-8}
-    expected = solve(problem, ReducedSpace(coarse_start=False))
+    options = {"coarse_start_nodes": 60, "coarse_start_tolerance": 1e-10}
+    direct = ReducedSpace(coarse_start=False, tolerance=1e-10)
+    expected = solve(problem, direct)
     request.getfixturevalue("wide")
-    for method in (ReducedSpace(coarse_start=False), ReducedSpace(**options)):
+    for method in (direct, ReducedSpace(tolerance=1e-10, **options)):
         solution = solve(problem, method)
         assert solution.status.converged
         assert solution.q == pytest.approx(expected.q, abs=1e-7)

@@ -75,8 +75,8 @@ def test_the_answer_is_that_of_the_direct_start(has_nuisance: bool):
     coarse = solve(problem, COARSE)
     assert coarse.status is direct.status is Status.CONVERGED
     for name, value in direct.parameters.items():
-        assert coarse.parameters[name] == pytest.approx(value, rel=1e-6), name
-    assert coarse.z == pytest.approx(direct.z, abs=1e-6)
+        assert coarse.parameters[name] == pytest.approx(value, rel=1e-5), name
+    assert coarse.z == pytest.approx(direct.z, abs=1e-5)
     assert coarse.iterations < direct.iterations
     assert f"of {6**3} nodes first" in coarse_note(coarse)
     assert not coarse_note(direct)
@@ -91,11 +91,12 @@ def test_the_answer_is_that_of_the_direct_start(has_nuisance: bool):
 
 def test_the_search_on_the_given_mesh_has_a_tolerance_of_its_own():
     problem = problem_of(noisy(hung_cube(10, divisions=DIVISIONS)))
-    direct = solve(problem, DIRECT)
+    direct = solve(problem, replace(DIRECT, tolerance=1e-10))
     errors = []
     sweeps = []
     for tolerance in (1e-2, 1e-10):
-        solution = solve(problem, replace(COARSE, coarse_start_tolerance=tolerance))
+        method = replace(COARSE, tolerance=1e-10, coarse_start_tolerance=tolerance)
+        solution = solve(problem, method)
         assert solution.status is Status.CONVERGED
         errors.append(np.abs(solution.q - direct.q).max())
         sweeps.append(solution.iterations)

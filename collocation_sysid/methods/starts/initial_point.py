@@ -31,7 +31,7 @@ LARGEST_CORRECTION = 1e-3
 MAX_SWEEPS = 100
 # Longest last step of the refinement, below the tolerance of reduced space: times the curvature of
 # the loss it is the error of IPOPT's conditions.
-REFINED_CORRECTION = 1e-10
+REFINED_CORRECTION = 1e-12
 # Sweeps of the refinement: less work than the factorisations of one iteration of IPOPT.
 REFINING_SWEEPS = 20
 # How a coarse solve may end without a point that is worth starting from.
@@ -77,7 +77,6 @@ def compute_initial_point(
     )
     is_usable = _reaches_end(coarse)
     is_close = is_usable and coarse.status is Status.CONVERGED
-    precision = LARGEST_CORRECTION
     if is_close:
         refined = _search(
             recorder,
@@ -86,8 +85,6 @@ def compute_initial_point(
             method=ReducedSpace(tolerance=REFINED_CORRECTION, max_iterations=REFINING_SWEEPS),
             max_time_s=max_time_s,
         )
-        if refined.status is Status.CONVERGED:
-            precision = REFINED_CORRECTION
         coarse = _refined_solution(coarse, refined)
     count = coarse.iterations
     sweeps = (
@@ -96,12 +93,7 @@ def compute_initial_point(
         else ("the given initial values")
     )
     continuation = "from there the complete program was given to IPOPT"
-    if is_close:
-        note = (
-            f"initial point: {sweeps}, which determined the parameters to "
-            f"{100 * precision:g} %; {continuation}"
-        )
-    elif is_usable:
+    if is_usable:
         note = f"initial point: {sweeps} ({coarse.status.value}); {continuation}"
     else:
         note = f"initial point: the method reduced-space found none ({coarse.message.rstrip('.')})"
