@@ -12,6 +12,7 @@ import pytest
 from kit.logs import json_mcap
 
 import collocation_sysid as cs
+from collocation_sysid.errors import InputError
 from collocation_sysid.features.image_tracks.files import read_tracks
 from collocation_sysid.recording.sources.calibration_files import read_calibration
 from collocation_sysid.recording.sources.topics import list_topics
@@ -400,3 +401,18 @@ def test_calibrations_are_read_from_topics(tmp_path: Path, capital: bool) -> Non
     assert (found.size_px, found.model) == ((1280, 720), "pinhole")
     with pytest.raises(cs.InputError, match=r"/x has no camera model"):
         read_calibration(f"{log}#/x")
+
+
+@pytest.mark.parametrize(
+    ("header", "missing"),
+    [
+        ("t_s,tip_u,tip_v,tip_likelihood,hook_u,hook_v,hook_likelyhood", "hook_likelihood"),
+        ("t_s,tip_u,tip_v,tip_likelihood,hock_u,hook_v,hook_likelihood", "hock_v"),
+        ("t_s,tip_u,tip_v,tip_likelihood,u,hook_v,hook_likelihood", "hook_u"),
+    ],
+)
+def test_a_misspelt_column_of_a_point_is_not_ignored(header, missing, tmp_path: Path) -> None:
+    file = tmp_path / "front.csv"
+    file.write_text(f"{header}\n0.0,1,2,0.9,3,4,0.1\n0.1,1,2,0.9,3,4,0.1\n")
+    with pytest.raises(InputError, match=f"there is no column '{missing}'; expected one"):
+        read_tracks(file)

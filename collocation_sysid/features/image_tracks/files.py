@@ -116,7 +116,8 @@ def read_tracks(path: str | Path) -> TrackFile:
 def _read_table(grid: Table) -> TrackFile:
     grid = replace(grid, columns=_usual_columns(grid.columns))
     t_s, frames = _times_of(grid)
-    wide = [name[:-2] for name in grid.columns if name.endswith("_u")]
+    ends = ("_u", "_v")
+    wide = [*dict.fromkeys(name[:-2] for name in grid.columns if name.endswith(ends))]
     if wide:
         return _wide_table(grid, wide, t_s, frames)
     point = next((name for name in POINT_COLUMNS if name in grid.columns), None)
@@ -162,7 +163,7 @@ def _numbers(grid: Table, names: Sequence[str]) -> Array:
         if grid.columns.count(name) != 1:
             count = grid.columns.count(name)
             found = f"{count} columns are called" if count else "there is no column"
-            raise grid.error_at(f"{found} {name!r}; expected one, with the pixels of this point")
+            raise grid.error_at(f"{found} {name!r}; expected one, as of the other points")
     columns = [grid.columns.index(name) for name in names]
     return np.asarray(numeric_cells(grid, columns, blank_allowed=True))
 
@@ -170,12 +171,8 @@ def _numbers(grid: Table, names: Sequence[str]) -> Array:
 def _wide_table(grid: Table, names: list[str], t_s: Array | None, frames: Array) -> TrackFile:
     pixels = _numbers(grid, [f"{name}_{axis}" for name in names for axis in "uv"])
     scores = [f"{name}_likelihood" for name in names]
-    likelihood = None
-    if any(name in grid.columns for name in scores):
-        likelihood = np.ones((len(pixels), len(names)))
-        for k, name in enumerate(scores):
-            if name in grid.columns:
-                likelihood[:, k] = _numbers(grid, [name])[:, 0]
+    has_score = any(name in grid.columns for name in scores)
+    likelihood = _numbers(grid, scores) if has_score else None
     pixels = pixels.reshape(len(pixels), -1, 2)
     if "track" not in grid.columns:
         return TrackFile(tuple(names), pixels, likelihood, t_s, frames)

@@ -314,7 +314,7 @@ def sensor_picture(samples: Array, names: Sequence[str], units: Sequence[str] = 
     for each in grid.flat[len(shown) :]:
         each.set_visible(False)
     title_style = {"title": title, "title_fontsize": TEXT_PT, "alignment": "left"}
-    add_figure_legend(figure, 3, **title_style)
+    add_figure_legend(figure, 3, markerscale=2, **title_style)
     return figure
 
 

@@ -73,7 +73,7 @@ def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None
     ]
     count = len(curves)
     height_mm = 48 + 28 * count
-    figure = framed_figure(COLUMN_MM, height_mm, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=4)
+    figure = framed_figure(COLUMN_MM, height_mm, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=5)
     heights = (*[1.0] * count, 0.2, 1.4)  # a gap for the legend
     grid = figure.add_gridspec(count + 2, 1, height_ratios=heights, hspace=0.12)
     panels = [figure.add_subplot(grid[row]) for row in (*range(count), count + 1)]
