@@ -31,7 +31,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import read_only_floats
@@ -176,8 +176,47 @@ class RodMesh(TetMesh):
                 f"found the arc length {s_m:g} m; expected 0 to {self.s_m[-1]:g} m, the length of the "
                 "rod"
             )
+        return self.places_m(np.array([s_m]))[0]
+
+    def places_m(self, s_m: Array) -> Array:
+        """Return the points (M, 3) [m] of the centreline at arc lengths (M,), see `place_m`."""
         centres = self.centres_of_sections_m
-        return np.array([np.interp(s_m, self.s_m, centres[:, axis]) for axis in range(3)])
+        return np.stack([np.interp(s_m, self.s_m, axis) for axis in centres.T], axis=1)
+
+    def nearest_s_m(self, points_m: Array) -> Array:
+        """Return the arc length (M,) [m] of the point of the centreline nearest to each of (M, 3)."""
+        centres = self.centres_of_sections_m
+        elements, shares = nearest_on_centreline(centres, points_m)
+        return self.s_m[elements] + shares * np.diff(self.s_m)[elements]
+
+    def elements_at(self, s_m: Array) -> Index:
+        """Return the element (M,) at each arc length (M,) [m]."""
+        return np.searchsorted(self.s_m[1:-1], s_m, side="right")
+
+    def smooth_interpolation(
+        self, s_m: Array, elements: Index
+    ) -> tuple[Index, Array, Array, Array]:
+        """Return the sections (M, 4) near elements (M,), and the weights (M, 4) of their positions
+        at arc lengths (M,) [m] with their first and second derivatives.
+
+        Weights are cubic, with the slopes of parabolas through three sections; beyond the element
+        they are linear.
+        """
+        size = min(4, len(self.s_m))
+        first = np.clip(elements - 1, 0, len(self.s_m) - size)
+        sections = first[:, None] + np.arange(size)
+        inside = np.clip(s_m, self.s_m[elements], self.s_m[elements + 1])
+        value, slope, curvature = (
+            np.take_along_axis(self._weights(inside, order), sections, axis=1) for order in range(3)
+        )
+        beyond = (s_m - inside)[:, None]
+        return sections, value + beyond * slope, slope, np.where(beyond == 0, curvature, 0.0)
+
+    @cached_property
+    def _weights(self) -> CubicHermiteSpline:
+        of_sections = np.eye(len(self.s_m))
+        slopes = np.gradient(of_sections, self.s_m, axis=0, edge_order=2)
+        return CubicHermiteSpline(self.s_m, of_sections, slopes)
 
     @property
     def centres_of_sections_m(self) -> Array:
@@ -377,6 +416,17 @@ def centres_of_sections(nodes_m: Array) -> Array:
     """Return the centre (…, N, 3) of each section, from positions of the nodes (…, 3 N, 3)."""
     centres: Array = nodes_m.reshape(*nodes_m.shape[:-2], -1, 3, 3).mean(axis=-2)
     return centres
+
+
+def nearest_on_centreline(centres_m: Array, points_m: Array) -> tuple[Index, Array]:
+    """Return the elements (M,) that are nearest to points (M, 3), and the share (M,) of each at the
+    nearest point, from the centres (N, 3) of sections.
+    """
+    steps = np.diff(centres_m, axis=0)
+    away = points_m[:, None] - centres_m[:-1]
+    shares = np.clip(np.sum(away * steps, axis=2) / np.sum(steps**2, axis=1), 0.0, 1.0)
+    nearest = np.linalg.norm(away - shares[..., None] * steps, axis=2).argmin(axis=1)
+    return nearest, shares[np.arange(len(points_m)), nearest]
 
 
 def frames_of_sections(nodes_m: Array) -> tuple[Array, Array]:

@@ -278,7 +278,8 @@ class PointPositions:
     @cached_property
     def _dependencies(self) -> tuple[Index, Index]:
         """Index of point and corner (w,) of each pair on which a position can depend."""
-        reads = self.association.weights != 0
+        _, shape = self.association.shape_functions(self.association.centre_coordinates)
+        reads = shape.weights != 0
         reads[self.association.estimated] = True
         marker, corner = np.nonzero(reads)
         return marker, corner

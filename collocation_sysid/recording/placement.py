@@ -17,7 +17,7 @@ from ..common.array_types import Array, Index
 from ..common.checked_arrays import point_text, read_only_floats, read_only_nodes
 from ..common.validated_classes import validated
 from ..errors import InputError
-from ..fem.rods import centres_of_sections
+from ..fem.rods import centres_of_sections, nearest_on_centreline
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -269,12 +269,9 @@ class LocatedBody:
 
     def _nearest_point_of_centreline(self, point: Array) -> tuple[Array, Array]:
         centres = centres_of_sections(self.nodes_m)
-        steps = np.diff(centres, axis=0)
-        squares = np.sum(steps**2, axis=1)
-        shares = np.sum((point - centres[:-1]) * steps, axis=1) / squares
-        nearest = centres[:-1] + np.clip(shares, 0.0, 1.0)[:, None] * steps
-        k = int(np.linalg.norm(nearest - point, axis=1).argmin())
-        return nearest[k], (steps[k] / np.sqrt(squares[k]))[:, None]
+        (k,), (share,) = nearest_on_centreline(centres, point[None])
+        step = centres[k + 1] - centres[k]
+        return centres[k] + share * step, (step / np.linalg.norm(step))[:, None]
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
         """Return barycentric coordinates (k, 4) of points (k, 3), or of one point (3,), in the

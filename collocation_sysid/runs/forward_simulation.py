@@ -415,8 +415,9 @@ def nuisance_of_fitted_recordings(transcription: Transcription, solution: Soluti
     phi = np.zeros(nuisance.size)
     for k, entry in enumerate(nuisance.entries):
         phi[k] = np.mean(known.get(entry.label, [0.0])) / entry.sigma
-    start_m = transcription.marker_places_m(np.zeros(nuisance.size))
-    for number in transcription.association.markers.estimated.tolist():
+    association = transcription.association.markers
+    means_m = transcription.marker_places_m(np.zeros(nuisance.size))
+    for number in association.estimated.tolist():
         name = transcription.experiment.markers.names[number]
         places_m = [
             part.transcription.marker_places_m(part.phi)[
@@ -426,12 +427,9 @@ def nuisance_of_fitted_recordings(transcription: Transcription, solution: Soluti
             if name in part.transcription.experiment.markers.names
         ]
         if places_m:
-            directions_m = (
-                transcription.association.markers.sigma_m[number]
-                * transcription.association.markers.axes[number]
-            )
-            way_m = np.mean(places_m, axis=0) - start_m[number]
-            phi[places[number]] = np.linalg.pinv(directions_m) @ way_m
+            means_m[number] = np.mean(places_m, axis=0)
+    estimated = association.estimated
+    phi[places[estimated]] = association.coordinates(means_m)[estimated]
     return phi
 
 

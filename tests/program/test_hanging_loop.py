@@ -13,6 +13,7 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.selection import Along
 from collocation_sysid.judge.modes import find_misspecifications_by_modes
+from collocation_sysid.program.markers.association import MarkerAssociation
 
 BENDING_N_M2, MASS_PER_LENGTH_KG_M, LENGTH_M, BARS = 1e-3, 0.025, 1.2, 240
 GAP_M = np.array([-0.12, 0.0])
@@ -110,6 +111,28 @@ def test_a_straight_wire_finds_its_equilibrium_from_a_drawn_loop(stretch):
     shape_m = cs.simulate(experiment, OTHERS | {"bending_n_m2": BENDING_N_M2}).markers_m[0]
     away_m = np.abs(shape_m - loop_m[1:-1]).max()
     assert away_m < 2e-3 if stretch == 1 else np.abs(shape_m[:, 1]).max() < 1e-9
+
+
+def test_places_of_drawn_points_move_smoothly_from_one_element_to_the_next():
+    loop_m = in_space(chain_loop((-0.3, -6.0), np.zeros(BARS + 1)))[::6]
+    (experiment,) = drawn_problem(loop_m, 0, 1e-3, None).experiments
+    association = MarkerAssociation.from_experiment(experiment)
+    mesh, nodes_m = experiment.body.mesh, experiment.body.nodes_m
+    assert isinstance(mesh, cs.RodMesh)
+    stated_m = mesh.nearest_s_m(association.prior_places_m)
+    section = np.searchsorted(mesh.s_m, stated_m)
+    coordinates = (mesh.s_m[section] - stated_m)[:, None] / 0.01
+    points = []
+    for side in (-1e-9, 1e-9):
+        moved, same = association.follow_estimates(coordinates + side)
+        np.testing.assert_array_equal(moved.cells, section - (side < 0))
+        np.testing.assert_allclose(same, coordinates + side, atol=1e-12)
+        nodes, shape = moved.shape_functions(same)
+        points.append([np.einsum("ma...,mai->mi...", w, nodes_m[nodes]) for w in shape[:2]])
+    np.testing.assert_allclose(points[0][0], mesh.centres_of_sections_m[section], atol=1e-10)
+    np.testing.assert_allclose(points[1][0], points[0][0], atol=1e-10)
+    np.testing.assert_allclose(points[1][1], points[0][1], atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(points[0][1], axis=1), 0.01, rtol=0.01)
 
 
 def test_stiffness_factors_scale_the_energy_of_a_rod():

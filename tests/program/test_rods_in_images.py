@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
@@ -91,10 +92,12 @@ def test_points_drawn_along_a_cable_in_an_image_give_its_bending_stiffness():
     assert run.trust.verdict == "good"
     assert low < 1e-3 < high
     assert high / low < 1.3
-    # What is left is the distance from the drawn point to the centreline in the image.
+    # What is left is the distance from the drawn point to the smooth centreline in the image.
     (part,) = run.solution.parts
     (residual,) = part.transcription.residuals_of(ImageTrackResidual)
-    centres_m = centres_of_sections(part.x.reshape(-1, 3))
+    s_m = np.linspace(0.0, LENGTH_M, 41)
+    curve = CubicSpline(s_m, centres_of_sections(part.x.reshape(-1, 3)))
+    centres_m = curve(np.linspace(0.0, LENGTH_M, 1001))
     pose = residual.estimated_pose(part.phi)
     own = (centres_m - pose[:3, 3]) @ pose[:3, :3]
     line = (own @ MATRIX.T)[:, :2] / own[:, 2:]

@@ -248,6 +248,24 @@ def test_a_rod_with_natural_curvature_hangs_as_its_equation_says(angle_rad):
     np.testing.assert_allclose(tip(x)[[0, 2]], expected[-1], atol=1e-3)
 
 
+def test_the_centreline_between_sections_is_a_smooth_curve():
+    """On a circle, whose sections are nearer to each other in its first part."""
+    angle = np.linspace(0.0, 2.0, 101)
+    circle_m = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    errors = []
+    for count in (8, 16, 32):
+        mesh = rod_mesh(
+            circle_m, THIN, count + 1, stations_m=(np.arange(count // 4) * 0.24 / count).tolist()
+        )
+        s_m = np.linspace(0.0, mesh.s_m[-1], 201)
+        sections, weights, *_ = mesh.smooth_interpolation(s_m, mesh.elements_at(s_m))
+        points = np.einsum("ma,mai->mi", weights, mesh.centres_of_sections_m[sections])
+        exact = 0.1 * np.stack([np.cos(s_m / 0.1), np.sin(s_m / 0.1), 0 * s_m], axis=1)
+        errors.append(np.linalg.norm(points - exact, axis=1).max())
+    assert errors[-1] < 1e-5
+    assert -np.diff(np.log2(errors)).max() > 2.5
+
+
 # Stability -------------------------------------------------------------------------------------
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from ...common.array_types import Array, Index
 from ...fem.body import Body
+from ...fem.rods import RodMesh
 from ...recording.experiment import Experiment
 from ...recording.placement import LocatedBody, Placement
 
@@ -52,7 +53,7 @@ class MarkerAssociation:
     # (M, npe): nodes and shape functions of exact places.
     nodes: Index
     weights: Array
-    cells: Index  # (M,): elements of estimated places
+    cells: Index  # (M,): elements of estimated places, of a rod between which sections
     centre_places_m: Array  # (M, 3): places at the centre of the association [m]
     axes: Array  # (M, 3, k): orthonormal directions in which places may move
     # (M, 2, 3): point and direction of the edge across which each place last left the surface; NaN
@@ -130,17 +131,28 @@ class MarkerAssociation:
     @cached_property
     def centre_coordinates(self) -> Array:
         """Coordinates φ (M, k) of the places at the centre of the association."""
-        return self._coordinates(self.centre_places_m)
+        return self.coordinates(self.centre_places_m)
 
-    def _coordinates(self, points_m: Array) -> Array:
+    def coordinates(self, points_m: Array) -> Array:
         """Return coordinates (M, k) in prior standard deviations; zero for exact places."""
         sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
+        if isinstance(mesh := self.body.mesh, RodMesh):
+            away_m = mesh.nearest_s_m(points_m) - mesh.nearest_s_m(self.prior_places_m)
+            return away_m[:, None] / sigma
         return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
+
+    def _s_m(self, mesh: RodMesh, phi: Array) -> Array:
+        """Return the arc lengths (M,) of places on a rod [m] for coordinates `phi` (M, 1)."""
+        return mesh.nearest_s_m(self.prior_places_m) + self.sigma_m * phi[:, 0]
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
-        standard deviations along `axes`, linear about the centre; exact places do not move.
+        standard deviations along `axes`, linear about the centre, of a rod along the centreline;
+        exact places do not move.
         """
+        if isinstance(mesh := self.body.mesh, RodMesh):
+            along = mesh.places_m(self._s_m(mesh, phi))
+            return np.where(self.sigma_m[:, None] > 0, along, self.centre_places_m)
         moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
         return self.centre_places_m + self.sigma_m[:, None] * moved
 
@@ -156,6 +168,8 @@ class MarkerAssociation:
         phi : (M, k) array
             Coordinates of the places, in prior standard deviations along `axes`.
         """
+        if isinstance(mesh := self.body.mesh, RodMesh) and len(self.estimated):
+            return self._between_sections(mesh, phi)
         element = self.body.place_element
         k = self.axes.shape[2]
         nodes = self.nodes.copy()
@@ -176,6 +190,23 @@ class MarkerAssociation:
                 "mail,mik,mln->makn", _second_derivatives(element, local), gradients, gradients
             )
         return nodes, ShapeFunctions(weights, slopes, hessians=curvatures)
+
+    def _between_sections(self, mesh: RodMesh, phi: Array) -> tuple[Index, ShapeFunctions]:
+        """Return `shape_functions` with estimated places on a rod, of the nodes of four sections."""
+        here = self.estimated
+        s_m = self._s_m(mesh, phi)[here]
+        sections, *weights = mesh.smooth_interpolation(s_m, self.cells[here])
+        node_count = 3 * sections.shape[1]
+        beyond = ((0, 0), (0, node_count - self.nodes.shape[1]))
+        nodes = np.pad(self.nodes, beyond)
+        nodes[here] = (3 * sections[..., None] + np.arange(3)).reshape(len(here), -1)
+        by_order = np.zeros((3, *nodes.shape))
+        by_order[0] = np.pad(self.weights, beyond)
+        by_order[:, here] = np.repeat(weights, 3, axis=2) / 3
+        by_order *= self.sigma_m[:, None] ** np.arange(3)[:, None, None]
+        return nodes, ShapeFunctions(
+            by_order[0], by_order[1, ..., None], by_order[2, ..., None, None]
+        )
 
     @cached_property
     def _shape(self) -> LocatedBody:
@@ -198,7 +229,7 @@ class MarkerAssociation:
                 points[m], axes[m] = self._shape.nearest_surface_point(points[m])
             else:
                 axes[m] = np.eye(3)
-            cells[m], _ = self._shape.nearest_cell(points[m])
+            cells[m] = self._cell_at(points[m])
         return replace(self, centre_places_m=points, cells=cells, axes=axes)
 
     def follow_estimates(self, phi: Array) -> tuple[MarkerAssociation, Array]:
@@ -263,13 +294,20 @@ class MarkerAssociation:
         """Whether another element contains a point better, by more than `BETTER`; false for NaN."""
         if not np.isfinite(point).all():
             return False
+        if self.body.is_slender:
+            return self._cell_at(point) != cell
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
             return False  # no other element contains it better
-        best, _ = self._shape.nearest_cell(point)
+        best = self._cell_at(point)
         smallest = self._shape.barycentric(np.stack([point, point]), np.array([cell, best])).min(
             axis=1
         )
         return bool(smallest[1] > smallest[0] + BETTER)
+
+    def _cell_at(self, point: Array) -> int:
+        if isinstance(mesh := self.body.mesh, RodMesh):
+            return int(mesh.elements_at(mesh.nearest_s_m(point[None]))[0])
+        return self._shape.nearest_cell(point)[0]
 
     def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:
         """Return the places (M, 3) on the undeformed body of points measured in another
