@@ -85,6 +85,9 @@ STEP_LIMIT = np.log(2.0)
 # soft bar with unknown places gains a third of the remaining distance per iteration near the
 # optimum, and hardly moves far from it.
 ROW_PIVOT = 1e-11
+# That of slender bodies, whose rows of strains are steeper: with 1e-11 the growth of the factor
+# leaves the inertia wrong in nearly every iteration.
+SLENDER_ROW_PIVOT = 1e-8
 # Largest product of that constant with the largest curvature of the objective.
 ROW_SLOWNESS = 1e-9
 # Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
@@ -311,7 +314,9 @@ class InteriorPoint(MethodOptions):
             if lifted_count(complete_program(program), "pressure")
             else "yes",
             "ipopt.jacobian_regularization_exponent": 0.0,
-            "ipopt.jacobian_regularization_value": min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
+            "ipopt.jacobian_regularization_value": SLENDER_ROW_PIVOT
+            if is_slender
+            else min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
         }
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 
@@ -326,9 +331,9 @@ def _largest_curvature(collocation: Collocation) -> float:
     return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
 
 
-# Number that is added to the diagonal entries of the Hessian that belong to positions, most of which
-# would otherwise be zero. It changes the steps slightly, but not the solution, and avoids
-# factorisations that fail because of rounding (wrong inertia).
+# Number that is added to the diagonal entries of the Hessian that belong to positions, and to
+# stresses of rods, most of which would otherwise be zero. It changes the steps slightly, but not the
+# solution, and avoids factorisations that fail because of rounding (wrong inertia).
 PROXIMAL = 1e-5
 
 

@@ -322,8 +322,10 @@ class ComplementarityForce(Pointwise):
     pressure_unit_m: float
 
     @abstractmethod
-    def scaled_pressures(self, xi: Array) -> Array:
-        """Return b (1, T, i) [m] of all i points at positions ξ (T, 3n) [m]."""
+    def scaled_pressures(self, xi: Array, nu: Array | None = None) -> Array:
+        """Return b (1, T, i) [m] of all i points at positions ξ (T, 3n) [m] and velocities ν, which
+        are zero for None.
+        """
 
 
 @dataclass(frozen=True, eq=False)

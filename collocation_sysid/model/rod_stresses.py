@@ -1,10 +1,13 @@
 """Stresses of a rod that are given, as variables of a program.
 
-With stresses s = C (ε − ε̂) at the guess of the stiffness C, in place of the strains ε of an element
-the force (∂ε/∂x)ᵀ C (ε(x) − ε̂) is added to that of its energy. It is zero at ε̂ = ε(x); the
-derivative of both by x contains s alone, and not the stretch of second order that a rotation adds to
-a linear step, times the stiffness. This is the mixed form of Newton's method (Magisano, Leonetti &
-Garcea 2017).
+With stresses s, in place of the strains ε of an element, the force (∂ε/∂x)ᵀ (C (ε + γ_r ε̇) − s) is
+added to those of its energy and damping, at the guess of the stiffness C and of γ_r. It is zero at
+s = C (ε + γ_r ε̇); the derivative of both by x contains s alone, and not the stretch of second order
+that a rotation adds to a linear step, times the stiffness or the viscosity. This is the mixed form of
+Newton's method (Magisano, Leonetti & Garcea 2017).
+
+The equations C⁻¹ s = ε + γ_r ε̇ are scaled, and s by the same factors, such that the factor of s is at
+most one; the matrix then stays bounded however stiff the rod is along itself.
 """
 
 from __future__ import annotations
@@ -28,15 +31,16 @@ from .generated_functions import GeneratedFunction
 from .point_forces import ComplementarityForce, PreviousState
 
 DOFS = 3 * ROD.nodes
-# Data of an element: those of its rest shape, then the stiffnesses by the unit of energy, and this.
+# Data of an element: those of its rest shape, then the stiffnesses by the unit of energy, this, and
+# γ_r of the guess.
 REST = ROD.nodes * ROD.columns + ROD.rest_values
 
 
 @dataclass(frozen=True, eq=False)
 class GivenStresses(ComplementarityForce):
-    """Force of the given stresses b, by the unit of energy, less those of the strains.
+    """Force of the given stresses b, scaled, less those of the strains.
 
-    What `ComplementarityForce` calls the residuals of a condition are C⁻¹ b less the strains.
+    What `ComplementarityForce` calls the residuals of a condition are the scaled equations of b.
     """
 
     points: ForcePoints  # elements, with their nodes
@@ -47,8 +51,6 @@ class GivenStresses(ComplementarityForce):
     size = 0
     is_complementarity = True
     pressure_unit_m = 1.0
-    is_nonlinear_in_velocity = False  # type: ignore[assignment]
-    has_skew_stiffness = False  # type: ignore[assignment]
 
     @classmethod
     def from_body(cls, body: Body, theta: Array, energy_j: float) -> GivenStresses:
@@ -57,8 +59,14 @@ class GivenStresses(ComplementarityForce):
         assert isinstance(body.mesh, RodMesh)
         lengths_m = geometry[:, -1:] / body.mesh.section.area_m2
         stiffness = stiffnesses(body, theta) * lengths_m / energy_j
-        unit = np.full((len(stiffness), 1), energy_j)
-        data = np.hstack([geometry[:, :REST], stiffness, unit])
+        # The section that two elements have in common has one stress, that of the first element.
+        stiffness[:-1, STRAINS + 3 :] += stiffness[1:, STRAINS : STRAINS + 3]
+        stiffness[1:, STRAINS : STRAINS + 3] = 0.0
+        others = np.empty((len(stiffness), 2))
+        for part, values in zip(body.parts, body.split_theta(theta), strict=True):
+            viscous_s = values[len(part.material.constants)] if part.damping.stress else 0.0
+            others[part.cells] = energy_j, viscous_s
+        data = np.hstack([geometry[:, :REST], stiffness, others])
         points = ForcePoints.at_nodes(body.cells, len(body.nodes_m))
         return cls(points, data.T[:, None])
 
@@ -90,13 +98,14 @@ class GivenStresses(ComplementarityForce):
     def data(self, chosen: Index | None) -> Array:
         return self.element_data
 
-    def scaled_pressures(self, xi: Array) -> Array:
-        """Return the stresses (12, T, E), by the unit of energy, at positions ξ (T, 3n) [m]."""
+    def scaled_pressures(self, xi: Array, nu: Array | None = None) -> Array:
+        """Return the stresses b (12, T, E) at positions ξ (T, 3n) [m] and velocities ν."""
         y = self.points.vectors(xi)
+        rate = self.points.vectors(np.zeros_like(xi) if nu is None else nu)
         data = np.broadcast_to(self.element_data, (len(self.element_data), *y.shape[1:]))
         nothing = np.zeros((RESULTANTS, *y.shape[1:]))
-        strains = -_law(True).evaluate(np.concatenate([y, nothing]), data)[DOFS:]
-        return data[REST:-1] * strains
+        strains = -_law(True).evaluate(np.concatenate([y, rate, nothing]), data)[DOFS:]
+        return np.maximum(data[REST:-2], 1.0) * strains
 
 
 def stiffnesses(body: Body, theta: Array) -> Array:
@@ -118,20 +127,23 @@ def bending_moment_n_m(body: Body, theta: Array) -> float:
 
 @cache
 def _law(is_given: bool) -> GeneratedFunction:
-    """Return the law (F, C⁻¹ b − ε) of an element at (y, b); F = 0 at y alone."""
+    """Return the law (F, scaled equations) of an element at (y, ẏ, b); F = 0 at (y, ẏ) alone."""
+    size, data_size = 2 * DOFS, REST + RESULTANTS + 2
     if not is_given:
-        return GeneratedFunction(lambda u, data: ca.SX(DOFS, 1), DOFS, REST + RESULTANTS + 1)
+        return GeneratedFunction(lambda u, data: ca.SX(DOFS, 1), size, data_size)
 
     def law(u: ca.SX, data: ca.SX) -> ca.SX:
-        y, given = u[:DOFS], u[DOFS:]
+        y, rate, given = ca.vertsplit(u, [0, DOFS, size, size + RESULTANTS])
         own = REST - ROD.rest_values
         slopes = ca.reshape(data[:own], ROD.columns, ROD.nodes)
         strain = strains_with_sections(ca.reshape(y, 3, ROD.nodes) @ slopes.T, data[own])
-        strain[:STRAINS] -= data[REST - STRAINS : REST]
-        stiffness = data[REST:-1]
         weights = ca.SX.sym("weights", RESULTANTS)
-        force = -data[-1] * ca.jtimes(strain, y, weights, True)
-        force = ca.substitute(force, weights, given - stiffness * strain)
-        return ca.vertcat(force, given / stiffness - strain)
+        force = -data[-2] * ca.jtimes(strain, y, weights, True)
+        damped = data[-1] * ca.jtimes(strain[:STRAINS], y, rate)
+        strain[:STRAINS] += damped - data[REST - STRAINS : REST]
+        stiffness = data[REST:-2]
+        scale = ca.sqrt(ca.fmin(stiffness, 1))
+        force = ca.substitute(force, weights, scale * given - stiffness * strain)
+        return ca.vertcat(force, given / ca.fmax(stiffness, 1) - scale * strain)
 
-    return GeneratedFunction(law, DOFS + RESULTANTS, REST + RESULTANTS + 1, is_compiled=True)
+    return GeneratedFunction(law, size + RESULTANTS, data_size, is_compiled=True)

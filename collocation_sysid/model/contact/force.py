@@ -88,7 +88,7 @@ class Contact(ComplementarityForce):
         """Unit of b as a variable [m]: the largest width δ of the contact law."""
         return self.law_of_contact.largest_width_m
 
-    def scaled_pressures(self, xi: Array) -> Array:
+    def scaled_pressures(self, xi: Array, nu: Array | None = None) -> Array:
         """Return the pressures divided by κ, b (1, T, i) [m], at positions ξ (T, 3n) [m], from the
         gaps there: without an average over the step, and without a given b.
         """

@@ -62,6 +62,14 @@ class LiftedCollocation(Collocation):
     def has_eliminated_histories(self) -> bool:
         return False
 
+    @cached_property
+    def hessian_diagonals(self) -> tuple[Index, Index]:
+        """Those of `Collocation`; to x belong also the stresses of rods."""
+        of_q, of_x = super().hessian_diagonals
+        ends, _ = self.hessian_structure
+        stresses = [ends[1:][each.columns] - 1 for each in self.lifted if each.kind == "stress"]
+        return of_q, np.concatenate([of_x, *stresses])
+
     def pack(self, p: Array, positions: Sequence[Array]) -> Array:
         parts = self.iterates_at(p, positions)
         lifted = [each.consistent_values(parts[each.transcription_index]) for each in self.lifted]

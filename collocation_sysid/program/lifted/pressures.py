@@ -22,7 +22,7 @@ from ...fem.rods import RESULTANTS
 from ...model.point_forces import ComplementarityForce
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
-from ..motion_transcription import WeightedHistory
+from ..motion_transcription import RowWeights, WeightedHistory
 from .force_histories import LiftedForceHistory
 
 
@@ -58,8 +58,8 @@ class LiftedPressure(LiftedForceHistory):
         return self.width, self.transcription.constraint_times, self._points.count
 
     def consistent_values(self, iterate: ExperimentIterate) -> Array:
-        xi, _ = iterate.equations.dynamics.evaluation_states(iterate.x)
-        return self._find_force().scaled_pressures(xi).ravel() / self.unit_m
+        states = iterate.equations.dynamics.evaluation_states(iterate.x)
+        return self._find_force().scaled_pressures(*states).ravel() / self.unit_m
 
     def with_lifted(self, iterate: ExperimentIterate, z: Array) -> ExperimentIterate:
         """Return a copy of the iterate with the scaled pressures b (width, N, I) [m] of this force
@@ -120,3 +120,20 @@ class LiftedStress(LiftedPressure):
     kind = "stress"
     width = RESULTANTS
     is_bilinear = True
+
+    def _hessian_blocks(self) -> Iterator[EntryBlock]:
+        """Yield also the diagonal, which is zero: methods may add to it."""
+        yield from super()._hessian_blocks()
+        columns = self.offsets.variable + self._indices
+        yield EntryBlock([columns], [columns])
+
+    def hessian_values(
+        self,
+        iterate: ExperimentIterate,
+        z: Array,
+        loss_weight: float,
+        multipliers: Array,
+        weights: RowWeights,
+    ) -> Array:
+        values = super().hessian_values(iterate, z, loss_weight, multipliers, weights)
+        return np.concatenate([values, np.zeros(self.count)])
