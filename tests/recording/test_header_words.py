@@ -290,11 +290,15 @@ def test_a_sensor_in_another_unit_than_stated_is_refused(tiny, stated, is_read):
         ("strain^2 (-)", "'^2'"),
         ("1/strain (-)", "'1/'"),
         ("−strain (-)", "'−'"),
+        ("stretch - 1 (-)", "'- 1'"),
+        ("λ−1 (-)", "'−1'"),
+        ("stress 1 - stress 2 (kPa)", "'-'"),
+        ("stress_1-stress_2 (kPa)", "'-'"),
         ("|force| (N)", "'|' and '|'"),
     ],
 )
 def test_each_word_and_sign_of_a_header_is_understood_or_listed(table, column, listed):
-    words = ("strain", "dehnung", "déformation", "stretch")
+    words = ("strain", "dehnung", "déformation", "stretch", "λ")
     is_load = not any(word in column.lower() for word in words)
     file = table(f"strain (-),{column}" if is_load else f"{column},stress (kPa)")
     (note,) = read_specimen(file, layout(length_m=0.1, area_m2=1e-4)).notes

@@ -215,6 +215,26 @@ def test_a_word_that_makes_another_quantity_is_no_stress_or_strain(tmp_path, hea
     assert not [name for name in named if "difference" in name or "Mises" in name or "std" in name]
 
 
+@pytest.mark.parametrize(
+    ("header", "modulus"),
+    [
+        ("stretch,sigma1-sigma2 (kPa)", ""),
+        ("stretch,F*lambda/A (kPa)", ""),
+        ("f (Hz),G* (kPa),tan delta", "harmonic"),
+        ("f (Hz),|E*| (kPa),E'' (kPa)", "harmonic"),
+    ],
+)
+def test_a_computed_quantity_is_no_statement_of_a_column(tmp_path, header, modulus):
+    path = tmp_path / "pull.csv"
+    width = header.count(",") + 1
+    path.write_text("\n".join([header, *(",".join([f"1.{k}"] * width) for k in (1, 2, 3))]) + "\n")
+    with pytest.raises(cs.InputError) as raised:
+        read_specimen(path, SpecimenLayout(test="uniaxial", columns={}, modulus=modulus))
+    (stated, *_) = statements(str(raised.value))
+    assert "…" in stated.values()
+    assert header.split(",")[1] not in stated.values()
+
+
 def test_a_column_of_errors_beside_the_stress_is_not_read(tmp_path):
     path = tmp_path / "pull.csv"
     path.write_text("stretch,stress (kPa),stress error (kPa)\n1,0,9\n1.1,2,9\n1.2,3,9\n")

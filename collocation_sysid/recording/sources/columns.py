@@ -228,8 +228,8 @@ _NEUTRAL = (
     "delta δ amount shear sigma σ epsilon eps ε nominale spannungs elastizitäts "
     "relaxations kolben längen stauch"
 )
-# Signs of arithmetic in a name, as in strain^2, 1/strain and E*.
-_ARITHMETIC = re.compile(r"[\^*√×÷|]\d*|\d+\s*/|^\s*[-−]")
+# Signs of arithmetic in a name, as in strain^2, 1/strain, stretch - 1 and E*.
+_ARITHMETIC = re.compile(r"[\^*√×÷|]\d*|\d+\s*/|^\s*[-−]|(?:(?<=\d)|(?<=\d ))[-−+]|[-−+]\s*\d+")
 # German compounds end with what they are: Druckspannung, Prüfkraft, Kolbenweg.
 _COMPOUND = re.compile(
     r"(?P<first>\w+)(?P<last>zeit|weg|kraft|last|spannung|dehnung|stauchung|streckung|druck|"
@@ -651,6 +651,7 @@ def similar_column_names(grid: Table, quantity: Quantity) -> list[str]:
         if (
             is_similar
             and not _other_word(column)
+            and not _ARITHMETIC.search(name)
             and not _words(name) & _DEFORMED
             and not any(
                 _name_fits(column, each) and unit and si_factor(unit, each.dimension) is not None
