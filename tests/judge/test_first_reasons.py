@@ -28,6 +28,21 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "First compare laws",
     ),
     "toe": (wrong.with_toe, "window_s", "compare laws|compare-models"),
+    "toe, Mooney-Rivlin": (
+        lambda: wrong.with_toe("mooney-rivlin"),
+        "window_s",
+        "compare laws|compare-models|ended at a bound",
+    ),
+    "slack of a strip": (
+        lambda: wrong.with_toe("mooney-rivlin", sign=1),
+        "window_s",
+        "compare laws|compare-models|ended at a bound",
+    ),
+    "slack of a lap joint": (
+        lambda: wrong.with_toe("mooney-rivlin", "simple-shear", sign=1),
+        "window_s",
+        "compare laws|compare-models|ended at a bound",
+    ),
     "strip cut at another angle": (
         wrong.cut_at_another_angle,
         "^turned.* .cut_angle_deg",

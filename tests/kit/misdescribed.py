@@ -43,13 +43,18 @@ def sheared_as_planar(law: str) -> cs.Problem:
     return cs.Problem([specimen.experiment(law, "one")], unknown | {"kappa_pa": 1e9})
 
 
-def with_toe() -> cs.Problem:
-    """Compression to 4 % with platens that touch the whole face from about 1.5 % on."""
+def with_toe(law: str = "linear", test: str = "uniaxial", sign: int = -1) -> cs.Problem:
+    """Test to a strain of 4 % with faces or grips that hold the whole section from about 1.5 % on."""
     strain = np.linspace(0, 0.04, 41)
     stress_pa = 9e5 * (strain - 0.006 * (1 - np.exp(-strain / 0.006)))
     stress_pa = stress_pa + 200 * rng().normal(size=41)
-    press = cs.Specimen("uniaxial", -strain, -stress_pa, 200.0).experiment("linear", "press")
-    return cs.Problem([press], {"young_pa": cs.Unknown(), "poisson": 0.49})
+    specimen = cs.Specimen(test, sign * strain, sign * stress_pa, 200.0).experiment(law, "one")
+    parameters: dict[str, cs.Unknown | float]
+    if law == "linear":
+        parameters = {"young_pa": cs.Unknown(), "poisson": 0.49}
+    else:
+        parameters = {"c10_pa": cs.Unknown(), "c01_pa": cs.Unknown(), "kappa_pa": 1e9}
+    return cs.Problem([specimen], parameters)
 
 
 FIBRES = cs.Fibres(direction=[0, 0, 1.0])

@@ -64,7 +64,8 @@ def as_specimen_concerns(
     in its place "specimen/branches" about tables of moduli, at whose small strain all laws are linear,
     and "noise/larger" at strains below `STRAIN`, where laws hardly differ, unless the slope grows
     there. Specimens with fibres have their largest unknown first: a strip that was cut at another
-    angle is one of them. Beside large residuals a disagreement of the recordings says nothing.
+    angle is one of them. Beside large residuals a disagreement of the recordings says nothing, and if
+    the slope grows, constants at their bounds follow from it.
 
     Parameters
     ----------
@@ -79,6 +80,7 @@ def as_specimen_concerns(
         "remedy": "compare laws with compare-models --materials",
     }
     codes = dict(SPECIMEN_CODES)
+    explained = {"residuals/recordings"}
     advice = _law_advice(experiments)
     unloaded = [each.name for each in experiments if _is_unloaded(each)]
     if unloaded:
@@ -92,6 +94,7 @@ def as_specimen_concerns(
     elif all(np.abs(strain).max() < STRAIN for strain in strains):
         if growing := [each.name for each in experiments if _slope_grows(each)]:
             advice = f"in {listed(growing)} {TOE}"
+            explained.add("information/default-bound")
         else:
             codes["noise/larger"] = "noise/larger"
         data["remedy"] = "measure the area and unloaded length"
@@ -123,7 +126,7 @@ def as_specimen_concerns(
         large = [replace(each, grade="doubtful") for each in large]
     others = [e for e in replaced if e.code not in (codes["noise/larger"], "specimen/far")]
     if large:
-        others = [each for each in others if each.code != "residuals/recordings"]
+        others = [each for each in others if each.code not in explained]
     others = [each for each in others if each not in alone]
     grave = any(each.grade == "doubtful" for each in large)
     alone = [replace(each, grade="doubtful") if grave else each for each in alone]
