@@ -694,3 +694,15 @@ def test_the_node_of_the_pages_makes_frames_that_live_reads(
     assert frame.t_s == pytest.approx(START_S + 0.5)
     np.testing.assert_allclose(frame.poses[1][:3, 3], (0, 0, 1), atol=1e-12)
     np.testing.assert_allclose(frame.tracks_m[:2], [[np.nan] * 3, [1, 2, 3]])
+
+
+def test_what_libraries_print_about_a_damaged_definition_is_not_shown(tmp_path: Path) -> None:
+    write_problem(tmp_path, {"swing": 12})
+    poses = read_poses(tmp_path / "swing_motion.csv")
+    table = read_markers(tmp_path / "swing_markers.csv")
+    log = bag(tmp_path / "trial", recorded(poses, table, "mcap file"), "mcap file")
+    log.write_bytes(log.read_bytes().replace(b"MSG: std_msgs/Header", b"\0" * 20))
+    ended = run_command("log", log)
+    assert (ended.code, ended.out) == (2, "")
+    assert "the log is damaged" in ended.err
+    assert len(ended.err.splitlines()) == 1

@@ -7,9 +7,10 @@ in ``run.mcap#/tf#base>tool``, a robot's description, and the episode of a datas
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -207,7 +208,8 @@ def _mcap(path: Path) -> Iterator[Log]:
     from mcap_ros2.decoder import DecoderFactory as Ros2
 
     with path.open("rb") as file:
-        decoders: Any = [Ros2(), Protobuf(), _Json()]
+        silent = SimpleNamespace(decoder_for=partial(_silenced, Ros2().decoder_for))
+        decoders: Any = [silent, Protobuf(), _Json()]
         reader = make_reader(file, decoder_factories=decoders)
         summary = reader.get_summary()
         if summary is None or summary.statistics is None:
@@ -225,6 +227,12 @@ def _mcap(path: Path) -> Iterator[Log]:
                 yield message.log_time, content
 
         yield Log(topics, summary.statistics.message_start_time, decoded)
+
+
+def _silenced(call: Callable[..., Any], *words: Any) -> Any:
+    """The library prints the definitions of messages that it does not understand."""
+    with redirect_stderr(io.StringIO()):
+        return call(*words)
 
 
 class _Json:
