@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import orthogonal_procrustes
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
@@ -16,7 +17,6 @@ from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement, root_mean
 from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
-from ..statistics.axes import with_other_axes
 from ..statistics.thresholds import BETTER, NOISE
 from .doubt import Correction, Doubt
 from .fit import Candidate, TestedFit, scaled_residuals
@@ -127,12 +127,10 @@ def whole_mistakes(sensor: Measurement, predicted: Array) -> Iterator[Doubt]:
                 other[:, columns] *= factor
                 yield mistake("sensor-unit", other, what=what, factor=factor)
     if measured.shape[1] % 3 == 0:
-
-        def misfit(values: Array) -> float:
-            off = (values - predicted) / sigmas
-            return root_mean(off[np.isfinite(off)] ** 2) if np.isfinite(off).any() else np.inf
-
-        turned = dict(with_other_axes(measured, has_sign=False))
-        axes = min(turned, key=lambda each: misfit(turned[each]))
-        if BETTER * misfit(turned[axes]) < misfit(measured):
-            yield mistake("sensor-axes", turned[axes], axes=axes)
+        pairs = np.stack([measured / sigmas, predicted / sigmas]).reshape(2, -1, 3)
+        stated, real = pairs[:, np.isfinite(pairs).all(axis=(0, 2))]
+        axes, _ = orthogonal_procrustes(stated, real)
+        left, *others = (np.sum((stated @ q - real) ** 2) for q in (axes, np.eye(3), -np.eye(3)))
+        if BETTER**2 * left < min(others):
+            turned = (measured.reshape(-1, 3) @ axes).reshape(measured.shape)
+            yield mistake("sensor-axes", turned, axes=str((axes.round(2) + 0.0).tolist()))

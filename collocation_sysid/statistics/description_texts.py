@@ -46,8 +46,8 @@ MESSAGES = {
     "direction of the sensor in its description; of a wrench, which is that of the grasp on the "
     "body, set sign = -1",
     "sensor-unit": "its {what} fit if multiplied by {factor:.4g}: check the unit of its columns",
-    "sensor-axes": "its axes are exchanged or reversed: its values fit with ({axes}) in place of "
-    "(x, y, z); reorder the columns, or rotate the axes",
+    "sensor-axes": "its axes are turned, exchanged or reversed: multiply its rows "
+    "(x, y, z) from the right by {axes}",
     "markers-axes": "the markers fit with ({axes}) in place of (x, y, z): the axes in their file "
     "are exchanged or reversed; reorder the columns, or rotate the tracks",
     "mesh-parts": "the mesh consists of {parts} unconnected parts, and no grasp holds {loose} of "

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from kit.problems import GUESS, TRUTH, hung_cube, measured
+from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.judge.engine import find_misspecifications
@@ -64,6 +66,21 @@ def test_likely_mistakes_of_a_sensor_correct_the_readings():
     assert data == {"what": "values", "factor": 1e-3}
     np.testing.assert_allclose(corrected.readings[0].measured_values, predicted)
     assert corrected.readings[1] is other
+
+
+@pytest.mark.parametrize("degrees", [30.0, 45.0, 180.0])
+def test_turned_axes_of_a_sensor_are_turned_back(degrees):
+    experiment = sensed()
+    probe, _ = experiment.readings
+    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    predicted = probe.measured_values @ turn
+    (axes,) = (r for r in whole_mistakes(probe, predicted) if r.name == "sensor-axes")
+    corrected, data = axes.correct(experiment, np.ones(1))
+    np.testing.assert_allclose(corrected.readings[0].measured_values, predicted)
+    np.testing.assert_allclose(json.loads(str(data["axes"])), turn, atol=0.01)
+    for sign in (1, -1):
+        rows = whole_mistakes(probe, sign * probe.measured_values)
+        assert "sensor-axes" not in {row.name for row in rows}
 
 
 @pytest.mark.long
