@@ -304,6 +304,24 @@ def test_words_that_contradict_a_reading_are_refused(case, file, found):
         cs.Problem.read(CASES / case / file)
 
 
+@pytest.mark.parametrize("file", ["problem.toml", "mr.toml"])
+def test_platens_that_are_not_parallel_are_no_law(file):
+    first, *others = answer("foot_curve_traceback", file).trust.reasons
+    assert "window_s" in first
+    assert not any("compare laws" in reason for reason in [first, *others])
+
+
+def test_the_curve_without_its_toe_is_good():
+    run = answer("foot_curve_traceback", "win.toml")
+    assert run.trust.verdict == "good"
+    assert_within(run, "young_pa", 9e5)
+
+
+def test_times_of_slow_motion_are_named():
+    reason, *_ = answer("slow_motion_ring_down").trust.reasons
+    assert "4 times too long" in reason
+
+
 @pytest.mark.parametrize("file", ["specimen.toml", "specimen_strain.toml"])
 def test_the_platens_of_a_flat_disc_are_in_the_interval(file):
     assert_within(answer("disc_compression_specimen", file), "young_pa", 1e6)
