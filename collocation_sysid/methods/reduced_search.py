@@ -128,10 +128,11 @@ class SearchOptions(MethodOptions):
         It ends also when a step is predicted to be within 1e-3 standard errors, or within less with
         a tolerance below the default.
     least_decrease : float
-        The search ends also when the next step is predicted to decrease the loss by less than this
-        fraction times the largest change of a parameter's logarithm, if that is below 1; 0 by
-        default. Then constants that change the loss little are not found, and the positions satisfy
-        the equations of motion to the accuracy of the last step.
+        The search ends also when the next step, unless the trust region shortens it, is predicted
+        to decrease the loss by less than this fraction times the largest change of a parameter's
+        logarithm, if that is below 1; 0 by default. Then constants that change the loss little are
+        not found, and the positions satisfy the equations of motion to the accuracy of the last
+        step.
     max_iterations : int
         Largest number of sweeps, over all horizons; a rejected trial counts.
     trust : float
@@ -473,7 +474,8 @@ class ReducedSearch:
             if not is_last and predicted_share < RUNG_DECREASE:
                 return Status.CONVERGED
             # With curvature that Gauss–Newton neglects its own loss may be predicted to grow.
-            if 0.0 <= predicted_share < self.options.least_decrease * min(1.0, length):
+            is_small = 0.0 <= predicted_share < self.options.least_decrease * min(1.0, length)
+            if is_full_step and is_small:
                 return Status.CONVERGED
             if self.sweeps >= self.options.max_iterations:
                 return Status.ITERATION_LIMIT
