@@ -48,7 +48,6 @@ from ..recording.nuisance import (
     POSE_TURN,
     PRESSURE_LAG,
     PRESSURE_OFFSET,
-    SPECIMEN_FACTORS,
     STRAIN_ZERO,
     TARE,
     TENSION_OFFSET,
@@ -405,8 +404,7 @@ class NuisanceMap(RecordingQuantities):
         prior standard deviations.
 
         They are those of the rows, except for the clock and the times of loads, whose bounds follow
-        from the recording, and for relative errors of a specimen, which are at least −100 %. They
-        may be infinite.
+        from the recording. They may be infinite.
 
         Parameters
         ----------
@@ -416,8 +414,6 @@ class NuisanceMap(RecordingQuantities):
             of the duration, or within `LARGEST_SHIFT_SAMPLES` samples if that is more.
         """
         low = np.array([entry.row.low for entry in self.entries])
-        factors = self.indices_of_rows(*SPECIMEN_FACTORS.values())
-        low[factors] = np.maximum(low[factors], -1 / self.scales[factors])
         high = np.array([entry.row.high for entry in self.entries])
         for k in self.indices_of_rows(TIME):
             middle_s = samples * self.interval_s

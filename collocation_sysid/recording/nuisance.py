@@ -748,13 +748,8 @@ GRIP = (GRASP_TURN, GRASP_SHIFT)
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, Deviation))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
 GAUGE = Deviation("reading", "", sigma=None, of="gauge", changes=())
-# Relative errors of the stress of a specimen. Several tests of a specimen share its stiffness. The
-# limit ends searches in wrong descriptions towards −1, where constants have no effect on the stress.
-SPECIMEN_FACTORS = {
-    name: Deviation(name, "", sigma=None, of="gauge", changes=(), low=-20.0)
-    for name in ("area_error", "specimen_stiffness")
-}
-SPECIMEN_STIFFNESS = SPECIMEN_FACTORS["specimen_stiffness"]
+# Unknown of the stress of a specimen that several tests of it share.
+SPECIMEN_STIFFNESS = Deviation("specimen_stiffness", "", sigma=None, of="gauge", changes=())
 # Coordinates of places on the surface that sensors refer to, and other unknowns of single points.
 SURFACE_PLACE = Deviation(
     "surface_place", "", sigma=None, of="gauge", changes=(), reach=3.0, step=_largest_place_step_m

@@ -12,7 +12,6 @@ import collocation_sysid as cs
 from collocation_sysid.features.specimens.concerns import as_specimen_concerns
 from collocation_sysid.features.specimens.doubts import likely_mistakes
 from collocation_sysid.methods.solution import Status
-from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.recording.specimen_checks import order_warnings
 from collocation_sysid.statistics.concerns import Concern
 
@@ -106,26 +105,6 @@ def test_nothing_is_named_after_a_search_that_did_not_converge():
     run = cs.run(problem)
     assert not run.solution.status.converged
     assert not run.causes
-
-
-@pytest.mark.parametrize(("largest", "young_pa"), [(0.1, 1e6), (0.5, 1e5)])
-def test_a_search_with_positive_signs_of_compression_ends(largest, young_pa):
-    """A shear modulus near the bulk modulus, and hardly an area, fit less badly than rubber does."""
-    strain = np.linspace(0.05, 1, 20) * largest
-    stress_pa = -young_pa / 3 * (1 - strain - (1 - strain) ** -2)
-    noise_pa = np.random.default_rng(0).normal(size=20)
-    press = cs.Specimen("uniaxial", strain, stress_pa + noise_pa, 1.0).experiment(name="press")
-    solution = cs.solve(cs.Problem([press], {"mu_pa": cs.Unknown()} | FIXED))
-    assert solution.status.converged
-    assert solution.history[-1].number < 60
-
-
-@pytest.mark.parametrize(("area_error", "lowest"), [(0.01, -0.2), (0.1, -1.0)])
-def test_an_area_is_positive(area_error, lowest):
-    press = cs.Specimen("uniaxial", STRAIN, STRAIN, 1.0, area_error=area_error).experiment()
-    nuisance = NuisanceMap.from_experiment(press)
-    row = nuisance.names.index("specimen: area_error of stress [1]")
-    assert nuisance.bounds(0)[0][row] * area_error == pytest.approx(lowest)
 
 
 # Kinds of test, zeros, and all data ---------------------------------------------------------------
