@@ -171,8 +171,13 @@ def _numbers(grid: Table, names: Sequence[str]) -> Array:
 def _wide_table(grid: Table, names: list[str], t_s: Array | None, frames: Array) -> TrackFile:
     pixels = _numbers(grid, [f"{name}_{axis}" for name in names for axis in "uv"])
     scores = [f"{name}_likelihood" for name in names]
-    has_score = any(name in grid.columns for name in scores)
-    likelihood = _numbers(grid, scores) if has_score else None
+    likelihood = None
+    if any(name in grid.columns for name in scores):
+        likelihood = np.ones((len(pixels), len(names)))
+        for k, name in enumerate(names):
+            own = [each for each in grid.columns if each.rpartition("_")[0] == name]
+            if len(own) > 2:  # a third column that is no likelihood is misspelt
+                likelihood[:, k] = _numbers(grid, [scores[k]])[:, 0]
     pixels = pixels.reshape(len(pixels), -1, 2)
     if "track" not in grid.columns:
         return TrackFile(tuple(names), pixels, likelihood, t_s, frames)
