@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +32,12 @@ from .program.collocation import Collocation
 from .recording.impact_steps import IMPACT_NOTE
 from .runs.check.cost import require_memory
 from .runs.expected_precision import with_measurements
-from .runs.forward_simulation import simulate_experiments, step_changes, step_error
+from .runs.forward_simulation import (
+    missed_by_simulations,
+    simulate_experiments,
+    step_changes,
+    step_error,
+)
 from .runs.mesh_resolution import mesh_changes
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
@@ -56,6 +62,7 @@ from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
 from .statistics.profile_likelihood import Profile, profile_of_solution
 from .statistics.residuals.diagnostics import diagnose_markers
+from .statistics.thresholds import ROLLOUT
 from .statistics.uncertainty import uncertainty_from_fit
 
 if TYPE_CHECKING:
@@ -425,14 +432,19 @@ def _fine_enough(
     problem = coarse.problem
     before = first.collocation.substeps
     negligible = NEGLIGIBLE_IN_SIMULATIONS if problem.is_declared_simulated else NEGLIGIBLE
-    factor = error.suggested_substeps(known, as_scheme(problem.scheme).order, negligible)
-    substeps = min(before * factor, MOST_SUBSTEPS)
+    order = as_scheme(problem.scheme).order
+    factor = error.suggested_substeps(known, order, negligible)
+    missed = missed_by_simulations(first, coarse.rollouts)
+    of_motion = ceil((missed / ROLLOUT) ** (1 / order))
+    substeps = min(before * max(factor, of_motion), MOST_SUBSTEPS)
     number = "one time step" if before == 1 else f"{before} time steps"
     worst, many = error.largest_correction(known)
     why = (
         f"with {number} per sample, the estimated time-step error of {worst} is {many:.2g} "
         "standard errors"
     )
+    if of_motion > factor:
+        why = f"with {number} per sample, the forward simulation deviates from the measurements"
     if fit.at_bound[: fit.shared_count].all():
         substeps = MOST_SUBSTEPS
         why = f"with {number} per sample, every parameter ends at a bound"

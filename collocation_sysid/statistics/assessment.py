@@ -445,18 +445,23 @@ def largest_deviation(count: int) -> float:
     return float(normal_isf(RARE / 2 / max(1, count)))
 
 
+def missed_by_simulation(simulated: InstrumentMisfit, fitted: InstrumentMisfit) -> float:
+    """Return √(simulated² − fitted²) of an instrument, with the larger of the fit's misfit and the
+    noise as unit.
+    """
+    squares = simulated.robust_sigmas**2 - fitted.robust_sigmas**2
+    return float(np.sqrt(max(0.0, squares))) / max(1.0, fitted.robust_sigmas)
+
+
 def forward_simulation_concerns(
     name: str, simulated: InstrumentMisfit, fitted: InstrumentMisfit, *, is_static: bool = False
 ) -> list[Concern]:
     """Return one concern, as a list, if the forward simulation of a fitted experiment misses the
     measurements of an instrument by much more than the fit; else empty.
 
-    With the larger of the fit's misfit and the noise as unit, √(simulated² − fitted²) is "check"
-    above `ROLLOUT`, and "doubtful" above `GROSS_ROLLOUT`.
+    `missed_by_simulation` is "check" above `ROLLOUT`, and "doubtful" above `GROSS_ROLLOUT`.
     """
-    unit = max(1.0, fitted.robust_sigmas)
-    squares = simulated.robust_sigmas**2 - fitted.robust_sigmas**2
-    missed = float(np.sqrt(max(0.0, squares))) / unit
+    missed = missed_by_simulation(simulated, fitted)
     return concern_if(
         missed > ROLLOUT,
         missed > GROSS_ROLLOUT,
