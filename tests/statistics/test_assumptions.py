@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from assumed_twins import with_wrong_assumptions
 from kit.problems import EDGE_M, box, hung_cube
+from kit.rods import CABLE, UNDAMPED, bent, clamped
+from kit.rods import cable as cable_of
 from kit.static import PRESSED_M, TIMES, block
 
 from collocation_sysid import (
@@ -35,6 +37,7 @@ from collocation_sysid.fem.laws.constants import GAMMA_R
 from collocation_sysid.fem.laws.materials import DAMPINGS, DampingLaw
 from collocation_sysid.fem.node_force import AIR_KG_M3
 from collocation_sysid.model.parameters import Parameters
+from collocation_sysid.program.simulation import Trajectory
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
 from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, ExperimentAtAnswer
 
@@ -103,6 +106,29 @@ def test_markers_change_as_where_the_body_is_as_the_assumption_fears(name):
     assert largest > 0
     atol = INEXACT.get(name, 0.01) * largest
     np.testing.assert_allclose(changed(experiment, name), simulated, atol=atol)
+
+
+def test_a_stated_torsional_stiffness_of_a_bent_cable_may_be_another():
+    experiment = clamped(cable_of(bent()), 0.0, 0.0, -0.1, kind="static")
+    values = CABLE | UNDAMPED
+
+    def motion(**changes: float) -> Trajectory:
+        return simulate(experiment, values | changes, substeps=1)
+
+    known = motion()
+    markers = replace(experiment.markers, positions_m=known.markers_m, sigma_m=1e-3)
+    guess = Unknown(CABLE["bending_n_m2"], 1e-4, 1.0)
+    parameters = Parameters.from_mapping(values | {"bending_n_m2": guess})
+    collocation = Collocation([replace(experiment, markers=markers)], parameters)
+    x = known.positions_m
+    z = collocation.pack(collocation.guess_p, [x.reshape(len(x), -1)])
+    _, found = changed_residuals(collocation, z, [(BY_NAME["torsion"], 1.0)])
+    more, less = (
+        motion(torsion_n_m2=CABLE["torsion_n_m2"] * (1 + way)).markers_m for way in (1e-3, -1e-3)
+    )
+    expected = (more - less) / 2e-3
+    assert np.abs(expected).max() > 1e-4
+    np.testing.assert_allclose(1e-3 * found[0][..., 0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("has_stated_places", [True, False])

@@ -25,7 +25,7 @@ from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
 from ...fem.body import Body
-from ...fem.laws.constants import GAMMA_M, GAMMA_R, without_region
+from ...fem.laws.constants import GAMMA_M, GAMMA_R, TORSION, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import boundary_of
@@ -533,12 +533,12 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
-def _stated_poisson_names(parameters: Parameters) -> set[str]:
+def _stated_names(parameters: Parameters, constant: str) -> set[str]:
     items = {item.name: item for item in parameters.components}
     return {
         name
         for name, item in items.items()
-        if without_region(name) == "poisson"
+        if without_region(name) == constant
         and (items[item.tied.to] if item.tied else item).is_fixed
     }
 
@@ -549,7 +549,7 @@ def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float
     deviation away on this scale. It is that of the largest stated ratio below ½.
     """
     items = {item.name: item for item in parameters.components}
-    tied = {name: items[name].tied for name in _stated_poisson_names(parameters)}
+    tied = {name: items[name].tied for name in _stated_names(parameters, "poisson")}
     stated = [items[name if to is None else to.to].guess for name, to in tied.items()]
     below = [nu for nu in stated if nu is not None and nu < INCOMPRESSIBLE_POISSON]
     if not below:
@@ -560,7 +560,7 @@ def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of all ratios together that are fixed or tied to a fixed one."""
-    constants = _stated_poisson_names(at.parameters)
+    constants = _stated_names(at.parameters, "poisson")
     if not constants:
         return None
     values = at.parameters.values(at.iterate.q)
@@ -576,6 +576,23 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
         for way in (step, -step)
     )
     return Effect((larger - smaller) / (2 * step))
+
+
+def _torsion(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a relative error of the torsional stiffnesses that are stated."""
+    constants = _stated_names(at.parameters, TORSION.name)
+    if not constants:
+        return None
+    values = at.parameters.values(at.iterate.q)
+    larger, smaller = (
+        at.internal_n(
+            theta=at.body.theta_from_values(
+                {n: v * (1 + way * (n in constants)) for n, v in values.items()}
+            )
+        )
+        for way in (SMALL, -SMALL)
+    )
+    return Effect((larger - smaller) / (2 * SMALL))
 
 
 def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -1056,6 +1073,14 @@ ASSUMPTIONS = (
         "solid rubber, 1.5 to 2 GPa, determines it to about 0.0001",
         effect=_poisson,
         of_specimens=True,
+    ),
+    Deviation(
+        "torsion",
+        "1",
+        considered=0.2,
+        description="relative error of a stated torsional stiffness of a rod",
+        remedy="estimate the torsional stiffness from a motion out of a plane, or measure it",
+        effect=_torsion,
     ),
     Deviation(
         "damping_law",
