@@ -18,7 +18,7 @@ from ..recording.experiment import Experiment
 from ..recording.markers import Markers
 from ..recording.measurement import Measurement, root_mean
 from ..statistics.budget.consider_analysis import changed_residuals
-from ..statistics.distributions import normal_isf
+from ..statistics.distributions import largest_deviation, normal_isf
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.linearised import LinearisedFit, linearise_fit
 from ..statistics.thresholds import CHANCE, LEAST_DECREASE, MISFIT, NOISE, RARE, UNCORRELATED
@@ -34,7 +34,7 @@ def discrepancy(part: ExperimentIterate) -> float:
     """Return the largest RMS residual of the measurements of a fitted experiment, or its largest
     nuisance parameter, over the largest one that noise causes.
     """
-    limit = float(normal_isf(RARE / 2 / max(1, len(part.phi))))
+    limit = largest_deviation(len(part.phi), RARE)
     found = [float(np.abs(part.phi).max(initial=0.0)) / limit]
     for _, ratios in scaled_residuals(part):
         known = ratios[np.isfinite(ratios)]

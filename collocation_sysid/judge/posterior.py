@@ -51,10 +51,9 @@ from ..statistics.budget.effect_estimates import (
     EffectEstimate,
     JointPosterior,
     effect_row,
-    surprise_limit,
 )
 from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
-from ..statistics.distributions import student_95
+from ..statistics.distributions import largest_deviation, student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..statistics.thresholds import CHANCE
@@ -303,8 +302,9 @@ class Posterior:
         """
         names, ways = self._priors
         count = len(self.effects.names)
+        limit = largest_deviation(len(self.effect_estimates), CHANCE)
         for each in self.effect_estimates:
-            if abs(each.surprise) > surprise_limit(len(self.effect_estimates), CHANCE):
+            if abs(each.surprise) > limit:
                 k = self.fit.names.index(each.name)
                 off = self.step[k] - self.effects.means[k - len(self.fit.names) + count]
                 own = self.covariance[:, k, None]

@@ -15,7 +15,7 @@ from ..program.experiment_iterate import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..recording.measurement import root_mean
 from ..recording.nuisance import PLACE
-from ..statistics.distributions import normal_isf
+from ..statistics.distributions import largest_deviation
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.thresholds import RARE
 from .doubt import exchanged_names
@@ -51,7 +51,7 @@ def exchanged_places(part: ExperimentIterate) -> Iterator[Hypothesis]:
     estimated = part.transcription.nuisance.indices_of_rows(PLACE)
     if len(markers.names) < 2 or not len(estimated):
         return
-    if np.abs(part.phi[estimated]).max() <= float(normal_isf(RARE / 2 / len(estimated))):
+    if np.abs(part.phi[estimated]).max() <= largest_deviation(len(estimated), RARE):
         return
     stated_m = part.transcription.marker_places_m(np.zeros(len(part.phi)))
     fitted_m = part.transcription.marker_places_m(part.phi)

@@ -38,14 +38,16 @@ from ..program.transcription import Transcription
 from ..recording import Experiment
 from ..recording.nuisance import CLOCK_RATE, DEPTH_TIME, JOINING, OBSTACLE_TIME, SENSOR_TIME, TIME
 from ..recording.sample_times import TIME_TOLERANCE_S
-from ..statistics.assessment import InstrumentMisfit, largest_deviation, missed_by_simulation
+from ..statistics.assessment import InstrumentMisfit, missed_by_simulation
 from ..statistics.budget.discretisation_error import (
     Refinement,
     change_in_observations,
     discretisation_errors,
 )
+from ..statistics.distributions import largest_deviation
 from ..statistics.estimates import Estimate
 from ..statistics.linearised import LinearisedFit, parameter_values
+from ..statistics.thresholds import RARE
 from .smaller_problem import sample_distance
 
 # Least ratio of grid step and simulation step for an estimate of the step's error: half, rounded.
@@ -72,7 +74,11 @@ class ForwardSimulation(SimulatedExperiment):
         """
         deviations = {**(self.own_deviations or {}), **(self.own_onsets or {})}
         largest = max(map(abs, deviations.values()), default=np.inf)
-        return self.own_misfits if largest <= largest_deviation(len(deviations)) else self.misfits
+        return (
+            self.own_misfits
+            if largest <= largest_deviation(len(deviations), RARE)
+            else self.misfits
+        )
 
 
 def simulate_experiments(

@@ -24,7 +24,7 @@ from ..recording.impact_steps import impact_steps
 from ..recording.measurement import root_mean
 from .budget.discretisation_error import Refinement
 from .concerns import Concern, Grade, concern_if
-from .distributions import chi2_sf, normal_isf
+from .distributions import chi2_sf, largest_deviation, normal_isf
 from .estimates import Estimate, display_name, limitless_shares
 from .hypothesis import Hypothesis
 from .residuals.autocorrelation import Dependence
@@ -392,7 +392,7 @@ def nuisance_concerns(
     "doubtful". Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
-    limit = largest_deviation(len(items))
+    limit = largest_deviation(len(items), RARE)
     concerns: list[Concern] = []
     far: dict[str, tuple[float, Concern]] = {}
     for k, (name, phi, lowest, highest) in enumerate(items):
@@ -436,13 +436,6 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
         shift_ms=1e3 * abs(shift_s),
         when="later" if shift_s > 0 else "earlier",
     )
-
-
-def largest_deviation(count: int) -> float:
-    """Return the deviation from a prior, in its standard deviations, that is exceeded with the
-    probability `RARE` by any of `count` parameters (Bonferroni): 3.9 for one, 4.6 for 20.
-    """
-    return float(normal_isf(RARE / 2 / max(1, count)))
 
 
 def missed_by_simulation(simulated: InstrumentMisfit, fitted: InstrumentMisfit) -> float:
@@ -496,7 +489,7 @@ def validation_concerns(
     times = misfit.robust_sigmas / max(1.0, level)
     is_chance = float(chi2_sf(misfit.count * times**2, misfit.count)) > RARE
     label = max(deviations, key=lambda each: abs(deviations[each]), default="")
-    is_absorbed = label and abs(deviations[label]) > largest_deviation(len(deviations))
+    is_absorbed = label and abs(deviations[label]) > largest_deviation(len(deviations), RARE)
     return concern_if(
         times > PREDICTION and not is_chance,
         times > GROSS_PREDICTION,

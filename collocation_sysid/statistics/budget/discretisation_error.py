@@ -147,7 +147,7 @@ class Refinement:
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
     def suggested_substeps(
-        self, estimates: Mapping[str, Estimate], order: float, negligible: float = NEGLIGIBLE
+        self, estimates: Mapping[str, Estimate], order: float, negligible: float
     ) -> int:
         """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
         correction small if the present errors are those of one step per sample.
@@ -156,11 +156,13 @@ class Refinement:
         ----------
         estimates : mapping of str to Estimate
             Estimates before the correction.
+        negligible : float
+            Share of a value: `NEGLIGIBLE` or `NEGLIGIBLE_IN_SIMULATIONS`.
 
         Notes
         -----
-        Small means at most `LITTLE` statistical standard errors, or the negligible share of the
-        value. Without a correction the number is 1.
+        Small means at most `LITTLE` statistical standard errors, or that share of the value.
+        Without a correction the number is 1.
         """
         many = max(
             (

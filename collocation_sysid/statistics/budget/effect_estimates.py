@@ -11,7 +11,7 @@ from ...common.array_types import Array
 from ...errors import listed
 from ...recording.deviation import Deviation, in_readable_unit
 from ..concerns import Concern
-from ..distributions import normal_isf
+from ..distributions import largest_deviation
 from ..thresholds import CHANCE, RARE
 from .systematic_effects import DEVIATIONS, source_label
 
@@ -88,11 +88,6 @@ def effect_row(name: str) -> Deviation:
     return DEVIATIONS[name.partition(" ")[0]]
 
 
-def surprise_limit(count: int, chance: float) -> float:
-    """Return the surprise that one of several effects exceeds by chance with this probability."""
-    return float(normal_isf(chance / 2 / max(count, 1)))
-
-
 def effect_concerns(
     effects: Sequence[EffectEstimate], suspects: Sequence[EffectEstimate] = ()
 ) -> list[Concern]:
@@ -108,7 +103,7 @@ def effect_concerns(
     if not named:
         return []
     worst = max(named, key=lambda each: abs(each.surprise))
-    limit, gross = (surprise_limit(len(named), p) for p in (CHANCE, RARE))
+    limit, gross = (largest_deviation(len(named), p) for p in (CHANCE, RARE))
     if abs(worst.surprise) <= limit:
         return []
     known = sorted((*suspects, *effects), key=lambda each: -abs(each.surprise))

@@ -9,7 +9,7 @@ residuals. Deviations that change only the measurements (cameras, clocks) are in
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -563,36 +563,32 @@ def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     constants = _stated_names(at.parameters, "poisson")
     if not constants:
         return None
-    values = at.parameters.values(at.iterate.q)
     # Both differences stay below ½, where the bulk modulus would be infinite.
+    values = at.parameters.values(at.iterate.q)
     largest = max(values[name] for name in constants)
     step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
+    return _effect_of_constants(at, dict.fromkeys(constants, 1.0), step)
+
+
+def _torsion(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a relative error of the torsional stiffnesses that are stated."""
+    values = at.parameters.values(at.iterate.q)
+    units = {name: values[name] for name in _stated_names(at.parameters, TORSION.name)}
+    return _effect_of_constants(at, units, SMALL) if units else None
+
+
+def _effect_of_constants(at: ExperimentAtAnswer, units: Mapping[str, float], step: float) -> Effect:
+    """Return the effect of constants that are all larger by their units, by central differences."""
+    values = at.parameters.values(at.iterate.q)
     larger, smaller = (
         at.internal_n(
             theta=at.body.theta_from_values(
-                {n: v + way * (n in constants) for n, v in values.items()}
+                {name: value + way * units.get(name, 0.0) for name, value in values.items()}
             )
         )
         for way in (step, -step)
     )
     return Effect((larger - smaller) / (2 * step))
-
-
-def _torsion(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a relative error of the torsional stiffnesses that are stated."""
-    constants = _stated_names(at.parameters, TORSION.name)
-    if not constants:
-        return None
-    values = at.parameters.values(at.iterate.q)
-    larger, smaller = (
-        at.internal_n(
-            theta=at.body.theta_from_values(
-                {n: v * (1 + way * (n in constants)) for n, v in values.items()}
-            )
-        )
-        for way in (SMALL, -SMALL)
-    )
-    return Effect((larger - smaller) / (2 * SMALL))
 
 
 def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
