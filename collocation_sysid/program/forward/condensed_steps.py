@@ -106,10 +106,7 @@ class StepEquations(ABC):
 
     def residual(self, x: Array) -> Array:
         """Return the complete residual (3n,) [N] at positions x (3n,) [m]."""
-        return self.add_local_forces(self.residual_without_local(x), x)
-
-    def add_local_forces(self, residual: Array, x: Array) -> Array:
-        """Return a residual (3n,) [N] without local forces at positions x (3n,) [m] plus these."""
+        residual = self.residual_without_local(x)
         if not self.local.parts:
             return residual
         return residual + self.local_weight * self.local.force(*self.states(x))

@@ -292,10 +292,7 @@ class NewtonSolver:
                 return improved
             self._wait = self._pause = 2 * self._pause + 1
         self._wait -= 1
-        linearise = equations.linearise
-        if self._last_step is not None:
-            stress, before = self._last_step
-            linearise = equations.stress.expecting(stress.at(before), linearise)
+        linearise = self.with_last_stress(equations)
         iterate = self._iterate_at(x.copy(), linearise, keep_definite=False)
         for _ in range(self.options.max_iterations):
             if self._is_last(iterate.step):
@@ -310,6 +307,13 @@ class NewtonSolver:
                 stress=equations.stress,
             )
         raise self._iteration_failure(iterate)
+
+    def with_last_stress(self, equations: StepEquations) -> Linearise:
+        """Return `linearise` of the equations with the mean stresses of the step before, if any."""
+        if self._last_step is None:
+            return equations.linearise
+        stress, before = self._last_step
+        return equations.stress.expecting(stress.at(before), equations.linearise)
 
     def _iteration_failure(self, iterate: _Iterate) -> NewtonFailure:
         return NewtonFailure(
@@ -580,21 +584,28 @@ class _CompleteIteration:
     has_factor : bool
         Whether there is a factor of an earlier state. Where factors are reused for several
         matrices, that of another time step does not count: a new matrix costs less than steps that
-        shrink more slowly.
+        shrink more slowly. Nor does it for a rod, whose matrices cost little and contain the
+        resultants of the step before.
     """
 
     solver: NewtonSolver  # stores the factor
     equations: StepEquations
+    _residual: Array | None = None  # at the state of the factor, before the first step
 
     def __post_init__(self) -> None:
+        solver = self.solver
+        is_slender = solver.body.is_slender
         self.has_factor = (
-            self.solver.last_factor is not None and self.solver.factor_sequence is None
+            solver.last_factor is not None and solver.factor_sequence is None and not is_slender
         )
+        equations = self.equations
+        self._linearise = solver.with_last_stress(equations) if is_slender else equations.linearise
 
     def factorise_at(self, x: Array) -> None:
         solver = self.solver
         with solver.stopwatch.evaluating():
-            at = self.equations.linearise(x)
+            at = self._linearise(x)
+        self._residual = at.residual
         solver.last_factor = (
             solver.factorise(at, x, keep_definite=False)
             if solver.factor_sequence is None
@@ -607,8 +618,10 @@ class _CompleteIteration:
     def step_from(self, x: Array) -> Array:
         solver = self.solver
         assert solver.last_factor is not None
-        with solver.stopwatch.evaluating():
-            residual = self.equations.add_local_forces(self.equations.residual_without_local(x), x)
+        residual, self._residual = self._residual, None
+        if residual is None:
+            with solver.stopwatch.evaluating():
+                residual = self.equations.residual(x)
         try:
             return solver.step(solver.last_factor, residual)
         except np.linalg.LinAlgError as error:  # a factor that is reused
