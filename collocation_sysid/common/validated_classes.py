@@ -35,11 +35,12 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     ConfigDict,
-    InstanceOf,
+    GetPydanticSchema,
     Strict,
     TypeAdapter,
     ValidationError,
 )
+from pydantic_core import core_schema
 
 from ..errors import InputError
 from .array_types import Index
@@ -58,6 +59,8 @@ _CONFIGURATION = ConfigDict(extra="forbid", arbitrary_types_allowed=True, valida
 _PLAIN = {float: Number, int: StrictInteger, bool: Flag, str: Annotated[str, Strict()]}
 _ARRAY = Annotated[Any, AfterValidator(require_numbers)]
 _INDICES = Annotated[Any, AfterValidator(require_indices)]
+# Unlike `pydantic.InstanceOf`, it asks for no schema of the class.
+_INSTANCE = GetPydanticSchema(lambda kind, _: core_schema.is_instance_schema(kind))
 
 
 @overload
@@ -297,7 +300,7 @@ def form_of(annotation: Any, names: Mapping[str, Any]) -> Any:
         return Callable[..., Any]
     if not isinstance(annotation, type) or origin or getattr(annotation, "_is_protocol", False):
         return None
-    return _PLAIN.get(annotation, InstanceOf[annotation])
+    return _PLAIN.get(annotation, Annotated[annotation, _INSTANCE])
 
 
 def _listed(value: Any) -> Any:

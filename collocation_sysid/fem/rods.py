@@ -30,8 +30,8 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from ..common.array_types import Array, Index
 from ..common.checked_arrays import read_only_floats
@@ -213,10 +213,10 @@ class RodMesh(TetMesh):
         return sections, value + beyond * slope, slope, np.where(beyond == 0, curvature, 0.0)
 
     @cached_property
-    def _weights(self) -> CubicHermiteSpline:
+    def _weights(self) -> scipy.interpolate.CubicHermiteSpline:
         of_sections = np.eye(len(self.s_m))
         slopes = np.gradient(of_sections, self.s_m, axis=0, edge_order=2)
-        return CubicHermiteSpline(self.s_m, of_sections, slopes)
+        return scipy.interpolate.CubicHermiteSpline(self.s_m, of_sections, slopes)
 
     @property
     def centres_of_sections_m(self) -> Array:
@@ -636,19 +636,19 @@ def rod_material(
     return RodMaterial(law, section, has_natural_curvature)
 
 
-def _by_arc_length(points: Array, steps_m: Array) -> tuple[CubicSpline, Array]:
+def _by_arc_length(points: Array, steps_m: Array) -> tuple[scipy.interpolate.CubicSpline, Array]:
     """Return a spline through points by arc length, and the arc length of each point."""
     s = np.concatenate([[0.0], np.cumsum(steps_m)])
     if len(points) == 2:
-        return CubicSpline(s, points), s
+        return scipy.interpolate.CubicSpline(s, points), s
     nodes, weights = np.polynomial.legendre.leggauss(8)
     for _ in range(20):
-        curve = CubicSpline(s, points)
+        curve = scipy.interpolate.CubicSpline(s, points)
         half = np.diff(s)[:, None] / 2
         places = s[:-1, None] + half * (1 + nodes)
         lengths = np.sum(np.linalg.norm(curve(places, 1), axis=2) * weights * half, axis=1)
         s = np.concatenate([[0.0], np.cumsum(lengths)])
-    return CubicSpline(s, points), s
+    return scipy.interpolate.CubicSpline(s, points), s
 
 
 def _stations(length_m: float, count: int, stated_m: Sequence[float]) -> Array:

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 from scipy.sparse.linalg import ArpackError
 from scipy.spatial.transform import Rotation
 
@@ -285,7 +285,7 @@ class ModalComparison:
         is_complete = np.isfinite(squares).any(axis=0).all()
         if not is_complete or len(names) < 2:
             return
-        _, chosen = linear_sum_assignment(np.nanmean(squares, axis=0))
+        _, chosen = scipy.optimize.linear_sum_assignment(np.nanmean(squares, axis=0))
         exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
         if not len(exchanged):
             return

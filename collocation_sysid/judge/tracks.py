@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 from scipy.spatial import KDTree
 
 from ..common.array_types import Array
@@ -56,7 +56,7 @@ def exchanged_places(part: ExperimentIterate) -> Iterator[Hypothesis]:
     stated_m = part.transcription.marker_places_m(np.zeros(len(part.phi)))
     fitted_m = part.transcription.marker_places_m(part.phi)
     distances_m = np.linalg.norm(fitted_m[:, None] - stated_m, axis=2)
-    _, chosen = linear_sum_assignment(distances_m**2)
+    _, chosen = scipy.optimize.linear_sum_assignment(distances_m**2)
     exchanged = np.flatnonzero(chosen != np.arange(len(chosen)))
     if not len(exchanged):
         return

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from scipy.linalg import get_lapack_funcs
-from scipy.optimize import lsq_linear
 
 from ..common.array_types import Array, Index
 
@@ -147,7 +147,9 @@ class SquareRootInformation:
         # The residuals of a motion that diverges are so large that their squares overflow.
         if (largest := np.abs(self.triangle).max()) > SQUARED:
             square, right = square / largest, right / largest
-        return np.clip(lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper)
+        return np.clip(
+            scipy.optimize.lsq_linear(square, right, (lower, upper), method="bvls").x, lower, upper
+        )
 
     def marginal(self, count: int) -> SquareRootInformation:
         """Return the problem in the first `count` parameters alone, with the others eliminated at

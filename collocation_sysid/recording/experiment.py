@@ -821,8 +821,10 @@ class Experiment:
             )
 
     def _check_order_of_grasps(self) -> None:
-        """Refuse platens that pass each other in an equilibrium; slender ends may do so."""
-        if not self.is_static:
+        """Refuse platens that pass each other in an equilibrium; slender ends may do so, and the
+        stretches of a homogeneous specimen are positive.
+        """
+        if not self.is_static or self.specimen is not None:
             return
         nodes_m = self.body.nodes_m
         grasps = self.body_grasps

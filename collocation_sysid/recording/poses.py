@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline, PPoly, RBFInterpolator, interp1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -81,7 +81,7 @@ class FaceDeformation:
         elif interpolation == "smooth" and len(self.t_s) > 2:
             moved = smooth_spline(self.t_s, values)(times)
         else:
-            moved = interp1d(self.t_s, values, axis=0)(times)
+            moved = scipy.interpolate.interp1d(self.t_s, values, axis=0)(times)
         return moved.reshape(len(times), len(points_m), 3)
 
     def _at_points(self, points_m: Array) -> Array:
@@ -94,7 +94,7 @@ class FaceDeformation:
         )
         values = np.moveaxis(self.displacements_m, 0, 1).reshape(len(measured), -1)
         affine = np.linalg.lstsq(measured, values, rcond=_FLATNESS)[0]
-        radial = RBFInterpolator(
+        radial = scipy.interpolate.RBFInterpolator(
             self.places_m,
             values - measured @ affine,
             neighbors=min(_NEAREST_PLACES, len(measured)),
@@ -320,12 +320,12 @@ class PoseSequence:
         return self.t_s[np.union1d(of_position, of_rotation)]
 
     @cached_property
-    def _position_spline(self) -> PPoly:
+    def _position_spline(self) -> scipy.interpolate.PPoly:
         """Spline of the positions (m, 3)."""
         return smooth_spline(self.t_s, self.positions_m)
 
     @cached_property
-    def _quaternion_spline(self) -> PPoly:
+    def _quaternion_spline(self) -> scipy.interpolate.PPoly:
         # Normalised it keeps its smoothness and its order, and no frame of reference is special.
         """Spline of the quaternions (m, 4), to be normalised after evaluation."""
         return smooth_spline(self.t_s, self.quaternions_xyzw)
@@ -443,7 +443,7 @@ def jump_intervals(t_s: Array, values: Array) -> Index:
     return 1 + np.flatnonzero(large[1:-1] & (rate[1:-1] > _LEAST_JUMP_RATIO * neighbour_rate))
 
 
-def smooth_spline(t_s: Array, values: Array) -> PPoly:
+def smooth_spline(t_s: Array, values: Array) -> scipy.interpolate.PPoly:
     """Return the cubic spline through values (m, k), m > 1, at times `t_s` (m,), with two
     continuous derivatives ("not-a-knot" ends).
 
@@ -454,12 +454,12 @@ def smooth_spline(t_s: Array, values: Array) -> PPoly:
     coefficients = np.zeros((4, len(t_s) - 1, values.shape[1]))
     for first, end in pairwise([0, *(broken + 1), len(t_s)]):
         if end - first > 1:
-            piece = CubicSpline(t_s[first:end], values[first:end])
+            piece = scipy.interpolate.CubicSpline(t_s[first:end], values[first:end])
             coefficients[:, first : end - 1] = piece.c
     coefficients[3, broken] = values[broken]
     steps_s = (t_s[broken + 1] - t_s[broken])[:, None]
     coefficients[2, broken] = (values[broken + 1] - values[broken]) / steps_s
-    return PPoly(coefficients, t_s)
+    return scipy.interpolate.PPoly(coefficients, t_s)
 
 
 # Checks over a recording -------------------------------------------------------------------------

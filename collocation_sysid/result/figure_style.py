@@ -84,12 +84,12 @@ class NotebookFigure(Figure):
 
 
 def symbol_as_mathtext(name: str) -> str:
-    """Return the symbol of a parameter as mathematical text of matplotlib, followed by the name of
-    its region, if any.
+    """Return the symbol of a parameter, followed by the name of its region, if any, with an index as
+    mathematical text of matplotlib, which takes longer than the other texts of a figure.
     """
     symbol, _, region = symbol_of(name).partition(" ")
     letter, _, index = symbol.partition("_")
-    written = rf"${letter}_{{\mathrm{{{index}}}}}$" if index else f"${symbol}$"
+    written = rf"$\mathrm{{{letter}}}_{{\mathrm{{{index}}}}}$" if index else symbol
     return f"{written} {region}".strip()
 
 

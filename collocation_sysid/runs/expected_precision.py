@@ -8,7 +8,7 @@ and a new test is simulated.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,12 @@ from ..recording.poses import PoseSequence
 from ..recording.specimen import Specimen, cell_of_other_test
 from ..recording.specimen_files import moduli_of, specimen_strains
 from ..statistics.budget.combined_intervals import NORMAL_95
-from ..statistics.budget.consider_analysis import UNWEIGHTED, changes_of_assumptions, unweighted_fit
+from ..statistics.budget.consider_analysis import (
+    UNWEIGHTED,
+    ResidualChanges,
+    changes_of_assumptions,
+    unweighted_fit,
+)
 from ..statistics.combinations import (
     WIDE,
     Combination,
@@ -50,10 +55,9 @@ from .smaller_problem import sample_distance
 EXACT_NOISE = ErrorModel("given", "independent")
 # Noise of an added instrument over its largest value.
 NOISE = 0.01
-# Tests that are tried beside those that were made.
+# Tests that are tried beside those that were made. Simple shear determines what a planar test does.
 ADDED_TESTS = {
     "equibiaxial": "an equibiaxial test",
-    "simple-shear": "a test in simple shear",
     "planar": "a planar test",
     "confined": "a confined test",
     "uniaxial": "a uniaxial test",
@@ -105,35 +109,54 @@ def expected_precision(
     SimulationError
         If the equations of motion are singular.
     """
+    return next(_precisions(collocation, z, deviations, [range(len(collocation.experiments))]))
+
+
+def _precisions(
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    selections: Iterable[Collection[int]],
+) -> Iterator[ExpectedPrecision]:
+    """Yield the precision with each selection of the fitted experiments; see `expected_precision`."""
     from ..judge.augmented_fit import is_learnt
     from ..judge.posterior import Effects, Posterior
 
-    fit, of_nuisances = unweighted_fit(collocation, z, deviations)
-    fit = _exact(fit)
+    complete, of_nuisances = unweighted_fit(collocation, z, deviations)
+    complete = _exact(complete)
     parameters = collocation.parameters
     q = z[: collocation.nq]
     changes = changes_of_assumptions(collocation, z, deviations, of_nuisances)
-    effects = Effects.from_changes(changes, deviations, {}, {})
-    posterior = Posterior.from_fit(
-        fit, effects, parameters, q, EXACT_NOISE, is_learnt=is_learnt(collocation)
-    )
+    experiments = [k for k, t in enumerate(collocation.transcriptions) for _ in t.residuals]
     sizes = relative_derivatives(parameters, q)
-    of_noise = posterior.uncertainty.complete_covariance
-    covariance = posterior.combine_covariance(of_noise, sizes)
-    kept = [k for k in parameters.scalar_coordinates if not fit.at_bound[k]]
+    kept = [k for k in parameters.scalar_coordinates if not complete.at_bound[k]]
     names = tuple(parameters.free[k].name for k in kept)
     values = parameters.values(q)
-    return ExpectedPrecision(
-        names,
-        np.array([values[name] for name in names]),
-        of_noise[np.ix_(kept, kept)],
-        covariance[np.ix_(kept, kept)],
-        {
-            name: (posterior.derivatives[name] / sizes)[kept] / value
-            for name, value in fit.derived.values.items()
-            if value
-        },
-    )
+    for selection in selections:
+        own = [k for k, number in enumerate(experiments) if number in selection]
+        fit = replace(complete, blocks=tuple(complete.blocks[k] for k in own))
+        seen = ResidualChanges(changes.names, [changes.blocks[k] for k in own])
+        posterior = Posterior.from_fit(
+            fit,
+            Effects.from_changes(seen, deviations, {}, {}),
+            parameters,
+            q,
+            EXACT_NOISE,
+            is_learnt=is_learnt(collocation),
+        )
+        of_noise = posterior.uncertainty.complete_covariance
+        covariance = posterior.combine_covariance(of_noise, sizes)
+        yield ExpectedPrecision(
+            names,
+            np.array([values[name] for name in names]),
+            of_noise[np.ix_(kept, kept)],
+            covariance[np.ix_(kept, kept)],
+            {
+                name: (posterior.derivatives[name] / sizes)[kept] / value
+                for name, value in fit.derived.values.items()
+                if value
+            },
+        )
 
 
 def _exact(fit: LinearisedFit) -> LinearisedFit:
@@ -238,13 +261,9 @@ def with_measurements(
             if {*(members := each.determined.names)} <= {*expected.names}
         }
 
-    for what, added in added_measurements(some, z, NOISE / np.sqrt(distance)):
-        try:
-            wide, at = _extended(some, z, added)
-            fixes = effects(what, expected_precision(wide, at, deviations))
-        except (InputError, SimulationError):
-            continue  # the law or the body does not allow this test
-        for k, fix in fixes.items():
+    added = [*added_measurements(some, z, NOISE / np.sqrt(distance))]
+    for what, expected in _with_each(some, z, deviations, added):
+        for k, fix in effects(what, expected).items():
             found[k].append(fix)
         if all(fixes and fixes[-1].factor < NARROW for fixes in found):
             break
@@ -253,6 +272,30 @@ def with_measurements(
         each if fix is None or fix.factor >= WIDE else replace(each, fixes=(fix, *each.fixes))
         for each, fix in zip(combinations, best, strict=True)
     )
+
+
+def _with_each(
+    collocation: Collocation,
+    z: Array,
+    deviations: Mapping[str, float | None],
+    added: Iterable[tuple[str, Sequence[Experiment]]],
+) -> Iterator[tuple[str, ExpectedPrecision]]:
+    """Yield the precision with each of the `added_measurements`; experiments that are added to the
+    same ones are linearised together.
+    """
+    own = range(count := len(collocation.transcriptions))
+    by_base: dict[tuple[int, ...], list[tuple[str, Sequence[Experiment]]]] = {}
+    for each in added:
+        by_base.setdefault(tuple(map(id, each[1][:count])), []).append(each)
+    for alternatives in by_base.values():
+        further = [each for _, experiments in alternatives for each in experiments[count:]]
+        selections = [[*own, count + k] for k in range(len(further))] or [own]
+        try:
+            wide, at = _extended(collocation, z, [*alternatives[0][1][:count], *further])
+            found = [*_precisions(wide, at, deviations, selections)]
+        except (InputError, SimulationError):
+            continue  # the law or the body does not allow this
+        yield from zip((what for what, _ in alternatives), found, strict=True)
 
 
 def _with_some_samples(

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy
 
 from ..common.array_types import Array
 from ..errors import InputError, SimulationError
@@ -344,7 +344,9 @@ class CoarseStart(SmallerProblem):
         distance = self.distances.get(experiment)
         if distance is None:
             return x
-        return make_interp_spline(distance * np.arange(len(x)), x)(np.arange(count))
+        return scipy.interpolate.make_interp_spline(distance * np.arange(len(x)), x)(
+            np.arange(count)
+        )
 
     def _interpolated(self, experiment: str, x: Array) -> Array:
         """Return (N, 3n) from (N, 3m); nodes of obstacle frames, which come last, are copied."""

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline, interp1d
+import scipy
 from scipy.special import binom
 
 from ..common.array_types import Array
@@ -208,10 +208,10 @@ def _interpolate(poses: PoseSequence, values: Array, t_s: Array) -> Array:
     ones stay constant.
     """
     if poses.interpolation == "smooth" and len(poses.t_s) > 3:
-        return CubicSpline(poses.t_s, values)(t_s)
+        return scipy.interpolate.CubicSpline(poses.t_s, values)(t_s)
     kind = "previous" if poses.interpolation == "hold" else "linear"
     inside = np.clip(t_s, poses.t_s[0], poses.t_s[-1])
-    return interp1d(poses.t_s, values, kind, axis=0)(inside)
+    return scipy.interpolate.interp1d(poses.t_s, values, kind, axis=0)(inside)
 
 
 def uncertainty_at(

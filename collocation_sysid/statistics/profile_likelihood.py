@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import root_scalar
+import scipy
 
 from ..common.array_types import Array
 from ..common.step_counting import search_activity
@@ -160,7 +160,7 @@ def _find_end(rise: Callable[[float], float], step: float, bound: float) -> floa
         outside = closest(inside + step, bound)
         if rise(outside) >= 0:
             within = PRECISION * abs(outside)
-            return root_scalar(rise, bracket=(inside, outside), xtol=within).root
+            return scipy.optimize.root_scalar(rise, bracket=(inside, outside), xtol=within).root
         inside = outside
         step = 2 * step
     return None

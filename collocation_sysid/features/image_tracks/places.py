@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
@@ -305,7 +305,7 @@ class _FirstImages:
             changes[free] = across * (missed[used][free] > 0)[:, None, None]
             return np.concatenate([changes.reshape(-1, len(pose)), np.eye(len(pose))])
 
-        fit = least_squares(
+        fit = scipy.optimize.least_squares(
             differences,
             np.zeros(len(estimated)),
             cast(Any, slopes),

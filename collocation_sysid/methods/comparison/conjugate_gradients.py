@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import OptimizeResult, minimize
+import scipy
 
 from ...common.array_types import Array
 from ...common.limits import require_time
@@ -56,7 +56,7 @@ def minimise_conjugate_gradients(
                 return point.value, np.where(at == beyond, unit * point.gradient, 0.0)
         return STEEP * height + 1e-300, np.zeros(len(s))
 
-    def callback(intermediate_result: OptimizeResult) -> None:
+    def callback(intermediate_result: scipy.optimize.OptimizeResult) -> None:
         nonlocal height, is_reached
         at = np.clip(z + unit * intermediate_result.x, problem.lower, problem.upper)
         accepted = point if np.array_equal(point.z, at) else MeritPoint.evaluate(merit, at)
@@ -65,7 +65,7 @@ def minimise_conjugate_gradients(
         if is_reached := accepted.gradient_norm <= tolerance:
             raise StopIteration
 
-    minimize(
+    scipy.optimize.minimize(
         value_and_gradient,
         np.zeros(len(z)),
         method="CG",

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+import scipy
 
 from ...common.array_types import Array
 from ...common.validated_classes import validated
@@ -224,7 +224,7 @@ class _ShootingSearch:
         """Minimise by SciPy's `least_squares`, from the first parameters; return the status and a
         sentence with SciPy's message. `_try` updates `best`, and states the exceptions.
         """
-        result = least_squares(
+        result = scipy.optimize.least_squares(
             self._residual,
             np.zeros(len(self.first)),  # then the trust region starts at one
             self._residual_slope,  # pyright: ignore[reportArgumentType]
@@ -261,7 +261,7 @@ class _ShootingSearch:
         Without success by SciPy's criteria the status is acceptable if the projected gradient is
         within `LEAST_GRADIENT_TOLERANCE`, and stalled otherwise.
         """
-        result = minimize(
+        result = scipy.optimize.minimize(
             self._objective,
             self.first,
             method="L-BFGS-B",

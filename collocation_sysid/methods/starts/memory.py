@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares, nnls
+import scipy
 
 from ...common.array_types import Array
 from ...fem.laws.constants import is_modulus
@@ -177,9 +177,11 @@ class _MemoryFit:
             }
         )
 
-    def _fit(self, q: Array, evaluations: int) -> OptimizeResult:
+    def _fit(self, q: Array, evaluations: int) -> scipy.optimize.OptimizeResult:
         bounds = (self.lower, self.upper)
-        return least_squares(self._residuals, q, bounds=bounds, x_scale="jac", max_nfev=evaluations)
+        return scipy.optimize.least_squares(
+            self._residuals, q, bounds=bounds, x_scale="jac", max_nfev=evaluations
+        )
 
     def _in_order(self, q: Array, order: Sequence[str]) -> Array:
         """Exchange branches so that relaxation times ascend as the guesses do, if admissible."""
@@ -222,7 +224,7 @@ class _MemoryFit:
             rows.append(modulus * table.weights[:, None] * np.column_stack(columns))
             data.append(table.weights * table.moduli_pa)
         matrix, right = np.vstack(rows), np.concatenate(data)
-        strengths, _ = nnls(matrix, right)
+        strengths, _ = scipy.optimize.nnls(matrix, right)
         return strengths, matrix @ strengths - right
 
     def _spectrum(self, q: Array) -> tuple[Array, Array, Array]:
@@ -252,7 +254,9 @@ class _MemoryFit:
         q = q.copy()
         if shifts:
             limits = (self.lower[shifts], self.upper[shifts])
-            q[shifts] = least_squares(misfit, q[shifts], bounds=limits, diff_step=1e-3).x
+            q[shifts] = scipy.optimize.least_squares(
+                misfit, q[shifts], bounds=limits, diff_step=1e-3
+            ).x
         tau_s = grid(q)
         return q, tau_s, self._strengths(q, tau_s)[0][1:]
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, least_squares
 
 from ...common.array_types import Array
 from ...fem.laws.constants import constant_named, symbol_of
@@ -580,9 +580,9 @@ def _with_factor(item: Parameter, value: float) -> Parameter:
 
 def _least_squares(
     residuals: Callable[[Array], Array], start: Array, lower: Array, upper: Array
-) -> OptimizeResult:
+) -> scipy.optimize.OptimizeResult:
     inside = np.clip(start, lower, upper)
-    return least_squares(
+    return scipy.optimize.least_squares(
         residuals, inside, bounds=(lower, upper), x_scale="jac", max_nfev=MOST_EVALUATIONS
     )
 

@@ -13,8 +13,8 @@ from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -117,7 +117,9 @@ class GriddedCloud:
         point = np.full(self._last + 1, -1)
         point[tuple(cells.T)] = np.arange(len(points_m))
         occupied = np.asarray(
-            distance_transform_edt(point < 0, return_distances=False, return_indices=True)
+            scipy.ndimage.distance_transform_edt(
+                point < 0, return_distances=False, return_indices=True
+            )
         )
         self._nearest = point[tuple(occupied)]
         count = min(NEIGHBOURS, len(points_m))

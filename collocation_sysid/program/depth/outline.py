@@ -22,8 +22,8 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from ...common.array_types import Array, Index
@@ -429,7 +429,7 @@ def _nearest_edges(
     if nothing.all():
         return pixels, np.ones_like(pixels), np.zeros(len(pixels), dtype=bool)
     places: Array = np.asarray(
-        distance_transform_edt(nothing, return_distances=False, return_indices=True)
+        scipy.ndimage.distance_transform_edt(nothing, return_distances=False, return_indices=True)
     )
     column, row = np.round(pixels).astype(np.int64).T
     nearest = places[::-1, row, column].T.astype(float)

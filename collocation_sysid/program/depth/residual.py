@@ -16,9 +16,9 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import scipy
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from ...common.array_types import Array
 from ...model.nuisance_map import NuisanceMap
@@ -356,7 +356,7 @@ class DepthResidual(CorrespondenceResidual):
         t_s, x = motion.t_s, motion.observed.x
         at_s = np.clip(self.observable_s, t_s[0], t_s[-1])
         if len(t_s) >= FEWEST_FOR_SPLINE:
-            return np.asarray(CubicSpline(t_s, x)(at_s))
+            return np.asarray(scipy.interpolate.CubicSpline(t_s, x)(at_s))
         return np.array([np.interp(at_s, t_s, each) for each in x.T]).T
 
     def changes(

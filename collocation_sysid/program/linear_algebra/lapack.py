@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy import LowLevelCallable
 from scipy.linalg import get_blas_funcs
 from threadpoolctl import ThreadpoolController
 
@@ -26,8 +25,7 @@ Band = NDArray[Any]
 
 def _routine(name: str) -> Any:
     """Return a LAPACK routine of SciPy's Cython interface as a ctypes function of six pointers."""
-    module = import_module("scipy.linalg.cython_lapack")
-    capsule = LowLevelCallable.from_cython(module, name).function
+    capsule = import_module("scipy.linalg.cython_lapack").__pyx_capi__[name]
     api = ctypes.pythonapi
     api.PyCapsule_GetName.restype = ctypes.c_char_p
     api.PyCapsule_GetName.argtypes = [ctypes.py_object]

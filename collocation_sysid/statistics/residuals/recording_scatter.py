@@ -30,8 +30,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from ...common.array_types import Array, Index
 from ..distributions import chi2_sf
@@ -216,7 +216,9 @@ def _sensitivities_to_differences(fit: LinearisedFit, names: Sequence[str], exce
         excess_scatter[row] = own_s @ projection @ own_s - np.trace(projection @ noise)
         by_each[row] = [np.trace(m.T @ projection @ m) for m in by_own]
     sizes = np.where(np.diag(by_each) > 0, np.diag(by_each), 1.0)
-    variances = nnls(by_each / np.sqrt(np.outer(sizes, sizes)), excess_scatter / np.sqrt(sizes))[0]
+    variances = scipy.optimize.nnls(
+        by_each / np.sqrt(np.outer(sizes, sizes)), excess_scatter / np.sqrt(sizes)
+    )[0]
     sensitivities = np.zeros((len(fit.names), fit.shared_count, len(names)))
     for k, tau in zip(shared, np.sqrt(variances / np.sqrt(sizes)), strict=True):
         sensitivities[free, k] = -tau * inverse @ each[:, free, k].T
