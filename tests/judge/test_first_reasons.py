@@ -43,6 +43,11 @@ REASONS: dict[str, tuple[Made, str, str]] = {
         "window_s",
         "compare laws|compare-models|ended at a bound",
     ),
+    "slack of a strip to a strain of 20 %": (
+        wrong.rubber_with_slack,
+        "window_s",
+        "compare laws|compare-models",
+    ),
     "strip cut at another angle": (
         wrong.cut_at_another_angle,
         "^turned.* .cut_angle_deg",
@@ -117,6 +122,7 @@ def test_the_first_reason_is_right(name: str):
 @pytest.mark.parametrize(
     "made",
     [
+        lambda: wrong.rubber_with_slack(left_out=0.03),
         lambda: wrong.ring_down(1.0),
         lambda: wrong.rolling_shutter(2e-5),
         lambda: wrong.mirrored_mesh(False),

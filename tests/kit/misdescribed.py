@@ -57,6 +57,19 @@ def with_toe(law: str = "linear", test: str = "uniaxial", sign: int = -1) -> cs.
     return cs.Problem([specimen], parameters)
 
 
+def rubber_with_slack(left_out: float = 0.0) -> cs.Problem:
+    """Strip of E = 900 kPa to a stretch of 1.2, slack below a strain of about 2 %; without the rows
+    of strains below `left_out`.
+    """
+    strain = np.linspace(0, 0.2, 61)
+    stretch = 1 + strain - 0.006 * (1 - np.exp(-strain / 0.006))
+    stress_pa = 3e5 * (stretch - stretch**-2) + 200 * rng().normal(size=61)
+    used = strain >= left_out
+    specimen = cs.Specimen("uniaxial", strain[used], stress_pa[used], 200.0, strain_zero=0.02)
+    parameters = {"young_pa": cs.Unknown(), "poisson": 0.499}
+    return cs.Problem([specimen.experiment("neo-hookean", "one")], parameters)
+
+
 FIBRES = cs.Fibres(direction=[0, 0, 1.0])
 REINFORCED = {"mu_pa": 1e5, "kappa_pa": 1e8, "fibre_pa": 2e6} | UNDAMPED
 

@@ -40,8 +40,9 @@ FOAM_LAWS = ("neo-hookean", "hyperfoam-1", "hyperfoam-2")
 ANGLE = "the angle of the cut (cut_angle_deg) and the direction of the fibres"
 # Why a curve is no straight line below `STRAIN`.
 TOE = (
-    "the slope grows with the load, which no law does at such strains: at small loads faces or grips "
-    "do not touch everywhere. Leave out these rows with window_s, and let strain_zero be unknown"
+    f"the slope grows with the load below a strain of {100 * STRAIN:g} %, unlike that of any law: at "
+    "small loads faces or grips do not touch everywhere. Leave out these rows with window_s, and let "
+    "strain_zero be unknown"
 )
 # Why no law fits a curve that returns.
 UNLOADED = (
@@ -91,13 +92,15 @@ def as_specimen_concerns(
         codes["noise/larger"] = "specimen/branches"
         data["branches"] = max(len(p.prony) for each in experiments for p in each.body.parts)
         data["remedy"] = "add branches of the memory, [[object.prony]]"
-    elif all(np.abs(strain).max() < STRAIN for strain in strains):
-        if growing := [each.name for each in experiments if _slope_grows(each)]:
-            advice = f"in {listed(growing)} {TOE}"
+    else:
+        are_small = all(np.abs(strain).max() < STRAIN for strain in strains)
+        if toes := [each.name for each in experiments if _has_toe(each)]:
+            advice = f"in {listed(toes)} {TOE}"
             explained.add("information/default-bound")
-        else:
+        elif are_small:
             codes["noise/larger"] = "noise/larger"
-        data["remedy"] = "measure the area and unloaded length"
+        if are_small:
+            data["remedy"] = "measure the area and unloaded length"
     replaced = [
         replace(
             concern,
@@ -147,19 +150,32 @@ def _is_unloaded(experiment: Experiment) -> bool:
     return returns and not any(part.prony for part in experiment.body.parts)
 
 
-def _slope_grows(experiment: Experiment) -> bool:
-    """Whether the slope of the stress grows with the strain by more than noise."""
+def _has_toe(experiment: Experiment) -> bool:
+    """Whether the slope of the stress grows below `STRAIN`, and at twice that strain less than half
+    as fast, both by more than noise: the slope of a law that stiffens grows ever faster.
+    """
     strain = np.abs(specimen_strains(experiment)[0])
     gauge = experiment.readings[0]
     stress_pa = np.abs(gauge.measured_values[:, 0])
-    known = np.isfinite(stress_pa)
-    if known.sum() < 4 or not np.ptp(strain[known]) or is_unloading(strain):
+    if not np.ptp(strain) or is_unloading(strain):
         return False
-    sigmas_pa = np.broadcast_to(gauge.sample_sigmas[:, 0], len(strain))[known]
-    powers = np.vander(strain[known] / strain[known].max(), 3) / sigmas_pa[:, None]
-    scaled = stress_pa[known] / sigmas_pa
-    curvature, *_ = np.linalg.lstsq(powers, scaled)[0]
-    return bool(curvature > GROSS_MISFIT * np.sqrt(np.linalg.pinv(powers.T @ powers)[0, 0]))
+    sigmas_pa = np.broadcast_to(gauge.sample_sigmas[:, 0], len(strain))
+
+    def deviations(largest: float, weights: Sequence[float]) -> float:
+        """Weighted sum of the coefficients of the polynomial of the stress up to a strain, in its
+        standard deviations.
+        """
+        used = np.isfinite(stress_pa) & (strain <= largest)
+        if used.sum() <= len(weights):
+            return 0.0
+        powers = np.vander(strain[used] / strain[used].max(), len(weights)) / sigmas_pa[used, None]
+        coefficients = np.linalg.lstsq(powers, stress_pa[used] / sigmas_pa[used])[0]
+        variance = weights @ np.linalg.pinv(powers.T @ powers) @ weights
+        return float(weights @ coefficients / np.sqrt(variance))
+
+    if deviations(STRAIN, (1, 0, 0)) <= GROSS_MISFIT:
+        return False
+    return strain.max() < STRAIN or deviations(2 * STRAIN, (6, 1, 0, 0)) < -GROSS_MISFIT
 
 
 def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:
