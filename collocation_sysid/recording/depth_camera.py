@@ -354,13 +354,13 @@ def points_from_image(image_m: Array, camera: Camera) -> Array:
             "cx], [0, fy, cy], [0, 0, 1]] in pixels: only point clouds can be used without it"
         )
     depth = np.where(np.isfinite(image_m) & (image_m > 0), image_m, np.nan)
-    is_inner = np.isfinite(depth)
+    is_inner = np.zeros(depth.shape, dtype=bool)
+    is_inner[1:-1, 1:-1] = np.isfinite(depth)[1:-1, 1:-1]
     for axis in (0, 1):
         for way in (1, -1):
             is_inner &= np.abs(
                 np.roll(depth, way, axis) - depth
             ) < LARGEST_RELATIVE_JUMP * np.nan_to_num(depth)
-    is_inner[[0, -1]] = is_inner[:, [0, -1]] = False
     v, u = np.nonzero(is_inner)
     return camera.points_at_unit_depth(np.column_stack([u, v]).astype(float)) * depth[v, u][:, None]
 

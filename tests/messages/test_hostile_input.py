@@ -56,6 +56,8 @@ from collocation_sysid.fem.meshes.structured import (
 from collocation_sysid.problem import Problem, loading
 from collocation_sysid.problem import size as problem_size
 from collocation_sysid.recording import read_markers, read_poses, write_markers_csv
+from collocation_sysid.recording.camera import Camera
+from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.sources.depth_files import read_depth
 from collocation_sysid.recording.sources.source import open_source
 from collocation_sysid.result import run_writers
@@ -731,6 +733,19 @@ def test_depth_archives_of_the_wrong_shape_are_refused(tmp_path: Path, shape: tu
     np.savez(tmp_path / "depth.npz", depth_m=np.ones(shape))
     with pytest.raises(InputError, match=r"depth_m has the shape .*; expected \(any, any\) or"):
         read_depth(tmp_path / "depth.npz", count_m=None, length_m=None)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (50, 2), (2, 50, 50)])
+def test_archives_of_clouds_of_the_wrong_shape_are_refused(tmp_path: Path, shape: tuple[int, ...]):
+    np.savez(tmp_path / "cloud.npz", points_m=np.ones(shape))
+    with pytest.raises(InputError, match=r"points_m has the shape .*; expected \(any, 3\) or"):
+        read_depth(tmp_path / "cloud.npz", count_m=None, length_m=1.0)
+
+
+@pytest.mark.parametrize("shape", [(0, 160), (120, 0), (1, 1), (2, 2)])
+def test_an_image_without_inner_pixels_has_no_points(shape: tuple[int, int]):
+    camera = Camera([[300.0, 0, 80], [0, 300.0, 60], [0, 0, 1]])
+    assert points_from_image(np.ones(shape), camera).shape == (0, 3)
 
 
 def test_text_that_no_memory_can_hold_is_refused_unread(

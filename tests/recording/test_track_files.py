@@ -14,6 +14,7 @@ from kit.logs import json_mcap
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.features.image_tracks.files import read_tracks
+from collocation_sysid.recording import read_markers
 from collocation_sysid.recording.sources.calibration_files import read_calibration
 from collocation_sysid.recording.sources.topics import list_topics
 
@@ -135,6 +136,16 @@ def test_tables_of_sleap_and_of_x_and_y_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.pixels[:, ::-1], PIXELS)
     assert read.likelihood is not None
     np.testing.assert_allclose(read.likelihood[:, ::-1], SCORES)
+
+
+@pytest.mark.parametrize("name", ["wide", "sleap", "deeplabcut"])
+def test_pixels_in_a_table_of_markers_are_called_image_tracks(name: str, tmp_path: Path) -> None:
+    if name == "deeplabcut":
+        deeplabcut().to_csv(tmp_path / "a.csv")
+    else:
+        write(tmp_path, "a.csv", wide() if name == "wide" else sleap_table(("",)))
+    with pytest.raises(InputError, match=r"pixels of a video belong to \[\[experiment.image_tr"):
+        read_markers(tmp_path / "a.csv")
 
 
 def test_positions_in_space_are_no_pixels(tmp_path: Path) -> None:

@@ -229,6 +229,12 @@ def test_tracks_of_two_coordinates_are_used():
     assert run.solution.parameters["young_pa"] == pytest.approx(2e4, rel=0.05)
 
 
+def test_a_finger_filmed_by_a_phone_is_identified():
+    run = answer("phone_finger")
+    assert run.trust.verdict in ("good", "check")
+    assert_within(run, "young_pa", 150e3)
+
+
 FILMED = """
 [object]
 mesh = "hook.msh"

@@ -9,13 +9,31 @@ of damaged depth images in `messages/test_hostile_input`, and those of plane str
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from kit.depth import looking
 from kit.falling import DURATION_S, FREE, TRUTH, TWIN_HZ, falling_block, noise_of
+from kit.filmed import (
+    DISTORTION,
+    MATRIX,
+    NAMES,
+    NOISE_PX,
+    PLACES_M,
+    T_S,
+    bar,
+    filming,
+    motion_m,
+    projected,
+    swung,
+)
+from kit.filmed import TRUTH as FILMED
 from kit.problems import hung_cube, measured
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 from study_hidden_errors import unplaced
 
 import collocation_sysid as cs
@@ -377,3 +395,133 @@ def test_the_law_of_mujoco_is_named_and_no_turn(young_pa, are_placed, seed):
     assert "such as st-venant-kirchhoff" in first
     assert "widen its prior" not in first
     assert run.parameters["young_pa"] == pytest.approx(young_pa, rel=0.15)
+
+
+FINGER_M = (0.016, 0.026, 0.1)
+
+
+def swung_finger(cells: tuple[int, int, int], t_s: np.ndarray, **keys: Any) -> cs.Experiment:
+    """Cast finger that hangs at rest for 0.2 s and is then moved sideways by 30 mm."""
+    mesh = cs.box_mesh(FINGER_M, cells)
+    body = cs.Body(mesh, mass_kg=0.0447, element="tet10-p0", made="cast", mesh_from="cad")
+    poses = np.tile(np.eye(4), (len(t_s), 1, 1))
+    poses[:, 0, 3] = 0.015 * (1 - np.cos(np.pi * np.clip((t_s - 0.2) / 0.15, 0, 1)))
+    held = cs.Grasp(np.flatnonzero(body.nodes_m[:, 2] > FINGER_M[2] - 1e-9), poses)
+    return cs.Experiment(body, t_s, [held], name="swing", start="equilibrium", **keys)
+
+
+@cache
+def finger_motion() -> CubicSpline:
+    """Motion [m] over time of six points of a finger on a finer mesh; E is 150 kPa."""
+    t_s = np.arange(120) / 120
+    places_m = np.array([[x, 0.0, z] for z in (0.01, 0.035, 0.06) for x in (0.004, 0.012)])
+    unseen = cs.Markers(t_s, np.zeros((len(t_s), 6, 3)), 1e-3, places_m=places_m)
+    finger = swung_finger((2, 2, 8), t_s, markers=unseen, nuisance=cs.Nuisance.none())
+    truth = {"young_pa": 1.5e5, "poisson": 0.485, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.0}
+    return CubicSpline(t_s, cs.simulate(finger, truth, "bdf2", substeps=4).markers_m)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guess_pa", [2e5, None])
+def test_a_finger_is_identified_from_a_late_video_of_a_turned_camera(guess_pa):
+    true = filming("front", pose=looking(np.array([0.03, -0.4, 0.08]), np.array([0.02, 0, 0.05])))
+    t_s = np.arange(51) / 60
+    seen_px = noisy(projected(true, finger_motion()(t_s + 0.02)), 0.3, 1)
+    pose = np.array(true.pose)
+    turn = Rotation.from_rotvec(np.deg2rad([0.6, -0.6, 0.5]))
+    pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+    pose[:3, 3] += [0.003, -0.002, 0.002]
+    names = [f"p{k}" for k in range(6)]
+    film = cs.ImageTracks("front", replace(true, pose=pose), t_s, seen_px, names, sigma_px=0.5)
+    film = replace(film, clock_sigma_s=0.02)
+    finger = swung_finger((2, 1, 6), np.arange(54) / 60, readings=[film])
+    unknown = {"young_pa": cs.Unknown(guess_pa), "gamma_r_s": cs.Unknown()}
+    run = cs.run(cs.Problem([finger], {"poisson": 0.49, "gamma_m_1_s": 0.0} | unknown))
+    assert run.trust.verdict in ("good", "check")
+    assert_within(run, "young_pa", 1.5e5)
+    assert_within(run, "gamma_r_s", 2e-3)
+    assert run.solution.nuisance("delay_s") == pytest.approx(0.02, abs=2e-3)
+
+
+FILMED_BAR = """
+[object]
+mesh = "bar.vtu"
+density_kg_m3 = 1070.0
+[parameters]
+young_pa = {}
+poisson = 0.45
+gamma_r_s = 0.002
+gamma_m_1_s = 0.1
+[[experiment]]
+name = "swing"
+[experiment.grasp]
+nodes = { box_m = [[-1, -1, -1], [1e-6, 1, 1]] }
+poses = "poses.csv"
+[[experiment.image_tracks]]
+name = "front"
+file = "FILE"
+frame_rate_hz = 100
+sigma_px = 0.5
+places_m = PLACES
+camera = { matrix = MATRIX, distortion = DISTORTION, pose = POSE }
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("file", ["sleap.csv", "cotracker.npz"])
+def test_tables_of_trackers_without_times_are_solved(tmp_path, file):
+    pixels = noisy(projected(filming("front"), motion_m()), NOISE_PX)
+    pixels[7:22, [0, 2, 4]] = np.nan
+    if file == "sleap.csv":
+        columns = {"frame_idx": np.arange(len(T_S))}
+        for k, name in enumerate(NAMES):
+            columns |= {f"{name}.x": pixels[:, k, 0], f"{name}.y": pixels[:, k, 1]}
+            columns |= {f"{name}.score": np.isfinite(pixels[:, k, 0]).astype(float)}
+        write_test(tmp_path, "sleap", columns)
+        table = (tmp_path / file).read_text().replace("nan", "")
+        (tmp_path / file).write_text(table)
+    else:
+        arrays = {
+            "pred_tracks": np.nan_to_num(pixels)[None],
+            "pred_visibility": np.isfinite(pixels[None, ..., 0]),
+        }
+        np.savez(tmp_path / file, names=np.array(NAMES), **arrays)
+    (held,) = swung().grasps
+    matrices = np.tile(np.eye(4), (len(T_S), 1, 1))
+    matrices[:, :3, 3] = held.poses.positions_m
+    np.savez(tmp_path / "poses.npz", t_s=T_S, matrices=matrices)
+    bar().mesh.write(tmp_path / "bar.vtu")
+    camera = filming("front")
+    text = FILMED_BAR.replace("FILE", file).replace("poses.csv", "poses.npz")
+    text = text.replace("PLACES", "{" + ", ".join(f"{n} = {[*PLACES_M[n]]}" for n in NAMES) + "}")
+    text = text.replace("MATRIX", str(MATRIX)).replace("DISTORTION", str(DISTORTION))
+    (tmp_path / "problem.toml").write_text(text.replace("POSE", str(camera.pose.tolist())))
+    steps = ["transcription.scheme=midpoint", "transcription.substeps=1"]
+    run = cs.run(cs.Problem.read(tmp_path / "problem.toml", overrides=steps))
+    assert run.trust.verdict in ("good", "check")
+    # The estimate is corrected for a coarse mesh, which these simulated data do not need.
+    assert run.solution.parameters["young_pa"] == pytest.approx(FILMED["young_pa"], rel=0.02)
+    assert_within(run, "young_pa", FILMED["young_pa"])
+
+
+def gent_pa(kind: str, stretch: np.ndarray) -> np.ndarray:
+    """Stress of a rubber whose chains have a limited length; E is 390 kPa."""
+    lateral = {"uniaxial": stretch**-0.5, "planar": 1 / stretch, "equibiaxial": stretch**-2}[kind]
+    across = {"uniaxial": lateral, "planar": np.ones_like(stretch), "equibiaxial": stretch}[kind]
+    invariant = stretch**2 + across**2 + (stretch * across) ** -2
+    return 130e3 * 18 / (21 - invariant) * (stretch - lateral**2 / stretch)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("kind", "largest", "law"),
+    [("uniaxial", 1.98, "ogden-2"), ("planar", 1.98, "ogden-2"), ("equibiaxial", 1.6, "ogden-3")],
+)
+def test_smooth_curves_of_another_law_end_with_an_answer_of_ogden(tmp_path, kind, largest, law):
+    stretch = np.linspace(1.04, largest, 22)
+    columns = {"stretch": stretch, "stress (Pa)": gent_pa(kind, stretch)}
+    terms = range(1, int(law[-1]) + 1)
+    unknown = dict.fromkeys(name for p in terms for name in (f"mu_{p}_pa", f"alpha_{p}"))
+    run = solved(tmp_path, law, unknown | RUBBER, ("pull", kind, columns, ["sigma_pa = 500"]))
+    assert run.solution.status.converged
+    assert_within(run, "young_pa", 390e3)

@@ -126,7 +126,7 @@ def _wide_labels(table: Table) -> list[str]:
     raise InputError(
         f"the columns are {_first_columns(header)} ({'; '.join(faults) or 'no markers'}); expected t_s "
         "and, for each marker, <name>_x, <name>_y, <name>_z; or a C3D, TRC, Qualisys TSV, Motive or "
-        "Vicon CSV file",
+        "Vicon CSV file; pixels of a video belong to [[experiment.image_tracks]]",
         where="line 1",
     )
 
