@@ -217,7 +217,9 @@ def _run_study(
         report.write(folder)
     if not is_complete:
         raise interruption_exit(
-            f"the tables of {len(report.records)} of {len(planned)} runs are in {folder}",
+            f"the tables of {len(report.records)} of {len(planned)} runs are in {folder}"
+            if report.records
+            else "no run has ended",
             continues=False,
         )
     failures = [Line(each, "doubtful") for each in report.failures]

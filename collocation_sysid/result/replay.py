@@ -23,7 +23,7 @@ from ..common.display import rounded, two_digits
 from ..common.files import RESULT_FILE, damage_refused, require_own
 from ..errors import InputError
 from ..fem.elements import EDGES
-from ..fem.laws.constants import symbol_of, without_region
+from ..fem.laws.constants import BENDING, symbol_of, unit_of, without_region
 from ..recording.experiment import Experiment
 from ..recording.sample_times import TIME_TOLERANCE_S
 from ..recording.specimen_files import specimen_strains
@@ -519,20 +519,18 @@ def read_run(folder: str | Path) -> tuple[Result, list[MotionRecord]]:
 
 
 def run_headline(result: Result) -> str:
-    """Return Young's moduli [Pa] of a result, of regions too, each with its combined standard
-    uncertainty if known, and the verdict, as one line of text; the verdict alone if there are no
-    moduli.
+    """Return Young's moduli and bending stiffnesses of a result, of regions too, each with its
+    combined standard uncertainty if known, and the verdict, as one line of text; the verdict alone
+    if there are none of them.
     """
-    moduli = {
-        symbol_of(n): each
-        for n, each in result.estimates.items()
-        if without_region(n) == "young_pa"
-    }
     sentences = []
-    for name, each in moduli.items():
+    for name, each in result.estimates.items():
+        if without_region(name) not in ("young_pa", BENDING.name):
+            continue
         deviation = each.combined_std_error
         bar = f" ± {two_digits(deviation)}" if deviation else ""
-        sentences.append(f"{name} = {rounded(each.value, deviation)}{bar} Pa")
+        value = rounded(each.value, deviation)
+        sentences.append(f"{symbol_of(name)} = {value}{bar} {unit_of(name)}")
     return "; ".join([*sentences, f"verdict: {result.trust.verdict}"])
 
 

@@ -170,6 +170,17 @@ def test_an_interrupted_study_keeps_the_finished_rows(tiny, stand_in, monkeypatc
     assert "1 of 2 runs remain to be done." in (tiny / "out" / "summary.md").read_text()
 
 
+def test_a_study_without_a_finished_run_keeps_nothing(tiny, stand_in, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_commands, "run_all", interrupt)
+    outcome = compare()
+    assert (outcome.code, outcome.out) == (130, "")
+    assert outcome.err.endswith("interrupted: no run has ended\n")
+    assert not (tiny / "out").exists()
+
+
 @pytest.mark.long
 def test_progress_is_one_line_on_a_terminal(tiny, stand_in, monkeypatch):
     shown = io.StringIO()

@@ -221,6 +221,8 @@ def test_the_film_states_the_answer(run):
         {"core.young_pa": value(1543.21, 123.4)}, trust=Assessment((Concern("solve/moves"),))
     )
     assert run_headline(one) == "E core = 1540 ± 120 Pa; verdict: check"
+    cable = a_result({"bending_n_m2": value(1.0081e-3, 1.1e-5)})
+    assert run_headline(cable).startswith("EI = 0.001008 ± 0.000011 N m²; verdict: ")
     texts = [
         text.get_text()
         for text in FilmFigure(swing, headline=run_headline(result)).figure.axes[0].texts
