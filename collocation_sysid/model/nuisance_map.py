@@ -48,6 +48,8 @@ from ..recording.nuisance import (
     POSE_TURN,
     PRESSURE_LAG,
     PRESSURE_OFFSET,
+    SMALLEST_FACTOR,
+    SPECIMEN_FACTORS,
     STRAIN_ZERO,
     TARE,
     TENSION_OFFSET,
@@ -404,7 +406,8 @@ class NuisanceMap(RecordingQuantities):
         prior standard deviations.
 
         They are those of the rows, except for the clock and the times of loads, whose bounds follow
-        from the recording. They may be infinite.
+        from the recording, and for the factors of the stress of a specimen, at least
+        `SMALLEST_FACTOR`. They may be infinite.
 
         Parameters
         ----------
@@ -414,6 +417,8 @@ class NuisanceMap(RecordingQuantities):
             of the duration, or within `LARGEST_SHIFT_SAMPLES` samples if that is more.
         """
         low = np.array([entry.row.low for entry in self.entries])
+        factors = self.indices_of_rows(*SPECIMEN_FACTORS.values())
+        low[factors] = (SMALLEST_FACTOR - 1) / self.scales[factors]
         high = np.array([entry.row.high for entry in self.entries])
         for k in self.indices_of_rows(TIME):
             middle_s = samples * self.interval_s

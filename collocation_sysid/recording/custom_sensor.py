@@ -31,7 +31,7 @@ from ..fem.body import Body
 from ..fem.laws.constants import unit_of, without_unit
 from .deviation import Deviation
 from .measurement import Measurement, checked_ratios, split_sigma
-from .nuisance import GAUGE, SPECIMEN_STIFFNESS
+from .nuisance import GAUGE, SPECIMEN_FACTORS
 from .poses import Frame
 from .sample_times import first_unordered_time
 
@@ -217,8 +217,7 @@ class CustomSensor(Measurement):
         with the same label are shared by all sensors of the experiment that have them.
         """
         for name, sigma in self.unknowns.items():
-            row = SPECIMEN_STIFFNESS if name == SPECIMEN_STIFFNESS.name else GAUGE
-            yield row, self.unknown_label(name), sigma
+            yield SPECIMEN_FACTORS.get(name, GAUGE), self.unknown_label(name), sigma
 
     def other_views(self, experiment: Any) -> Iterator[tuple[str, Self]]:
         """Yield sensors of the same kind at other places that a check compares, each after a

@@ -748,8 +748,17 @@ GRIP = (GRASP_TURN, GRASP_SHIFT)
 KINDS = tuple(row for row in [*vars().values()] if isinstance(row, Deviation))
 # What a `Gauge` does not know of itself: it has the deviations, in place of `Nuisance`.
 GAUGE = Deviation("reading", "", sigma=None, of="gauge", changes=())
-# Unknown of the stress of a specimen that several tests of it share.
-SPECIMEN_STIFFNESS = Deviation("specimen_stiffness", "", sigma=None, of="gauge", changes=())
+# Relative errors of the stress of a specimen, which a step of the solver changes as it does moduli.
+# Several tests of a specimen share its stiffness.
+SPECIMEN_FACTORS = {
+    name: Deviation(
+        name, "", sigma=None, of="gauge", changes=(), reach=UNLIMITED_REACH, step=lambda _: 1.0
+    )
+    for name in ("area_error", "specimen_stiffness")
+}
+SPECIMEN_STIFFNESS = SPECIMEN_FACTORS["specimen_stiffness"]
+# No area is ten times too large: towards zero, constants have no effect on the stress.
+SMALLEST_FACTOR = 0.1
 # Coordinates of places on the surface that sensors refer to, and other unknowns of single points.
 SURFACE_PLACE = Deviation(
     "surface_place", "", sigma=None, of="gauge", changes=(), reach=3.0, step=_largest_place_step_m

@@ -31,7 +31,7 @@ from ..model.contact.summary import friction_summaries
 from ..problem import Problem
 from ..program.collocation import ExperimentIterate
 from ..recording.deviation import in_readable_unit
-from ..recording.nuisance import GAUGE, JOINING, PLACE, SPECIMEN_STIFFNESS, TARE
+from ..recording.nuisance import GAUGE, JOINING, PLACE, SPECIMEN_FACTORS, TARE
 from ..statistics.combinations import identifiability_sentences
 from ..statistics.field_estimates import FieldEstimate
 from ..statistics.scale_identifiability import ScaleReference, scale_reference
@@ -344,7 +344,7 @@ def _place_sentences(places: Mapping[str, MarkerPlace]) -> Iterator[str]:
 def _nuisance_sentences(part: ExperimentIterate, answer: SolvedProblem) -> Iterator[str]:
     nuisance = part.transcription.nuisance
     values = part.phi * nuisance.scales
-    for row in (*part.transcription.experiment.nuisance.kinds, GAUGE, SPECIMEN_STIFFNESS):
+    for row in (*part.transcription.experiment.nuisance.kinds, GAUGE, *SPECIMEN_FACTORS.values()):
         here = nuisance.indices_of_rows(row).tolist()
         if row == PLACE or not here:
             continue

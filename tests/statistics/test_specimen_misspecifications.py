@@ -107,6 +107,20 @@ def test_nothing_is_named_after_a_search_that_did_not_converge():
     assert not run.causes
 
 
+@pytest.mark.parametrize(
+    ("largest", "young_pa", "sigma_pa"), [(0.3, 3e5, 1.0), (0.4, 3e5, 3.0), (0.5, 3e5, 10.0)]
+)
+def test_a_search_with_positive_signs_of_compression_ends(largest, young_pa, sigma_pa):
+    """A stiff material, and hardly an area, fit less badly than rubber does."""
+    strain = np.linspace(0.05, 1, 20) * largest
+    stress_pa = -young_pa / 3 * (1 - strain - (1 - strain) ** -2)
+    noise_pa = sigma_pa * np.random.default_rng(0).normal(size=20)
+    press = cs.Specimen("uniaxial", strain, stress_pa + noise_pa, sigma_pa).experiment(name="press")
+    solution = cs.solve(cs.Problem([press], {"mu_pa": cs.Unknown()} | FIXED))
+    assert solution.status.converged
+    assert solution.history[-1].number < 100
+
+
 # Kinds of test, zeros, and all data ---------------------------------------------------------------
 
 
