@@ -297,7 +297,9 @@ class FilmFigure:
         everything = _points_to_show_m(replay, surface_m, samples=is_finite)
         everything = np.vstack([everything, *(each.reshape(-1, 3) for each in paths_m.values())])
         compared = [
-            (n, m) for n, _, m in shown if m.size and np.isfinite(m - replay.measured_m).any()
+            (n, m)
+            for n, _, m in shown
+            if np.isfinite(m - replay.measured_m).any(axis=(1, 2)).sum() > 1
         ]
         width = FILM_WIDTH_MM - (ERROR_PANEL_WIDTH_MM if compared else 0.0)
         aspect = aspect_ratio(camera, everything)
@@ -349,7 +351,7 @@ class FilmFigure:
             axes.plot(*path_mm.T, **style)
             if self.paths:
                 alone = path_mm[is_alone(path_mm[:, 0])]
-                axes.plot(*alone.T, **style | {"ls": "", "marker": "o", "ms": 7, "mfc": "none"})
+                axes.plot(*alone.T, **style | {"ls": "", "marker": "o", "ms": 7})
         for k, (name, positions, markers) in enumerate(trajectories):
             wire = GREEN if k else None
             title = axes.text(

@@ -131,6 +131,9 @@ def test_a_film_has_the_errors_of_both_beside_the_body_and_a_line_at_its_time(ru
     assert film.figure.axes[1].get_xlim() == pytest.approx((0, end_s))
     unmarked = replace(swing, measured_m=np.full_like(swing.measured_m, np.nan))
     assert FilmFigure(unmarked).cursor is None
+    # One sample would be a dot in empty axes.
+    once_m = np.where(np.arange(len(swing.t_s))[:, None, None] == 3, swing.measured_m, np.nan)
+    assert FilmFigure(replace(swing, measured_m=once_m)).cursor is None
 
 
 def test_the_body_fills_a_large_part_of_the_frame(run):
