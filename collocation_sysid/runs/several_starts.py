@@ -49,8 +49,8 @@ from ..statistics.linearised import AT_BOUND, parameter_values
 # Difference of losses below which two solutions are the same minimum with other correspondences:
 # in simulated recordings they differ by up to 5.
 SAME_LOSS = 10.0
-# Relative difference of all parameters below which a search with such a loss is at the same minimum
-# and need not continue.
+# Relative difference of all parameters below which a search with such a loss is where another one
+# was, and need not continue.
 SAME_PARAMETERS = 0.01
 # Estimate of an error, in standard deviations of its prior, that makes a solution doubtful.
 UNLIKELY = 4.5
@@ -84,7 +84,7 @@ def robust_loss(solution: Solution) -> float:
 
 
 class KnownMinimum(Exception):
-    """A search has arrived at a minimum that is known."""
+    """A search has arrived where another one was."""
 
     def __init__(self, solution: Solution) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ class KnownMinimum(Exception):
 
 
 def until_known(method: Method, known: Sequence[Solution]) -> Method:
-    """Return a method that raises `KnownMinimum` where a known solution is reached."""
+    """Return a method that raises `KnownMinimum` at an iterate of the search for a known solution."""
 
     def solve(
         collocation: Collocation, watch: Watch | None = None, start: Array | None = None
@@ -111,14 +111,14 @@ def until_known(method: Method, known: Sequence[Solution]) -> Method:
 
 
 def _is_at(line: Iteration, solution: Solution) -> bool:
-    last = solution.history[-1]
-    return (
-        line.share == 1.0
-        and abs(line.loss - last.loss) <= SAME_LOSS
+    return any(
+        line.share == known.share
+        and abs(line.loss - known.loss) <= SAME_LOSS
         and all(
-            np.isclose(value, last.parameters[name], rtol=SAME_PARAMETERS)
+            np.isclose(value, known.parameters[name], rtol=SAME_PARAMETERS)
             for name, value in line.parameters.items()
         )
+        for known in solution.history
     )
 
 
