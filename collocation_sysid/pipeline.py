@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,12 +31,7 @@ from .program.collocation import Collocation
 from .recording.impact_steps import IMPACT_NOTE
 from .runs.check.cost import require_memory
 from .runs.expected_precision import with_measurements
-from .runs.forward_simulation import (
-    missed_by_simulations,
-    simulate_experiments,
-    step_changes,
-    step_error,
-)
+from .runs.forward_simulation import simulate_experiments, step_changes, step_error
 from .runs.mesh_resolution import mesh_changes
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
@@ -54,15 +48,13 @@ from .statistics.assessment import impact_step_concerns, rotation_step_concerns
 from .statistics.budget.discretisation_error import (
     MESH_ORDER,
     MOST_SUBSTEPS,
-    NEGLIGIBLE,
-    NEGLIGIBLE_IN_SIMULATIONS,
+    SMALL_SHARE,
     extrapolated,
 )
 from .statistics.linearised import LinearisedFit, linearise_fit
 from .statistics.pose_noise import with_pose_noise
 from .statistics.profile_likelihood import Profile, profile_of_solution
 from .statistics.residuals.diagnostics import diagnose_markers
-from .statistics.thresholds import ROLLOUT
 from .statistics.uncertainty import uncertainty_from_fit
 
 if TYPE_CHECKING:
@@ -222,7 +214,8 @@ def run(
             answer = _with_problem_notes(answer)
             if answer.uncertainty is not None and fit is not None:
                 profiles = profile_likelihoods(answer, fit, say=say)
-                answer = _with_posterior(answer, fit, steps, say=say)
+                if answer.posterior is None:
+                    answer = _with_posterior(answer, fit, steps, say=say)
                 answer = replace(answer, profiles=profiles)
                 answer = _with_added_measurements(answer, say)
                 answer = _with_offset_notes(answer, fit)
@@ -284,9 +277,15 @@ def _with_problem_notes(answer: Run) -> Run:
 
 
 def _with_posterior(
-    answer: Run, fit: LinearisedFit, steps: Sequence[Array] | None, say: Log
+    answer: Run,
+    fit: LinearisedFit,
+    steps: Sequence[Array] | None,
+    say: Log,
+    coarse: Solution | None = None,
 ) -> Run:
-    """Replace the statistical uncertainty of the solution by the posterior with all effects."""
+    """Replace the statistical uncertainty of the solution by the posterior with all effects; that of
+    the mesh is known if it was computed at a solution nearby with longer steps, `coarse`.
+    """
     from .judge.augmented_fit import augmented_fit, suspects
 
     problem, solution = answer.problem, answer.solution
@@ -300,7 +299,7 @@ def _with_posterior(
     if not problem.uncertainty.numerical:
         say("estimating the error of the mesh")
         with counted_phase(StepUnit.TIME_STEP, rows):
-            changes, by_mesh, note = mesh_changes(problem, solution, fit)
+            changes, by_mesh, note = mesh_changes(problem, coarse or solution, fit)
         notes = (*notes, note) if note else notes
         if by_mesh is not None:
             discretisation["mesh"] = [extrapolated(each, MESH_ORDER) for each in changes]
@@ -431,20 +430,21 @@ def _fine_enough(
     error = step_error(coarse.problem, first, fit, steps, known)
     problem = coarse.problem
     before = first.collocation.substeps
-    negligible = NEGLIGIBLE_IN_SIMULATIONS if problem.is_declared_simulated else NEGLIGIBLE
-    order = as_scheme(problem.scheme).order
-    factor = error.suggested_substeps(known, order, negligible)
-    missed = missed_by_simulations(first, coarse.rollouts)
-    of_motion = ceil((missed / ROLLOUT) ** (1 / order))
-    substeps = min(before * max(factor, of_motion), MOST_SUBSTEPS)
+    factor = error.suggested_substeps(known, as_scheme(problem.scheme).order)
+    is_near = False
+    if factor > 1:
+        judged = _with_posterior(coarse, fit, steps, say=say)
+        is_near = judged.is_consistent
+        shares = (line.shares.get("time_step", 0.0) for line in judged.budget.values())
+        if is_near and max(shares, default=0.0) <= SMALL_SHARE:
+            return judged, fit, steps
+    substeps = min(before * factor, MOST_SUBSTEPS)
     number = "one time step" if before == 1 else f"{before} time steps"
     worst, many = error.largest_correction(known)
     why = (
         f"with {number} per sample, the estimated time-step error of {worst} is {many:.2g} "
         "standard errors"
     )
-    if of_motion > factor:
-        why = f"with {number} per sample, the forward simulation deviates from the measurements"
     if fit.at_bound[: fit.shared_count].all():
         substeps = MOST_SUBSTEPS
         why = f"with {number} per sample, every parameter ends at a bound"
@@ -466,7 +466,10 @@ def _fine_enough(
         return replace(coarse, notes=(note, *coarse.notes)), fit, steps
     most = ", the largest number that is chosen automatically" if substeps == MOST_SUBSTEPS else ""
     reason = f"{why}; therefore the problem was solved again with {substeps} steps per sample{most}"
-    return _checked(problem, finer.after(first, reason), say=say)
+    answer, fit, steps = _checked(problem, finer.after(first, reason), say=say)
+    if is_near and fit is not None and answer.uncertainty is not None:
+        answer = _with_posterior(answer, fit, steps, say=say, coarse=first)
+    return answer, fit, steps
 
 
 def _solve_from_parameters(

@@ -15,13 +15,14 @@ information, that of an estimate with derivative g by q contains (gᵀ C_k)² fo
 is the standard deviation of its prior.
 
 The error of the mesh and of the time step are effects with a mean: that of the estimated change to
-elements, or steps, of half the length, extrapolated to infinitely small ones. The data learn its
-size, but not its shape, which is known as badly: each channel (one number of a marker over time), and
-the part that parameters reproduce, of which residuals show nothing, have amplitudes of their own with
-the same deviation, which are considered.
+elements, or steps, of half the length, extrapolated to infinitely small ones. The data learn the
+size of that of the mesh, but not its shape, which is known as badly: each channel (one number of a
+marker over time), and the part that parameters reproduce, of which residuals show nothing, have
+amplitudes of their own with the same deviation, which are considered. The error of the time step is
+considered: its estimate is closer than what residuals tell of it.
 
 A single curve of a static test does not tell effects from each other, nor from the law of the
-material, which is never exact. There effects are considered but not learnt: the estimates are
+material, which is never exact. There all effects are considered but not learnt: the estimates are
 corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962).
 
 An effect that redefines a constant, such as another damping law for γ_r, does not change that
@@ -143,6 +144,17 @@ class Effects:
             self.deviations[kept],
         )
 
+    def expected_in(self, fit: LinearisedFit) -> LinearisedFit:
+        """Return the fit with residuals that contain the effects, each as large as its mean."""
+        changes = (each @ self.means for each in self.blocks)
+        return replace(
+            fit,
+            blocks=tuple(
+                block.changed(change * block.compute_root_weight() * block.is_measured)
+                for block, change in zip(fit.blocks, changes, strict=True)
+            ),
+        )
+
     def added_to(self, fit: LinearisedFit, parameters: Parameters) -> tuple[LinearisedFit, Array]:
         """Return the fit with the effects as its last parameters, and their definition: the matrix
         (p + a, p + a) that turns these parameters into those of the body.
@@ -251,16 +263,19 @@ class Posterior:
         fit : LinearisedFit
             Linearised fit at q (nq,), without effects.
         is_learnt : bool
-            Whether the data correct the effects.
+            Whether the data correct the effects. They never correct that of the time step, which
+            is known better than they show it.
         derived_at : callable, optional
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
-        none = effects.only(())
-        learnt, considered = (effects, none) if is_learnt else (none, effects)
+        names = range(len(effects.names))
+        kept = [k for k in names if is_learnt and effects.names[k] != DISCRETISATION[1].name]
+        learnt = effects.only(kept)
+        considered = effects.only(k for k in names if k not in kept)
         wide, definition = learnt.added_to(fit, parameters)
         step = gauss_newton_step(wide)
-        after = wide.after_step(step)
         step = step + estimate_changes(wide, considered.blocks) @ considered.means
+        after = considered.expected_in(wide).after_step(step)
         there = np.clip(q + step[: len(q)], *parameters.bounds_q)
         if derived_at is not None:
             after = replace(after, derived=derived_at(there))
@@ -296,8 +311,8 @@ class Posterior:
     @cached_property
     def sources(self) -> tuple[tuple[str, ...], Array]:
         """Names of the effects, and changes (p + a, …) of parameters and learnt effects if each is off
-        by the standard deviation of its prior; mesh and time step occur again, once for each amplitude
-        of their shape, and a surprising effect for all that it changes, because another error may
+        by the standard deviation of its prior; a learnt error of the mesh occurs again, once for each
+        amplitude of its shape, and a surprising effect for all that it changes, because another error may
         look alike.
         """
         names, ways = self._priors
@@ -388,7 +403,7 @@ class Posterior:
                 rows[EFFECT + name] = k, 1.0
         own = len(self.considered.names)
         ways = np.pad(self.sources[1], ((0, own), (0, 0)))
-        ways[count:, :own] = np.eye(own)
+        ways[count:, learnt : learnt + own] = np.eye(own)
         covariance = np.pad(self.uncertainty.noise_covariance, (0, own)) + ways @ ways.T
         scatter = self.uncertainty.scatter
         if scatter is not None:

@@ -234,7 +234,7 @@ def _coverage_sentence(result: Result) -> str:
     meshed = any(each.test is None for each in result.fit.experiments.values())
     kinds = ("step", "mesh") if moving and meshed else ("mesh",) if meshed else ()
     known = set(result.discretisation_kinds)
-    names = {each.name for each in result.effects}
+    names = {source for shares in result.budget.values() for source in shares}
     known |= {kind for kind, name in (("step", "time_step"), ("mesh", "mesh")) if name in names}
     covered = [f"the {kind} error" for kind in kinds if kind in known]
     missing = [f"the {kind} error" for kind in kinds if kind not in known]

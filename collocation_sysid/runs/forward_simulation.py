@@ -38,7 +38,7 @@ from ..program.transcription import Transcription
 from ..recording import Experiment
 from ..recording.nuisance import CLOCK_RATE, DEPTH_TIME, JOINING, OBSTACLE_TIME, SENSOR_TIME, TIME
 from ..recording.sample_times import TIME_TOLERANCE_S
-from ..statistics.assessment import InstrumentMisfit, missed_by_simulation
+from ..statistics.assessment import InstrumentMisfit
 from ..statistics.budget.discretisation_error import (
     Refinement,
     change_in_observations,
@@ -379,26 +379,6 @@ def _step_s(problem: Problem, transcription: Transcription) -> float:
     is_smooth = sample_distance(transcription.experiment) >= SMOOTH_SAMPLES
     count = min(max(2 if is_smooth else 4, 2 * transcription.substeps), MOST_STEPS - 1)
     return problem.rollout.timestep_s or transcription.experiment.timestep_s / count
-
-
-def missed_by_simulations(
-    solution: Solution, rollouts: Mapping[str, ForwardSimulation | str]
-) -> float:
-    """Return the largest `missed_by_simulation` of the fitted motions; 0 without any."""
-    moving = {
-        t.experiment.name for t in solution.collocation.transcriptions if not t.experiment.is_static
-    }
-    return max(
-        (
-            missed_by_simulation(simulated, fitted)
-            for name, each in fit_misfits(solution).items()
-            if name in moving and isinstance(rollout := rollouts.get(name), ForwardSimulation)
-            for fitted in each
-            for simulated in rollout.misfits
-            if simulated.what == fitted.what
-        ),
-        default=0.0,
-    )
 
 
 def fit_misfits(solution: Solution) -> dict[str, list[InstrumentMisfit]]:

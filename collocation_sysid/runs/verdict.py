@@ -62,6 +62,7 @@ def solution_concerns(
     uncertainty: Uncertainty | None,
     phi: Array | None = None,
     surprise: Grade | None = None,
+    is_step_known: bool = False,
 ) -> Iterator[Concern]:
     """Yield the concerns about a solution and its forward simulations.
 
@@ -84,6 +85,9 @@ def solution_concerns(
     surprise : {"check", "doubtful"} or None
         Grade of the effects that the residuals need; None if they need none. Without free constants
         the stated ones may as well be wrong, so that the prediction is as grave.
+    is_step_known : bool
+        Whether the error of the time step, by which forward simulations of motions deviate, is an
+        effect of a consistent posterior, which corrects for it and contains it.
     """
     status = solution.status
     yield from body_concerns(solution)
@@ -126,7 +130,9 @@ def solution_concerns(
         if isinstance(rollout, ForwardSimulation):
             for feature in present(FEATURES, [rollout.trajectory.experiment]):
                 yield from feature.simulation_concerns(name, rollout)
-        yield from _forward_concerns(name, rollout, fitted, is_static=name in static)
+        is_static = name in static
+        is_contained = is_step_known and not is_static
+        yield from _forward_concerns(name, rollout, fitted, is_static, is_contained)
     for transcription in collocation.transcriptions:
         yield from rotation_step_concerns(
             transcription.experiment,
@@ -240,8 +246,11 @@ def _forward_concerns(
     rollout: ForwardSimulation | str,
     fitted: Mapping[str, Sequence[InstrumentMisfit]],
     is_static: bool,
+    is_contained: bool,
 ) -> Iterator[Concern]:
-    """A simulation failed, or misses measurements by more than the noise and the fit."""
+    """A simulation failed, or misses measurements by more than the noise and the fit, and than what
+    intervals contain.
+    """
     if not isinstance(rollout, ForwardSimulation):
         yield Concern("roll-out/failed", "doubtful", data={"experiment": name, "why": rollout})
         return
@@ -249,7 +258,7 @@ def _forward_concerns(
         of_fit = {each.what: each for each in fitted[name]}
         for simulated in rollout.misfits:
             # The simulated surface may be near points of a camera that the fitted one is not.
-            if simulated.what in of_fit:
+            if simulated.what in of_fit and not is_contained:
                 yield from forward_simulation_concerns(
                     name, simulated, of_fit[simulated.what], is_static=is_static
                 )

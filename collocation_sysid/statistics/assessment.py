@@ -438,23 +438,17 @@ def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
     )
 
 
-def missed_by_simulation(simulated: InstrumentMisfit, fitted: InstrumentMisfit) -> float:
-    """Return √(simulated² − fitted²) of an instrument, with the larger of the fit's misfit and the
-    noise as unit.
-    """
-    squares = simulated.robust_sigmas**2 - fitted.robust_sigmas**2
-    return float(np.sqrt(max(0.0, squares))) / max(1.0, fitted.robust_sigmas)
-
-
 def forward_simulation_concerns(
     name: str, simulated: InstrumentMisfit, fitted: InstrumentMisfit, *, is_static: bool = False
 ) -> list[Concern]:
     """Return one concern, as a list, if the forward simulation of a fitted experiment misses the
     measurements of an instrument by much more than the fit; else empty.
 
-    `missed_by_simulation` is "check" above `ROLLOUT`, and "doubtful" above `GROSS_ROLLOUT`.
+    √(simulated² − fitted²) is "check" above `ROLLOUT` times the larger of the fit's misfit and the
+    noise, and "doubtful" above `GROSS_ROLLOUT`.
     """
-    missed = missed_by_simulation(simulated, fitted)
+    squares = simulated.robust_sigmas**2 - fitted.robust_sigmas**2
+    missed = float(np.sqrt(max(0.0, squares))) / max(1.0, fitted.robust_sigmas)
     return concern_if(
         missed > ROLLOUT,
         missed > GROSS_ROLLOUT,

@@ -177,20 +177,36 @@ def test_effects_without_some_are_those_of_a_fit_without_them(rng):
 
 
 def test_the_interval_of_a_surprising_effect_contains_the_estimate_without_it(rng):
-    """What looks like the reverse of an error of the time step has another cause, which need not move
+    """What looks like the reverse of an error of the mesh has another cause, which need not move
     the constants.
     """
     by_parameters, column = 30.0 * slopes(rng, 4), 10.0 * slopes(rng, 1)
     fit = linear_fit(by_parameters, 3.0 * 2.0 * column[:, 0])
-    own = effects(column, "time_step", means=2.0)
+    own = effects(column, "mesh", means=2.0)
     found, without = (
         Posterior.from_fit(fit, own, PARAMETERS, Q, GIVEN, is_learnt=each) for each in (True, False)
     )
-    assert of_effect(found, "time_step").value == pytest.approx(-3.0, abs=0.01)
+    assert of_effect(found, "mesh").value == pytest.approx(-3.0, abs=0.01)
     moved = found.reported_q - without.reported_q
     for k, name in enumerate(PARAMETERS.names):
         deviation = np.diff(np.log(found.reported(name).combined95))[0] / 3.92
         assert abs(moved[k]) < deviation < 1.5 * abs(moved[k]), name
+
+
+def test_the_effect_of_the_time_step_is_not_learnt(rng):
+    """Constants are corrected by its mean whatever the residuals are, which are judged without it."""
+    by_parameters, column = slopes(rng, 4), 5.0 * slopes(rng, 1)
+    noise = rng.normal(size=len(column))
+    own = effects(column, "time_step", means=2.0)
+    expected = posterior(linear_fit(by_parameters, noise), column[:, :0])
+    for residual in (noise - 2.0 * column[:, 0], noise - 6.0 * column[:, 0]):
+        found = Posterior.from_fit(linear_fit(by_parameters, residual), own, PARAMETERS, Q, GIVEN)
+        known = linear_fit(by_parameters, residual + 2.0 * column[:, 0])
+        corrected = posterior(known, column[:, :0])
+        np.testing.assert_allclose(found.q, corrected.q, atol=1e-9)
+        assert found.uncertainty.level.pooled == pytest.approx(corrected.uncertainty.level.pooled)
+        assert all(line.shares["time_step"] > 0 for line in found.budget.values())
+    assert not np.allclose(found.q, expected.q, atol=1e-3)
 
 
 def test_other_effects_are_learnt_beside_the_mean_of_one_that_a_refinement_measures(rng):

@@ -49,10 +49,10 @@ LEAST_ORDER = 0.5
 # chosen.
 LITTLE = 0.5
 # Change of an estimate over its value that needs no more steps, although many precise samples make it
-# larger than that: systematic effects of a percent are usual, and estimates are corrected for it.
-NEGLIGIBLE = 1e-2
-# The same where recordings are declared to be simulated.
-NEGLIGIBLE_IN_SIMULATIONS = 1e-3
+# larger than that: estimates are corrected for it.
+NEGLIGIBLE = 1e-3
+# Share of the correction in the variance of an estimate that needs no more steps.
+SMALL_SHARE = 0.1
 # Largest number of steps per sample that is chosen.
 MOST_SUBSTEPS = 8
 
@@ -146,9 +146,7 @@ class Refinement:
         # Moduli that move alike differ by rounding: the first is the parameter itself.
         return max(moves.items(), key=lambda each: round(each[1], 6), default=("", 0.0))
 
-    def suggested_substeps(
-        self, estimates: Mapping[str, Estimate], order: float, negligible: float
-    ) -> int:
+    def suggested_substeps(self, estimates: Mapping[str, Estimate], order: float) -> int:
         """Return the number of steps per sample, from 1 to `MOST_SUBSTEPS`, that makes every
         correction small if the present errors are those of one step per sample.
 
@@ -156,18 +154,16 @@ class Refinement:
         ----------
         estimates : mapping of str to Estimate
             Estimates before the correction.
-        negligible : float
-            Share of a value: `NEGLIGIBLE` or `NEGLIGIBLE_IN_SIMULATIONS`.
 
         Notes
         -----
-        Small means at most `LITTLE` statistical standard errors, or that share of the value.
+        Small means at most `LITTLE` statistical standard errors, or `NEGLIGIBLE` of the value.
         Without a correction the number is 1.
         """
         many = max(
             (
                 abs(estimates[name].value - error.extrapolated)
-                / max(LITTLE * spread, negligible * abs(estimates[name].value))
+                / max(LITTLE * spread, NEGLIGIBLE * abs(estimates[name].value))
                 for name, error in self.errors.items()
                 if (spread := estimates[name].statistical_std_error)
             ),
