@@ -1944,12 +1944,15 @@ def test_a_reference_at_one_time_is_drawn_as_a_point():
         measured="reference",
         paths_m=planning_folder.drawn_paths_m(plan),
     )
-    body, errors = picture.figure.axes
-    rings = [line for line in body.lines if line.get_markersize() == 7]
-    assert [len(line.get_xdata()) for line in rings] == [1]
+    (body,) = picture.figure.axes
+    points = [line for line in body.lines if line.get_markersize() == 7]
+    assert [len(line.get_xdata()) for line in points] == [1]
+    once_m[8] = record.markers_m[8] + [0.0, 0.0, 2e-3]
+    body, errors = FilmFigure(replace(record, measured_m=once_m), "reference").figure.axes
     points = [line for line in errors.lines if line.get_marker() == "o"]
-    assert [line.get_xydata().ravel() for line in points] == [
-        pytest.approx([record.t_s[3] - record.t_s[0], 1.0])
+    times_s = record.t_s[[3, 8]] - record.t_s[0]
+    assert [line.get_xydata() for line in points] == [
+        pytest.approx(np.column_stack([times_s, [1.0, 2.0]]))
     ]
 
 
