@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -430,14 +431,18 @@ def _fine_enough(
     error = step_error(coarse.problem, first, fit, steps, known)
     problem = coarse.problem
     before = first.collocation.substeps
-    factor = error.suggested_substeps(known, as_scheme(problem.scheme).order)
+    order = as_scheme(problem.scheme).order
+    factor = error.suggested_substeps(known, order)
     is_near = False
     if factor > 1:
         judged = _with_posterior(coarse, fit, steps, say=say)
         is_near = judged.is_consistent
-        shares = (line.shares.get("time_step", 0.0) for line in judged.budget.values())
-        if is_near and max(shares, default=0.0) <= SMALL_SHARE:
-            return judged, fit, steps
+        if is_near:
+            coarse = judged
+            shares = (line.shares.get("time_step", 0.0) for line in judged.budget.values())
+            share = max(shares, default=0.0)
+            excess = share / max(1e-9, 1.0 - share) * (1.0 - SMALL_SHARE) / SMALL_SHARE
+            factor = ceil(excess ** (0.5 / order))  # of a variance
     substeps = min(before * factor, MOST_SUBSTEPS)
     number = "one time step" if before == 1 else f"{before} time steps"
     worst, many = error.largest_correction(known)
