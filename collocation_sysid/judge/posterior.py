@@ -268,14 +268,15 @@ class Posterior:
         derived_at : callable, optional
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
-        names = range(len(effects.names))
-        kept = [k for k in names if is_learnt and effects.names[k] != DISCRETISATION[1].name]
-        learnt = effects.only(kept)
-        considered = effects.only(k for k in names if k not in kept)
+        _, time_step = DISCRETISATION
+        learnt = effects.without([time_step.name]) if is_learnt else effects.only(())
+        considered = effects.only(
+            k for k, name in enumerate(effects.names) if name not in learnt.names
+        )
         wide, definition = learnt.added_to(fit, parameters)
-        step = gauss_newton_step(wide)
-        step = step + estimate_changes(wide, considered.blocks) @ considered.means
-        after = considered.expected_in(wide).after_step(step)
+        expected = considered.expected_in(wide)
+        step = gauss_newton_step(expected)
+        after = expected.after_step(step)
         there = np.clip(q + step[: len(q)], *parameters.bounds_q)
         if derived_at is not None:
             after = replace(after, derived=derived_at(there))
@@ -375,7 +376,7 @@ class Posterior:
         considered = self.considered.without(left_out)
         learnt = self.effects.without(left_out)
         definition = self.definition[np.ix_(kept, kept)]
-        step = gauss_newton_step(fit) + estimate_changes(fit, considered.blocks) @ considered.means
+        step = gauss_newton_step(considered.expected_in(fit))
         omitted = self.effects.only(np.flatnonzero(~np.array(is_kept, dtype=bool)))
         step = step + estimate_changes(fit, omitted.blocks) @ omitted.means
         step[:first] -= estimate_changes(alone, omitted.blocks) @ omitted.means

@@ -235,7 +235,9 @@ class SolvedProblem:
                 uncertainty=self.uncertainty,
                 phi=self.posterior and self.posterior.phi,
                 surprise=effects[0].grade if effects else None,
-                is_step_known=self.is_consistent and "time_step" in self._considered,
+                is_step_known=self.posterior is not None
+                and self.is_consistent
+                and "time_step" in self.posterior.considered.names,
             )
         )
         if not self.solution.collocation.nq:
@@ -273,10 +275,6 @@ class SolvedProblem:
         return Assessment.from_concerns(
             (interrupted, *(of_fit if self.uncertainty is not None else ()))
         )
-
-    @property
-    def _considered(self) -> tuple[str, ...]:
-        return () if self.posterior is None else self.posterior.considered.names
 
     @cached_property
     def modes_by_experiment(self) -> dict[str, ModesCheck]:
