@@ -44,7 +44,7 @@ DECREASE = 1e-3
 SMALL_IMPACT_STRAIN = 1e-4
 # The same for slender bodies without impacts: forces along them that are wrong by their weight are
 # perhaps compression, with which the linearised motion grows without limit.
-SLENDER_STRAIN = 1e-2
+SLENDER_STRAIN = 5e-2
 # Steps longer than so many times the one that is expected to leave as much are simulated at once.
 LONGEST_SWEPT = 2.0
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With

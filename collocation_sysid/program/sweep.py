@@ -166,22 +166,19 @@ class PrescribedColumns:
         prescribed = self.is_prescribed[t]
         solution[self.dofs[prescribed]] = self.columns[t, prescribed]
 
-    def force(self, sweep: Sweep, step: FactorisedStep) -> Array | float:
-        """Return the contribution (p_0 G + q_0 C) U_t (free, c) [N] of the prescribed changes U_t
-        at a time step to the changes of the force on the free dofs; 0 if nothing changes.
+    def forces(self, sweep: Sweep, rows: slice, at: Linearisation) -> Array:
+        """Return the contributions (p_0 G + q_0 C) U_t (k, free, c) [N] of the prescribed changes U_t
+        at k time steps to the changes of the force on the free dofs.
         """
-        now = np.where(self.is_prescribed[step.t, :, None], self.columns[step.t], 0.0)
+        now = np.where(self.is_prescribed[rows, :, None], self.columns[rows], 0.0)
         # Columns of parameters that do not move grasps are zero.
-        changed = np.flatnonzero(now.any(axis=0))
-        if not len(changed):
-            return 0.0
-        p = step.row.p[0]
-        q = step.row.q[0]
-        force = np.zeros((len(sweep.free), self.columns.shape[-1]))
-        skew = step.row.skew(0, step.skew, by_velocity_skew=step.rate_skew)
-        matrix = sweep.prescribed_block.extract(p * step.by_position + q * step.by_velocity, skew)
-        force[:, changed] = matrix @ now[:, changed]
-        return force
+        changed = np.flatnonzero(now.any(axis=(0, 1)))
+        forces = np.zeros((len(now), len(sweep.free), now.shape[-1]))
+        if len(changed):
+            now = now[..., changed]
+            p, q = (each[rows, :1, None] for each in _tables(sweep.dynamics))
+            forces[..., changed] = _force_changes(sweep.prescribed_block, at, p * now, q * now)
+        return forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -876,21 +873,35 @@ class ForwardSubstitution:
             if columns.has_step:
                 residual = np.stack([self._residual(s, acceleration[s.t]) for s in steps])
                 self.violation_n = max(self.violation_n, float(np.abs(residual).max(initial=0.0)))
-            sides = columns.right_hand_sides(
+            rights, forces = columns.right_hand_sides(
                 rows,
                 linearisation,
                 acceleration=acceleration[rows],
                 residual=residual,
                 free=solver.free,
             )
-            for step, right, force in zip(steps, *sides, strict=True):
-                solution = np.zeros(self.shape) if out is None else out[step.t]
+            on_free = forces.take(solver.free, axis=1)
+            if columns.prescribed is not None:
+                on_free += columns.prescribed.forces(solver, rows, linearisation)
+            solutions = np.zeros((len(steps), *self.shape)) if out is None else out[rows]
+            past = [*reversed(self.past)]
+            for step, right, force, forced, solution in zip(
+                steps, rights, forces, on_free, solutions, strict=True
+            ):
                 with solver.stopwatch.solving():
-                    self.solve_step(step, right, force=force, out=solution)
+                    self.solve_step(step, right, force=force, forced=forced, out=solution)
                 self.indefinite += not step.factor.positive_definite
                 complete_steps(StepUnit.TIME_STEP)
                 require_time()
-                yield solution
+            if self.grasp_forces is not None:
+                self._store_grasp_forces(
+                    self.grasp_forces,
+                    rows,
+                    linearisation,
+                    forces=forces,
+                    solutions=np.stack([*past, *solutions]),
+                )
+            yield from solutions
 
     def _residual(self, step: FactorisedStep, acceleration: Array) -> Array:
         """Return c_t on the free dofs (free,) [N], from the acceleration (3n,) of the row [m/s²];
@@ -907,7 +918,9 @@ class ForwardSubstitution:
             self.past_forces.appendleft(force)
         return solver.without_prescribed(step.t, total)
 
-    def solve_step(self, step: FactorisedStep, right: Array, force: Array, out: Array) -> None:
+    def solve_step(
+        self, step: FactorisedStep, right: Array, force: Array, forced: Array, out: Array
+    ) -> None:
         """Solve one row, store Y_t in `out`, and advance the state to the next row.
 
         Parameters
@@ -917,7 +930,9 @@ class ForwardSubstitution:
         right : (free, c) array
             R_t; modified.
         force : (3n, c) array
-            F_R; not modified.
+            F_R; the change of the force by internal variables is added.
+        forced : (free, c) array
+            F_R on the free dofs, with the force of prescribed changes; modified.
         out : (3n, c) array
             Y_t, overwritten.
         """
@@ -933,11 +948,10 @@ class ForwardSubstitution:
             right += weighted_sum_of_past(w, self.past_increments, shape=self._of_free)
         right -= mass * weighted_sum_of_past(s, self.past, shape=self.shape).take(free, axis=0)
         for each in self.internal_states:
-            force = force + each.force_columns()
-        forced = force.take(free, axis=0)
+            change = each.force_columns()
+            force += change
+            forced += change.take(free, axis=0)
         forced += self._past_force(step, row)
-        if prescribed is not None:
-            forced += prescribed.force(solver, step)
         solver.without_prescribed(t, right)
         solver.without_prescribed(t, forced)
         similar = self._similar_solution(step)
@@ -953,8 +967,6 @@ class ForwardSubstitution:
             each.advance(
                 partial(self._stencil_sum, row.p, out), partial(self._stencil_sum, row.q, out)
             )
-        if self.grasp_forces is not None:
-            self._store_grasp_forces(self.grasp_forces, step, force=force, solution=out)
         self.past.appendleft(out)
 
     def _similar_solution(self, step: FactorisedStep) -> Array | float:
@@ -979,17 +991,29 @@ class ForwardSubstitution:
         return np.asarray(sum(terms, start=similar))
 
     def _store_grasp_forces(
-        self, grasp_forces: GraspForces, step: FactorisedStep, force: Array, solution: Array
+        self,
+        grasp_forces: GraspForces,
+        rows: slice,
+        at: Linearisation,
+        forces: Array,
+        solutions: Array,
     ) -> None:
-        """Store F_t and its changes on instrumented grasps."""
-        row = step.row
-        dofs = self.solver.sensed
-        matrix = self.solver.of_sensed
-        grasp_forces.force[step.t] = step.force[dofs]
-        state, rate = (self._stencil_sum(weights, solution) for weights in (row.p, row.q))
-        slopes = force[dofs] + matrix.extract(step.by_position, step.skew) @ state
-        grasp_forces.changes[step.t] = (
-            slopes + matrix.extract(step.by_velocity, step.rate_skew) @ rate
+        """Store F_t and its changes on instrumented grasps at k time steps, from F_R (k, 3n, c) and
+        Y (lags + k, 3n, c).
+        """
+        solver = self.solver
+        dofs = solver.sensed
+        # The first results are of earlier rows, and not used.
+        places = np.arange(rows.stop - len(solutions), rows.stop)
+        state, rate = (
+            solver.dynamics.combine(table.take(places, axis=0, mode="clip"), solutions)[
+                -len(forces) :
+            ]
+            for table in _tables(solver.dynamics)
+        )
+        grasp_forces.force[rows] = at.force[:, dofs]
+        grasp_forces.changes[rows] = forces[:, dofs] + _force_changes(
+            solver.of_sensed, at, state, rate
         )
 
     def _stencil_sum(self, weights: Sequence[float], solution: Array) -> Array:
@@ -1017,3 +1041,15 @@ class ForwardSubstitution:
             past = weighted_sum_of_past(row.p, self.past, shape=self.shape)
             total += matrix.extract(step.by_position, step.skew) @ past
         return total
+
+
+def _tables(dynamics: Dynamics) -> tuple[Array, Array]:
+    """Return the coefficients p and q (N, lags), the latter with the time step included."""
+    return dynamics.tables.p, dynamics.tables.q / dynamics.step_s
+
+
+def _force_changes(block: Submatrix, at: Linearisation, states: Array, rates: Array) -> Array:
+    """Return G dξ + C dν (T, k, c) in a block, from dξ and dν (T, …, c)."""
+    return block.products(at.by_position, at.by_position_skew, states) + block.products(
+        at.by_velocity, at.by_velocity_skew, rates
+    )

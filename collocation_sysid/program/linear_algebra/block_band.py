@@ -333,7 +333,8 @@ class Submatrix:
             number[across[is_selected]],
             np.concatenate([[0], ends]),
         )
-        self._matrix = sp.csr_array(parts, shape=(len(rows), count))
+        self._shape = len(rows), count
+        self._matrix = sp.csr_array(parts, shape=self._shape)
 
     def extract(self, lower: Array, skew: Array) -> sp.csr_array:
         """Return the submatrix (k, c). The returned object is shared: its values are overwritten by
@@ -346,12 +347,34 @@ class Submatrix:
         skew : (m,) or (0,) array
             Lower triangle of the skew part; empty for none.
         """
-        if skew.size:
-            both = np.concatenate([lower + skew, lower - skew])
-            self._matrix.data = np.take(both, self._in_both)
-        else:
-            self._matrix.data = np.take(lower, self._source)
+        self._matrix.data = self._values(lower, skew)
         return self._matrix
+
+    def products(self, lower: Array, skew: Array, vectors: Array) -> Array:
+        """Return the products (T, k, d) of the submatrices of T matrices with vectors (T, c, d).
+
+        Parameters
+        ----------
+        lower, skew : (T, m) or (T, 0) array
+            See `extract`.
+        """
+        values = self._values(lower, skew)
+        count = len(lower)
+        number = np.arange(count)[:, None]
+        rows, columns = self._shape
+        places = self._matrix.indices + columns * number
+        starts = np.append(self._matrix.indptr[:-1] + len(self._source) * number, values.size)
+        blocks = sp.csr_array(
+            (values.ravel(), places.ravel(), starts), shape=(count * rows, count * columns)
+        )
+        return (blocks @ vectors.reshape(count * columns, -1)).reshape(count, rows, -1)
+
+    def _values(self, lower: Array, skew: Array) -> Array:
+        """Return the entries (…, any) from lower triangles (…, m)."""
+        if not skew.size:
+            return lower.take(self._source, axis=-1)
+        both = np.concatenate([lower + skew, lower - skew], axis=-1)
+        return both.take(self._in_both, axis=-1)
 
 
 def skew_block_band(
