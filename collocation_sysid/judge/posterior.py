@@ -22,8 +22,9 @@ amplitudes of their own with the same deviation, which are considered. The error
 considered: its estimate is closer than what residuals tell of it.
 
 A single curve of a static test does not tell effects from each other, nor from the law of the
-material, which is never exact. There all effects are considered but not learnt: the estimates are
-corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962).
+material, which is never exact. There all effects but a toe are considered, not learnt: the estimates
+are corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962). A
+toe is learnt, because laws differ from it by how far they are flexible at small strain.
 
 An effect that redefines a constant, such as another damping law for γ_r, does not change that
 constant: the constant is the one given the stated definition, b = 0.
@@ -53,8 +54,8 @@ from ..statistics.budget.effect_estimates import (
     JointPosterior,
     effect_row,
 )
-from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
-from ..statistics.distributions import largest_deviation, student_95
+from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION, TOE
+from ..statistics.distributions import chi2_sf, largest_deviation, normal_isf, student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..statistics.thresholds import CHANCE
@@ -269,7 +270,8 @@ class Posterior:
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
         _, time_step = DISCRETISATION
-        learnt = effects.without([time_step.name]) if is_learnt else effects.only(())
+        toe = [k for k, name in enumerate(effects.names) if name in TOE.components]
+        learnt = effects.without([time_step.name]) if is_learnt else effects.only(toe)
         considered = effects.only(
             k for k, name in enumerate(effects.names) if name not in learnt.names
         )
@@ -321,10 +323,11 @@ class Posterior:
         limit = largest_deviation(len(self.effect_estimates), CHANCE)
         for each in self.effect_estimates:
             if abs(each.surprise) > limit:
-                k = self.fit.names.index(each.name)
-                off = self.step[k] - self.effects.means[k - len(self.fit.names) + count]
-                own = self.covariance[:, k, None]
-                ways = np.hstack([ways, own / own[k] * off])
+                own = TOE.components if each.name == TOE.name else (each.name,)
+                at = [self.fit.names.index(name) for name in own]
+                off = self.step[at] - self.effects.means[np.array(at) - len(self.fit.names) + count]
+                known = self.covariance[:, at]
+                ways = np.hstack([ways, known @ np.linalg.pinv(known[at]) @ off[:, None]])
                 names += (each.name,)
         return names, ways
 
@@ -579,9 +582,9 @@ class Posterior:
         by_shape = self._priors[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
-        found = []
+        found = self._toe()
         for k, name in enumerate(self.fit.names[len(self.fit.names) - count :]):
-            if predicted[k] < UNSEEN:
+            if predicted[k] < UNSEEN or name in TOE.components:
                 continue
             off = float(values[k] - self.effects.means[k])
             found.append(
@@ -596,6 +599,31 @@ class Posterior:
                 )
             )
         return tuple(sorted(found, key=lambda each: -abs(each.surprise)))
+
+    def _toe(self) -> list[EffectEstimate]:
+        """Return the share of the slope that a toe lacks in all, as a list; empty without one.
+
+        Its surprise is by how many standard deviations the data exclude that there is no toe: the size
+        of a usual one surprises nobody, but its shape, which is not known, distorts the estimates.
+        """
+        at = [k for k, name in enumerate(self.fit.names) if name in TOE.components]
+        if not at:
+            return []
+        of_phi = np.array(at) - len(self.start)
+        covariance = self.uncertainty.nuisance_covariance[np.ix_(of_phi, of_phi)]
+        shares, size = self.step[at], float(self.effects.deviations[0])
+        distance = float(shares @ np.linalg.pinv(covariance, hermitian=True) @ shares)
+        deviations = float(normal_isf(max(chi2_sf(distance, len(at)), 1e-300) / 2))
+        return [
+            EffectEstimate(
+                TOE.name,
+                0.0,
+                0.0,
+                size * float(shares.sum()),
+                size * float(np.sqrt(covariance.sum())),
+                float(np.copysign(deviations, shares.sum())),
+            )
+        ]
 
     def suspected(self, others: Effects, errors: ErrorModel) -> tuple[EffectEstimate, ...]:
         """Return those of other effects with which the least loss decreases most (`AS_WELL`), with the

@@ -111,7 +111,9 @@ def solution_concerns(
         of_parameters = parameter_concerns(uncertainty, solution.collocation.parameters)
         of_fit = [*misfits, *of_parameters, *unknowns]
         are_specimens = all(each.specimen for each in fitted_experiments)
-        yield from as_specimen_concerns(of_fit, fitted_experiments) if are_specimens else of_fit
+        if are_specimens:  # which learn no other effect than a toe
+            of_fit = as_specimen_concerns(of_fit, fitted_experiments, surprise is not None)
+        yield from of_fit
     else:
         if solution.collocation.nq:
             yield Concern("solve/no-error-bars", "doubtful")

@@ -216,7 +216,7 @@ def test_a_curve_that_returns_names_unloading_in_place_of_the_law():
         "both signs": np.concatenate([-STRAIN[::-1] / 2, STRAIN]),
     }.items():
         test = cs.Specimen("uniaxial", strain, neo_hookean_pa(strain), SIGMA_PA)
-        (concern,) = as_specimen_concerns(larger, [test.experiment(name="pull")])
+        (concern,) = as_specimen_concerns(larger, [test.experiment(name="pull")], False)
         named[name] = 'branch = "loading"' in concern.message
     assert named == {"loading": False, "returns": True, "both signs": False}
 
@@ -232,7 +232,7 @@ def test_concerns_of_specimens_name_no_markers():
         Concern("noise/smaller", data={"factor": 2.0, "stated": "sigma"}),
         Concern("residuals/persist", data={"autocorrelation": 0.9}),
     ]
-    concerns = as_specimen_concerns(general, [test.experiment(name="pull")])
+    concerns = as_specimen_concerns(general, [test.experiment(name="pull")], False)
     assert concerns[0].code == "specimen/law"
     text = " ".join(each.message for each in concerns)
     assert "sigma_pa seems 2 times too large" in text

@@ -20,7 +20,6 @@ from ...recording.specimen import LATERAL_NAME, RELAXED_STRAIN, is_harmonic
 from ...recording.specimen_checks import HYSTERESIS, is_unloading
 from ...recording.specimen_files import moduli_of, specimen_strains
 from ...statistics.concerns import Concern
-from ...statistics.thresholds import GROSS_MISFIT
 from .notes import GENERAL_TESTS
 
 # Code of the concern about a specimen by that of the general concern with the same data.
@@ -38,12 +37,6 @@ COMPARED_LAWS = ("neo-hookean", "mooney-rivlin", "yeoh", "gent", "ogden-2")
 FOAM_LAWS = ("neo-hookean", "hyperfoam-1", "hyperfoam-2")
 # What to check of strips from a sheet with fibres.
 ANGLE = "the angle of the cut (cut_angle_deg) and the direction of the fibres"
-# Why a curve is no straight line below `STRAIN`.
-TOE = (
-    f"the slope grows with the load below a strain of {100 * STRAIN:g} %, unlike that of any law: at "
-    "small loads faces or grips do not touch everywhere. Leave out these rows with window_s, and let "
-    "strain_zero be unknown"
-)
 # Why no law fits a curve that returns.
 UNLOADED = (
     "contain loading and unloading, which no law without memory fits together: state "
@@ -56,22 +49,24 @@ LITTLE_DILATATION = 0.1
 
 
 def as_specimen_concerns(
-    concerns: Iterable[Concern], experiments: Sequence[Experiment]
+    concerns: Iterable[Concern], experiments: Sequence[Experiment], has_toe: bool
 ) -> list[Concern]:
     """Return concerns about a fit of specimens alone, replaced by those of `SPECIMEN_CODES`.
 
     The concern "specimen/law" about residuals larger than sigma comes first, because a law that is
     too simple is the most frequent cause of the others, unless one sample makes nearly all of them;
     in its place "specimen/branches" about tables of moduli, at whose small strain all laws are linear,
-    and "noise/larger" at strains below `STRAIN`, where laws hardly differ, unless the slope grows
-    there. Specimens with fibres have their largest unknown first: a strip that was cut at another
-    angle is one of them. Beside large residuals a disagreement of the recordings says nothing, and if
-    the slope grows, constants at their bounds follow from it.
+    and "noise/larger" at strains below `STRAIN`, where laws hardly differ. Specimens with fibres
+    have their largest unknown first: a strip that was cut at another angle is one of them. Beside
+    large residuals a disagreement of the recordings says nothing, and constants at default bounds
+    follow from a toe.
 
     Parameters
     ----------
     concerns : iterable of Concern
         Concerns from the residuals, the error bars and the unknowns of the fit.
+    has_toe : bool
+        Whether the residuals need a toe.
     """
     strains = [specimen_strains(each)[0] for each in experiments]
     keys = ["relative_sigma" if is_harmonic(strain) else "sigma_pa" for strain in strains]
@@ -81,7 +76,7 @@ def as_specimen_concerns(
         "remedy": "compare laws with compare-models --materials",
     }
     codes = dict(SPECIMEN_CODES)
-    explained = {"residuals/recordings"}
+    explained = {"information/default-bound"} if has_toe else set()
     advice = _law_advice(experiments)
     unloaded = [each.name for each in experiments if _is_unloaded(each)]
     if unloaded:
@@ -92,15 +87,9 @@ def as_specimen_concerns(
         codes["noise/larger"] = "specimen/branches"
         data["branches"] = max(len(p.prony) for each in experiments for p in each.body.parts)
         data["remedy"] = "add branches of the memory, [[object.prony]]"
-    else:
-        are_small = all(np.abs(strain).max() < STRAIN for strain in strains)
-        if toes := [each.name for each in experiments if _has_toe(each)]:
-            advice = f"in {listed(toes)} {TOE}"
-            explained.add("information/default-bound")
-        elif are_small:
-            codes["noise/larger"] = "noise/larger"
-        if are_small:
-            data["remedy"] = "measure the area and unloaded length"
+    elif all(np.abs(strain).max() < STRAIN for strain in strains):
+        codes["noise/larger"] = "noise/larger"
+        data["remedy"] = "measure the area and unloaded length"
     replaced = [
         replace(
             concern,
@@ -129,7 +118,8 @@ def as_specimen_concerns(
         large = [replace(each, grade="doubtful") for each in large]
     others = [e for e in replaced if e.code not in (codes["noise/larger"], "specimen/far")]
     if large:
-        others = [each for each in others if each.code not in explained]
+        explained.add("residuals/recordings")
+    others = [each for each in others if each.code not in explained]
     others = [each for each in others if each not in alone]
     grave = any(each.grade == "doubtful" for each in large)
     alone = [replace(each, grade="doubtful") if grave else each for each in alone]
@@ -148,34 +138,6 @@ def _is_unloaded(experiment: Experiment) -> bool:
         for size in sides
     )
     return returns and not any(part.prony for part in experiment.body.parts)
-
-
-def _has_toe(experiment: Experiment) -> bool:
-    """Whether the slope of the stress grows below `STRAIN`, and at twice that strain less than half
-    as fast, both by more than noise: the slope of a law that stiffens grows ever faster.
-    """
-    strain = np.abs(specimen_strains(experiment)[0])
-    gauge = experiment.readings[0]
-    stress_pa = np.abs(gauge.measured_values[:, 0])
-    if not np.ptp(strain) or is_unloading(strain):
-        return False
-    sigmas_pa = np.broadcast_to(gauge.sample_sigmas[:, 0], len(strain))
-
-    def deviations(largest: float, weights: Sequence[float]) -> float:
-        """Weighted sum of the coefficients of the polynomial of the stress up to a strain, in its
-        standard deviations.
-        """
-        used = np.isfinite(stress_pa) & (strain <= largest)
-        if used.sum() <= len(weights):
-            return 0.0
-        powers = np.vander(strain[used] / strain[used].max(), len(weights)) / sigmas_pa[used, None]
-        coefficients = np.linalg.lstsq(powers, stress_pa[used] / sigmas_pa[used])[0]
-        variance = weights @ np.linalg.pinv(powers.T @ powers) @ weights
-        return float(weights @ coefficients / np.sqrt(variance))
-
-    if deviations(STRAIN, (1, 0, 0)) <= GROSS_MISFIT:
-        return False
-    return strain.max() < STRAIN or deviations(2 * STRAIN, (6, 1, 0, 0)) < -GROSS_MISFIT
 
 
 def _named(data: Mapping[str, Any], experiments: Sequence[Experiment]) -> dict[str, str]:

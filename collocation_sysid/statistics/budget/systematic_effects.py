@@ -80,6 +80,11 @@ AIR_COEFFICIENT_DEVIATION = 0.4
 _AXES = "xyz"
 # Shape factor of a pressed specimen of unknown size: four times as wide as high.
 FLAT_SHAPE_FACTOR = 1.0
+# Strains within which the slope of a toe approaches that of the law, two of which describe those
+# between too, and the largest strain of a curve below which they are as much less: what is no small
+# part of a curve is not its beginning.
+TOE_STRAINS = (0.003, 0.01)
+TOE_RANGE = 0.04
 # Poisson's ratio of an incompressible material.
 INCOMPRESSIBLE_POISSON = 0.5
 # Deviation of each component of a vector of length one with an unknown direction.
@@ -749,6 +754,31 @@ def _specimen_sticking(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(stiffer * at.internal_n() * is_pressed[:, None])
 
 
+def _specimen_toe(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Return the effect of a toe, per share of the slope of the measured curve that is missing at no
+    load: stresses are too small by this share of the slope times w (1 − exp(−|ε| / w)), less that of
+    the smallest strain, an offset of the strain that `strain_zero` contains. The strain w is that of
+    `TOE_STRAINS`, less for curves that end below `TOE_RANGE`. None if the strains are exact.
+    """
+    experiment = at.iterate.transcription.experiment
+    deformation = experiment.specimen
+    if deformation is None or deformation.second or not experiment.nuisance.strain_zero:
+        return None
+    strain, _ = specimen_strains(experiment)
+    stress_pa = experiment.readings[0].measured_values[:, 0]
+    size = np.abs(strain)
+    largest = float(size.max())
+    if not largest:
+        return None
+    width = TOE_STRAINS[index] * min(1.0, largest / TOE_RANGE)
+    lost = np.sign(strain) * width * (np.exp(-size.min() / width) - np.exp(-size / width))
+    slope_pa = float(np.nanmax(np.abs(stress_pa))) / largest
+    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    force_n = np.zeros_like(at.iterate.x)
+    force_n[:, 3 * (1 + normal) + direction] = slope_pa * lost / STRESS_PER_FORCE
+    return Effect(force_n)
+
+
 def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of friction on nodes that slide along platens, perpendicular to the loading
     axis, per unit of the coefficient; None for a dynamic experiment and without platens.
@@ -936,6 +966,18 @@ def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
     return section_effect(at) if other and other.name == [*SECTIONS][index] else None
 
 
+TOE = Deviation(
+    "specimen_toe",
+    "1",
+    considered=0.5,
+    description="share of the slope of a specimen's curve that is missing at no load, because grips or "
+    "faces do not hold the whole section yet, for each strain within which it returns",
+    remedy="leave out the rows of small strains, in which grips or faces do not hold the whole section, "
+    "with window_s, and let strain_zero be unknown",
+    effect=_specimen_toe,
+    axes=" ".join(f"{strain:g}" for strain in TOE_STRAINS),
+    of_specimens=True,
+)
 ASSUMPTIONS = (
     Deviation(
         "body_scale",
@@ -1176,6 +1218,7 @@ ASSUMPTIONS = (
         effect=_specimen_sticking,
         of_specimens=True,
     ),
+    TOE,
     Deviation(
         "platen_friction",
         "",
