@@ -84,8 +84,8 @@ def _check_verdict(findings: CheckResult) -> Line:
             "doubtful",
         )
     if findings.omitted and not findings.causes:
-        edge_m = findings.edge_of_a_minute_m
-        edges = f" with edges of {1e3 * edge_m:.2g} mm" if edge_m is not None else ""
+        ratio = findings.edges_of_a_minute
+        edges = f" with edges {ratio:.2g} times as long" if ratio is not None else ""
         return Line(
             "No mistake was found. Left out, because check would take longer than half a minute: "
             f"{', '.join(findings.omitted)}. Use a coarser mesh{edges}, or check --full.",
@@ -304,9 +304,9 @@ def _solve_brief(findings: CheckResult) -> Table:
     for cost in findings.costs:
         if cost.method == findings.method:
             rows["solve"] = f"{_cost_text(cost)} by {cost.method} (rough estimates, without checks)"
-            edge_m = findings.edge_of_a_minute_m
-            if edge_m is not None:
-                rows["solve"] += f"; edges of {1e3 * edge_m:.2g} mm would take about a minute"
+            ratio = findings.edges_of_a_minute
+            if ratio is not None:
+                rows["solve"] += f"; edges {ratio:.2g} times as long would take about a minute"
     return labelled("", rows)
 
 

@@ -50,8 +50,8 @@ from ..statistics.linearised import AT_BOUND, parameter_values
 # in simulated recordings they differ by up to 5.
 SAME_LOSS = 10.0
 # Relative difference of all parameters below which a search with such a loss is where another one
-# was, and need not continue.
-SAME_PARAMETERS = 0.01
+# was, and need not continue. A first share of a recording determines them to several per cent.
+SAME_PARAMETERS = 0.1
 # Estimate of an error, in standard deviations of its prior, that makes a solution doubtful.
 UNLIKELY = 4.5
 Solve = Callable[[Method, Collocation], Solution]

@@ -493,13 +493,13 @@ def test_a_check_leaves_out_what_takes_too_long_with_the_remedy(tiny: Path, monk
 
 def test_an_edge_length_is_proposed_with_which_a_search_takes_a_minute(tiny: Path, monkeypatch):
     problem = Problem.read(tiny / "problem.toml")
-    assert check_problem(problem).edge_of_a_minute_m is None
+    assert check_problem(problem).edges_of_a_minute is None
     monkeypatch.setattr("collocation_sysid.runs.check.LONG_SOLVE_S", 1e-3)
     found = check_problem(problem)
-    edge_m = found.edge_of_a_minute_m
-    assert edge_m is not None
-    assert edge_m > found.bodies[0].edges_m[1]
-    assert f"; edges of {1e3 * edge_m:.2g} mm would take about a minute" in plain_text(
+    ratio = found.edges_of_a_minute
+    assert ratio is not None
+    assert ratio > 1
+    assert f"; edges {ratio:.2g} times as long would take about a minute" in plain_text(
         full_check_tables(found)
     )
 

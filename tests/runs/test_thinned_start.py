@@ -203,7 +203,7 @@ def test_a_search_at_a_known_minimum_ends():
     assert all(is_at(line) for line in known.history)
     assert not is_at(replace(last, share=0.5))
     assert not is_at(replace(last, loss=highest + 11.0))
-    assert not is_at(replace(last, parameters={"young_pa": 1.02 * known.parameters["young_pa"]}))
+    assert not is_at(replace(last, parameters={"young_pa": 1.2 * known.parameters["young_pa"]}))
 
 
 def test_all_points_have_the_correspondences_of_the_thinned_solution(many):

@@ -153,9 +153,9 @@ class CheckResult(QuickCheck):
     combinations: tuple[Combination, ...] = ()
     notes: tuple[str, ...] = ()  # sentences for information, without a remedy
     omitted: tuple[str, ...] = ()  # parts of the check that would take too long
-    # Mean edge length of a mesh with which the search takes about a minute; None if it takes no
-    # longer.
-    edge_of_a_minute_m: float | None = None
+    # Length of the edges with which the search takes about a minute over that of the mesh; None if
+    # it takes no longer.
+    edges_of_a_minute: float | None = None
     # Expected problems, with the remedy; `warnings` are their sentences.
     concerns: tuple[Concern, ...] = ()
 
@@ -346,7 +346,7 @@ def check_problem(
         rows = _grid_rows(collocation)
         search_s = Size(largest.nodes, largest.elements, rows, unknowns=1).time_s()
     findings = replace(
-        findings, concerns=concerns, edge_of_a_minute_m=_edge_of_a_minute_m(findings, search_s)
+        findings, concerns=concerns, edges_of_a_minute=_edges_of_a_minute(findings, search_s)
     )
     rests_on = scale_reference(
         problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
@@ -356,11 +356,11 @@ def check_problem(
     return replace(findings, notes=(*known, *lost, *notes))
 
 
-def _edge_of_a_minute_m(findings: QuickCheck, search_s: float | None) -> float | None:
+def _edges_of_a_minute(findings: QuickCheck, search_s: float | None) -> float | None:
     meshed = [body for body in findings.bodies if not body.is_homogeneous]
     if search_s is None or search_s <= LONG_SOLVE_S or len(meshed) != 1:
         return None
-    return meshed[0].edges_m[1] * (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
+    return (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
 
 
 def _rigid_variables(collocation: Collocation) -> Array:
