@@ -35,7 +35,7 @@ from .complementarity import require_frictionless, solve_complementarity
 from .condensed_program import complete_program, condense
 from .loss_curvature import reduced_hessian, sensitivities, tangent_directions
 from .options import MethodOptions
-from .ordering import METIS, cheaper_ordering
+from .ordering import AMD, METIS, cheaper_ordering
 from .solution import Solution, Status, Watch
 from .solve_recorder import Recorder
 from .starts.initial_point import InitialPoint, adjoint_multipliers, compute_initial_point
@@ -301,8 +301,8 @@ class InteriorPoint(MethodOptions):
             }
         if self.linear_solver == "mumps":  # the matrix as it is: IPOPT refines
             settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_pivtol": PIVOT_TOLERANCE}
-            settings["ipopt.mumps_pivot_order"] = METIS
-            if not is_warm and "mumps_pivot_order" not in self.ipopt:
+            settings["ipopt.mumps_pivot_order"] = AMD if is_slender else METIS
+            if not (is_warm or is_slender or "mumps_pivot_order" in self.ipopt):
                 with_hessian = self.hessian != "limited-memory"
                 settings["ipopt.mumps_pivot_order"] = cheaper_ordering(program, with_hessian)
         if self.hessian == "limited-memory":

@@ -2,7 +2,8 @@
 
 Which of two orderings needs fewer operations depends on body and recording: quasi-dense minimum
 degree (QAMD) 0.7 times those of nested dissection (METIS) for the foam cylinder, 1.4 times for
-Table I. MUMPS states the number only in its output, hence the isolated process.
+Table I. MUMPS states the number only in its output, hence the isolated process. Slender bodies have
+minimum degree (AMD).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import scipy.sparse as sp
 from ..common.isolated_process import Failed, run_isolated
 from ..program.collocation import Collocation
 
-METIS, QAMD = 5, 6
+AMD, METIS, QAMD = 0, 5, 6
 # Size of the KKT matrix below which METIS is taken: a factorisation then takes less than a second,
 # and the choice half a second.
 LEAST_ROWS = 20_000
