@@ -55,7 +55,7 @@ from ..statistics.budget.effect_estimates import (
     effect_row,
 )
 from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION, TOE
-from ..statistics.distributions import chi2_sf, largest_deviation, normal_isf, student_95
+from ..statistics.distributions import largest_deviation, student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
 from ..statistics.thresholds import CHANCE
@@ -68,6 +68,8 @@ BETWEEN = "between recordings"
 ALIKE = 0.9
 # Share of the prior variance of an effect below which the data say nothing about it.
 UNSEEN = 1e-6
+# Share of the slope at no load by which a law that fits may be wrong.
+LAW_ERROR = 0.1
 
 
 @dataclass(frozen=True)
@@ -603,8 +605,9 @@ class Posterior:
     def _toe(self) -> list[EffectEstimate]:
         """Return the share of the slope that a toe lacks in all, as a list; empty without one.
 
-        Its surprise is by how many standard deviations the data exclude that there is no toe: the size
-        of a usual one surprises nobody, but its shape, which is not known, distorts the estimates.
+        Its surprise is by how many standard deviations the data exclude that there is no toe, beside an
+        error of the law (`LAW_ERROR`): the size of a usual toe surprises nobody, but its shape, which is
+        not known, distorts the estimates.
         """
         at = [k for k, name in enumerate(self.fit.names) if name in TOE.components]
         if not at:
@@ -612,18 +615,9 @@ class Posterior:
         of_phi = np.array(at) - len(self.start)
         covariance = self.uncertainty.nuisance_covariance[np.ix_(of_phi, of_phi)]
         shares, size = self.step[at], float(self.effects.deviations[0])
-        distance = float(shares @ np.linalg.pinv(covariance, hermitian=True) @ shares)
-        deviations = float(normal_isf(max(chi2_sf(distance, len(at)), 1e-300) / 2))
-        return [
-            EffectEstimate(
-                TOE.name,
-                0.0,
-                0.0,
-                size * float(shares.sum()),
-                size * float(np.sqrt(covariance.sum())),
-                float(np.copysign(deviations, shares.sum())),
-            )
-        ]
+        share, error = size * float(shares.sum()), size * float(np.sqrt(covariance.sum()))
+        deviations = share / float(np.hypot(error, LAW_ERROR))
+        return [EffectEstimate(TOE.name, 0.0, 0.0, share, error, deviations)]
 
     def suspected(self, others: Effects, errors: ErrorModel) -> tuple[EffectEstimate, ...]:
         """Return those of other effects with which the least loss decreases most (`AS_WELL`), with the

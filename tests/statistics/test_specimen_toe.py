@@ -41,7 +41,7 @@ def test_the_interval_of_a_law_that_reproduces_a_slack_contains_the_truth(noise,
 
 
 def test_a_toe_that_the_data_show_is_the_first_reason():
-    run = run_of_lap_joint(0.006, 0.2, 0.005, 0)
+    run = run_of_lap_joint(0.006, 0.1, 0.005, 0)
     assert "need a specimen toe" in run.trust.reasons[0]
     assert "window_s" in run.trust.reasons[0]
 

@@ -969,10 +969,10 @@ def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
 TOE = Deviation(
     "specimen_toe",
     "1",
-    considered=0.5,
+    considered=0.6,
     description="share of the slope of a specimen's curve that is missing at no load, because grips or "
     "faces do not hold the whole section yet, for each strain within which it returns",
-    remedy="leave out the rows of small strains, in which grips or faces do not hold the whole section, "
+    remedy="leave out the rows of small strains, in which grips or faces may not hold the whole section, "
     "with window_s, and let strain_zero be unknown",
     effect=_specimen_toe,
     axes=" ".join(f"{strain:g}" for strain in TOE_STRAINS),
