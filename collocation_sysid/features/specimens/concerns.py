@@ -49,7 +49,7 @@ LITTLE_DILATATION = 0.1
 
 
 def as_specimen_concerns(
-    concerns: Iterable[Concern], experiments: Sequence[Experiment], has_toe: bool
+    concerns: Iterable[Concern], experiments: Sequence[Experiment], has_toe: bool = False
 ) -> list[Concern]:
     """Return concerns about a fit of specimens alone, replaced by those of `SPECIMEN_CODES`.
 
