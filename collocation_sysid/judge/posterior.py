@@ -614,7 +614,8 @@ class Posterior:
             return []
         of_phi = np.array(at) - len(self.start)
         covariance = self.uncertainty.nuisance_covariance[np.ix_(of_phi, of_phi)]
-        shares, size = self.step[at], float(self.effects.deviations[0])
+        shares = self.step[at]
+        size = float(self.effects.deviations[at[0] - self._of_effects[0]])
         share, error = size * float(shares.sum()), size * float(np.sqrt(covariance.sum()))
         deviations = share / float(np.hypot(error, LAW_ERROR))
         return [EffectEstimate(TOE.name, 0.0, 0.0, share, error, deviations)]
