@@ -84,8 +84,8 @@ def _check_verdict(findings: CheckResult) -> Line:
             "doubtful",
         )
     if findings.omitted and not findings.causes:
-        ratio = findings.edges_of_a_minute
-        edges = f" with edges {ratio:.2g} times as long" if ratio is not None else ""
+        longer = findings.longer_edges
+        edges = f" with edges {longer[0]:.2g} times as long" if longer else ""
         return Line(
             "No mistake was found. Left out, because check would take longer than half a minute: "
             f"{', '.join(findings.omitted)}. Use a coarser mesh{edges}, or check --full.",
@@ -304,9 +304,9 @@ def _solve_brief(findings: CheckResult) -> Table:
     for cost in findings.costs:
         if cost.method == findings.method:
             rows["solve"] = f"{_cost_text(cost)} by {cost.method} (rough estimates, without checks)"
-            ratio = findings.edges_of_a_minute
-            if ratio is not None:
-                rows["solve"] += f"; edges {ratio:.2g} times as long would take about a minute"
+            if findings.longer_edges:
+                ratio, time_s = findings.longer_edges
+                rows["solve"] += f"; edges {ratio:.2g} times as long: about {duration(time_s)}"
     return labelled("", rows)
 
 

@@ -39,7 +39,12 @@ from collocation_sysid.result.check_sections import (
     quick_check_tables,
 )
 from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
-from collocation_sysid.runs.check.body import element_concerns, slenderness, worst_elements
+from collocation_sysid.runs.check.body import (
+    element_concerns,
+    longest_edges,
+    slenderness,
+    worst_elements,
+)
 from collocation_sysid.runs.check.cost import (
     FRICTION_FACTOR,
     STATIC_FACTOR,
@@ -262,6 +267,15 @@ def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, e
     assert all(
         "of a real body" in each and "not that of data simulated with" in each for each in said
     )
+
+
+def test_edges_may_be_longer_until_too_few_are_across_a_slender_body():
+    slender = box_mesh((0.1, 0.03, 0.03), (15, 6, 6))
+    for element, ratio in {"tet4": 1.5, "tet10-p0": 3.0, "tet10": np.inf}.items():
+        body = Body(slender, density_kg_m3=30.0, element=element)
+        assert longest_edges(body, *slenderness(slender)) == pytest.approx(ratio, rel=0.1)
+    cube = box_mesh((0.1, 0.1, 0.1), (2, 2, 2))
+    assert longest_edges(Body(cube, density_kg_m3=30.0), *slenderness(cube)) == np.inf
 
 
 def test_as_many_elements_across_as_are_needed_are_enough():
@@ -493,15 +507,22 @@ def test_a_check_leaves_out_what_takes_too_long_with_the_remedy(tiny: Path, monk
 
 def test_an_edge_length_is_proposed_with_which_a_search_takes_a_minute(tiny: Path, monkeypatch):
     problem = Problem.read(tiny / "problem.toml")
-    assert check_problem(problem).edges_of_a_minute is None
+    assert check_problem(problem).longer_edges is None
     monkeypatch.setattr("collocation_sysid.runs.check.LONG_SOLVE_S", 1e-3)
     found = check_problem(problem)
-    ratio = found.edges_of_a_minute
-    assert ratio is not None
-    assert ratio > 1
-    assert f"; edges {ratio:.2g} times as long would take about a minute" in plain_text(
-        full_check_tables(found)
-    )
+    assert found.longer_edges is not None
+    ratio, time_s = found.longer_edges
+    assert ratio > 1.3
+    assert time_s == pytest.approx(1e-3, rel=0.5)
+    assert f"; edges {ratio:.2g} times as long: about" in plain_text(full_check_tables(found))
+    # Not so long that too few elements are across a body that bends.
+    monkeypatch.setattr("collocation_sysid.runs.check.longest_edges", lambda *_: 1.3)
+    bending = check_problem(problem).longer_edges
+    assert bending is not None
+    assert bending[0] == 1.3
+    assert bending[1] > time_s
+    monkeypatch.setattr("collocation_sysid.runs.check.longest_edges", lambda *_: 0.9)
+    assert check_problem(problem).longer_edges is None
 
 
 def test_three_samples_of_equilibria_have_all_kinds_of_rows():

@@ -53,6 +53,8 @@ from .body import (
     check_grasps,
     grasp_concerns,
     grasp_extent_concerns,
+    longest_edges,
+    slenderness,
 )
 from .cost import LONG_SOLVE_S, MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from .derivatives import derivative_errors, shortened_problem
@@ -153,9 +155,9 @@ class CheckResult(QuickCheck):
     combinations: tuple[Combination, ...] = ()
     notes: tuple[str, ...] = ()  # sentences for information, without a remedy
     omitted: tuple[str, ...] = ()  # parts of the check that would take too long
-    # Length of the edges with which the search takes about a minute over that of the mesh; None if
-    # it takes no longer.
-    edges_of_a_minute: float | None = None
+    # Length of the edges over that of the mesh with which the search takes about a minute, or the
+    # longest that bending allows, and the time of the search with them [s]; None if none are longer.
+    longer_edges: tuple[float, float] | None = None
     # Expected problems, with the remedy; `warnings` are their sentences.
     concerns: tuple[Concern, ...] = ()
 
@@ -345,9 +347,7 @@ def check_problem(
         largest = max(findings.bodies, key=lambda body: body.nodes)
         rows = _grid_rows(collocation)
         search_s = Size(largest.nodes, largest.elements, rows, unknowns=1).time_s()
-    findings = replace(
-        findings, concerns=concerns, edges_of_a_minute=_edges_of_a_minute(findings, search_s)
-    )
+    findings = replace(findings, concerns=concerns, longer_edges=_longer_edges(problem, search_s))
     rests_on = scale_reference(
         problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
     )
@@ -356,11 +356,13 @@ def check_problem(
     return replace(findings, notes=(*known, *lost, *notes))
 
 
-def _edges_of_a_minute(findings: QuickCheck, search_s: float | None) -> float | None:
-    meshed = [body for body in findings.bodies if not body.is_homogeneous]
-    if search_s is None or search_s <= LONG_SOLVE_S or len(meshed) != 1:
+def _longer_edges(problem: Problem, search_s: float | None) -> tuple[float, float] | None:
+    meshed = {each.body for each in problem.experiments if each.specimen is None}
+    if search_s is None or len(meshed) != 1 or (body := meshed.pop()).is_slender:
         return None
-    return (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
+    of_a_minute = (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
+    ratio = round(min(of_a_minute, longest_edges(body, *slenderness(body.mesh))), 1)
+    return (ratio, search_s / ratio**EDGE_POWER) if ratio > 1 else None
 
 
 def _rigid_variables(collocation: Collocation) -> Array:

@@ -135,11 +135,9 @@ def bending_concerns(
     thickness; else empty. The numbers are those of `slenderness`.
     """
     name = body.element.name
-    needed = CELLS_ACROSS.get(name, 0.0)
-    slender = length_m > LEAST_SLENDERNESS * thickness_m
     off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
     return concern_if(
-        slender and cells_across < needed - ROUNDING,
+        longest_edges(body, length_m, thickness_m, cells_across) < 1 - ROUNDING,
         False,
         code="mesh/few",
         # Rounded down, so that it is below the number that is needed.
@@ -149,8 +147,18 @@ def bending_concerns(
         off=off,
         level=level,
         remedy=f"{FOR_BENDING}, or refine" if name == LINEAR else "refine",
-        needed=needed,
+        needed=CELLS_ACROSS.get(name),
     )
+
+
+def longest_edges(body: Body, length_m: float, thickness_m: float, cells_across: float) -> float:
+    """Return the length of the longest edges with which a body has enough elements across its
+    thickness over that of its mesh; infinite unless it is slender. The numbers are those of
+    `slenderness`.
+    """
+    needed = CELLS_ACROSS.get(body.element.name)
+    is_slender = length_m > LEAST_SLENDERNESS * thickness_m
+    return cells_across / needed if needed and is_slender else np.inf
 
 
 def _covariance(mesh: TetMesh) -> Array:
