@@ -21,7 +21,7 @@ from ...common.array_types import Array, Index
 from ...errors import InputError, listed
 from ...fem.body import Body
 from ...program.correspondences import Correspondences
-from ...program.markers.association import MarkerAssociation
+from ...program.markers.association import MarkerAssociation, association_kind
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.placement import (
@@ -641,7 +641,7 @@ def surface_association(
     ]
     count = len(places_m)
     none = np.zeros(count, dtype=np.int64)
-    association = MarkerAssociation(
+    association = association_kind(body)(
         body,
         sigmas_m,
         prior_places_m=places_m,

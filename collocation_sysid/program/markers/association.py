@@ -47,13 +47,12 @@ class MarkerAssociation:
     body: Body
     sigma_m: Array  # (M,): prior standard deviation of each place [m], zero where it is exact
     prior_places_m: Array  # (M, 3): places at the centres of the priors [m]
-    # Whether places move in the plane of the nearest face (k = 2), of a rod along its centreline
-    # (k = 1), or freely (k = 3).
+    # Whether places move in the plane of the nearest face (k = 2), or freely (k = 3).
     on_surface: bool
     # (M, npe): nodes and shape functions of exact places.
     nodes: Index
     weights: Array
-    cells: Index  # (M,): elements of estimated places, of a rod between which sections
+    cells: Index  # (M,): elements of estimated places
     centre_places_m: Array  # (M, 3): places at the centre of the association [m]
     axes: Array  # (M, 3, k): orthonormal directions in which places may move
     # (M, 2, 3): point and direction of the edge across which each place last left the surface; NaN
@@ -75,7 +74,7 @@ class MarkerAssociation:
         sigma_m = experiment.place_sigma_m
         points = markers.predict_positions(body.nodes_m)
         k = markers.place_dimension(body)
-        association = cls(
+        association = association_kind(body)(
             body,
             sigma_m,
             prior_places_m=points,
@@ -135,24 +134,16 @@ class MarkerAssociation:
 
     def coordinates(self, points_m: Array) -> Array:
         """Return coordinates (M, k) in prior standard deviations; zero for exact places."""
-        sigma = np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
-        if isinstance(mesh := self.body.mesh, RodMesh):
-            away_m = mesh.nearest_s_m(points_m) - mesh.nearest_s_m(self.prior_places_m)
-            return away_m[:, None] / sigma
-        return np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m) / sigma
+        away_m = np.einsum("mik,mi->mk", self.axes, points_m - self.prior_places_m)
+        return self._in_deviations(away_m)
 
-    def _s_m(self, mesh: RodMesh, phi: Array) -> Array:
-        """Return the arc lengths (M,) of places on a rod [m] for coordinates `phi` (M, 1)."""
-        return mesh.nearest_s_m(self.prior_places_m) + self.sigma_m * phi[:, 0]
+    def _in_deviations(self, away_m: Array) -> Array:
+        return away_m / np.where(self.sigma_m > 0, self.sigma_m, np.inf)[:, None]
 
     def places_m(self, phi: Array) -> Array:
         """Return the places (M, 3) on the undeformed body [m] for coordinates `phi` (M, k) in prior
-        standard deviations along `axes`, linear about the centre, of a rod along the centreline;
-        exact places do not move.
+        standard deviations along `axes`, linear about the centre; exact places do not move.
         """
-        if isinstance(mesh := self.body.mesh, RodMesh):
-            along = mesh.places_m(self._s_m(mesh, phi))
-            return np.where(self.sigma_m[:, None] > 0, along, self.centre_places_m)
         moved = np.einsum("mik,mk->mi", self.axes, phi - self.centre_coordinates)
         return self.centre_places_m + self.sigma_m[:, None] * moved
 
@@ -168,8 +159,6 @@ class MarkerAssociation:
         phi : (M, k) array
             Coordinates of the places, in prior standard deviations along `axes`.
         """
-        if isinstance(mesh := self.body.mesh, RodMesh) and len(self.estimated):
-            return self._between_sections(mesh, phi)
         element = self.body.place_element
         k = self.axes.shape[2]
         nodes = self.nodes.copy()
@@ -190,23 +179,6 @@ class MarkerAssociation:
                 "mail,mik,mln->makn", _second_derivatives(element, local), gradients, gradients
             )
         return nodes, ShapeFunctions(weights, slopes, hessians=curvatures)
-
-    def _between_sections(self, mesh: RodMesh, phi: Array) -> tuple[Index, ShapeFunctions]:
-        """Return `shape_functions` with estimated places on a rod, of the nodes of four sections."""
-        here = self.estimated
-        s_m = self._s_m(mesh, phi)[here]
-        sections, *weights = mesh.smooth_interpolation(s_m, self.cells[here])
-        node_count = 3 * sections.shape[1]
-        beyond = ((0, 0), (0, node_count - self.nodes.shape[1]))
-        nodes = np.pad(self.nodes, beyond)
-        nodes[here] = (3 * sections[..., None] + np.arange(3)).reshape(len(here), -1)
-        by_order = np.zeros((3, *nodes.shape))
-        by_order[0] = np.pad(self.weights, beyond)
-        by_order[:, here] = np.repeat(weights, 3, axis=2) / 3
-        by_order *= self.sigma_m[:, None] ** np.arange(3)[:, None, None]
-        return nodes, ShapeFunctions(
-            by_order[0], by_order[1, ..., None], by_order[2, ..., None, None]
-        )
 
     @cached_property
     def _shape(self) -> LocatedBody:
@@ -294,8 +266,6 @@ class MarkerAssociation:
         """Whether another element contains a point better, by more than `BETTER`; false for NaN."""
         if not np.isfinite(point).all():
             return False
-        if self.body.is_slender:
-            return self._cell_at(point) != cell
         if self._shape.barycentric(point, np.array([cell])).min() >= 0:
             return False  # no other element contains it better
         best = self._cell_at(point)
@@ -305,8 +275,6 @@ class MarkerAssociation:
         return bool(smallest[1] > smallest[0] + BETTER)
 
     def _cell_at(self, point: Array) -> int:
-        if isinstance(mesh := self.body.mesh, RodMesh):
-            return int(mesh.elements_at(mesh.nearest_s_m(point[None]))[0])
         return self._shape.nearest_cell(point)[0]
 
     def places_of_points(self, nodes_m: Array, points_m: Array) -> Array:
@@ -328,6 +296,61 @@ class MarkerAssociation:
             Places [m]; NaN where a point is not finite.
         """
         return LocatedBody(nodes_m, self.body).places_of_points(points_m)
+
+
+class CentrelineAssociation(MarkerAssociation):
+    """Association of places on a rod, which move along its centreline (k = 1); the element of a place
+    is that between two sections.
+    """
+
+    @property
+    def _rod(self) -> RodMesh:
+        assert isinstance(self.body.mesh, RodMesh)
+        return self.body.mesh
+
+    def coordinates(self, points_m: Array) -> Array:
+        """Return coordinates (M, 1) in prior standard deviations; zero for exact places."""
+        away_m = self._rod.nearest_s_m(points_m) - self._rod.nearest_s_m(self.prior_places_m)
+        return self._in_deviations(away_m[:, None])
+
+    def _s_m(self, phi: Array) -> Array:
+        """Return the arc lengths (M,) of places [m] for coordinates `phi` (M, 1)."""
+        return self._rod.nearest_s_m(self.prior_places_m) + self.sigma_m * phi[:, 0]
+
+    def places_m(self, phi: Array) -> Array:
+        """Return the places (M, 3) on the undeformed centreline [m] for coordinates `phi` (M, 1)."""
+        along = self._rod.places_m(self._s_m(phi))
+        return np.where(self.sigma_m[:, None] > 0, along, self.centre_places_m)
+
+    def shape_functions(self, phi: Array) -> tuple[Index, ShapeFunctions]:
+        """Return `MarkerAssociation.shape_functions`, of the nodes of four sections."""
+        here = self.estimated
+        if not len(here):
+            return super().shape_functions(phi)
+        s_m = self._s_m(phi)[here]
+        sections, *weights = self._rod.smooth_interpolation(s_m, self.cells[here])
+        node_count = 3 * sections.shape[1]
+        beyond = ((0, 0), (0, node_count - self.nodes.shape[1]))
+        nodes = np.pad(self.nodes, beyond)
+        nodes[here] = (3 * sections[..., None] + np.arange(3)).reshape(len(here), -1)
+        by_order = np.zeros((3, *nodes.shape))
+        by_order[0] = np.pad(self.weights, beyond)
+        by_order[:, here] = np.repeat(weights, 3, axis=2) / 3
+        by_order *= self.sigma_m[:, None] ** np.arange(3)[:, None, None]
+        return nodes, ShapeFunctions(
+            by_order[0], by_order[1, ..., None], by_order[2, ..., None, None]
+        )
+
+    def _is_outside(self, point: Array, cell: int) -> bool:
+        return bool(np.isfinite(point).all()) and self._cell_at(point) != cell
+
+    def _cell_at(self, point: Array) -> int:
+        return int(self._rod.elements_at(self._rod.nearest_s_m(point[None]))[0])
+
+
+def association_kind(body: Body) -> type[MarkerAssociation]:
+    """Return the kind of association of places on a body."""
+    return CentrelineAssociation if body.is_slender else MarkerAssociation
 
 
 def _second_derivatives(element, local: Array) -> Array:
