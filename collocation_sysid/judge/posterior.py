@@ -22,9 +22,9 @@ amplitudes of their own with the same deviation, which are considered. The error
 considered: its estimate is closer than what residuals tell of it.
 
 A single curve of a static test does not tell effects from each other, nor from the law of the
-material, which is never exact. There all effects but a toe are considered, not learnt: the estimates
-are corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962). A
-toe is learnt, because laws differ from it by how far they are flexible at small strain.
+material, which is never exact. There effects are considered but not learnt: the estimates are
+corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962). Only
+those that may be much larger than is typical (`Deviation.typical`), such as a toe, are learnt.
 
 An effect that redefines a constant, such as another damping law for γ_r, does not change that
 constant: the constant is the one given the stated definition, b = 0.
@@ -54,7 +54,7 @@ from ..statistics.budget.effect_estimates import (
     JointPosterior,
     effect_row,
 )
-from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION, TOE
+from ..statistics.budget.systematic_effects import DEVIATIONS, DISCRETISATION
 from ..statistics.distributions import largest_deviation, student_95
 from ..statistics.estimates import Estimate, IntervalCoordinate
 from ..statistics.linearised import LinearisedFit, gauss_newton_step, least_squares_of_fit
@@ -68,8 +68,6 @@ BETWEEN = "between recordings"
 ALIKE = 0.9
 # Share of the prior variance of an effect below which the data say nothing about it.
 UNSEEN = 1e-6
-# Share of the slope at no load by which a law that fits may be wrong.
-LAW_ERROR = 0.1
 
 
 @dataclass(frozen=True)
@@ -129,6 +127,12 @@ class Effects:
             expected[seen],
             sizes[seen],
         )
+
+    @property
+    def typical(self) -> Array:
+        """Standard deviations (a,) of right descriptions, over those of the priors."""
+        known = [effect_row(name).typical.get(name, np.inf) for name in self.names]
+        return np.fmin(1.0, known / self.deviations)
 
     def without(self, rows: Iterable[str]) -> Effects:
         """Return the effects without those of some rows, by name."""
@@ -272,8 +276,8 @@ class Posterior:
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
         _, time_step = DISCRETISATION
-        toe = [k for k, name in enumerate(effects.names) if name in TOE.components]
-        learnt = effects.without([time_step.name]) if is_learnt else effects.only(toe)
+        corrected = [k for k, name in enumerate(effects.names) if effect_row(name).typical]
+        learnt = effects.without([time_step.name]) if is_learnt else effects.only(corrected)
         considered = effects.only(
             k for k, name in enumerate(effects.names) if name not in learnt.names
         )
@@ -317,20 +321,23 @@ class Posterior:
     def sources(self) -> tuple[tuple[str, ...], Array]:
         """Names of the effects, and changes (p + a, …) of parameters and learnt effects if each is off
         by the standard deviation of its prior; a learnt error of the mesh occurs again, once for each
-        amplitude of its shape, and a surprising effect for all that it changes, because another error may
+        amplitude of its shape, and a row with a surprise for all that it changes, because another error may
         look alike.
         """
         names, ways = self._priors
-        count = len(self.effects.names)
         limit = largest_deviation(len(self.effect_estimates), CHANCE)
-        for each in self.effect_estimates:
-            if abs(each.surprise) > limit:
-                own = TOE.components if each.name == TOE.name else (each.name,)
-                at = [self.fit.names.index(name) for name in own]
-                off = self.step[at] - self.effects.means[np.array(at) - len(self.fit.names) + count]
-                known = self.covariance[:, at]
-                ways = np.hstack([ways, known @ np.linalg.pinv(known[at]) @ off[:, None]])
-                names += (each.name,)
+        rows = [
+            each.name.partition(" ")[0]
+            for each in self.effect_estimates
+            if abs(each.surprise) > limit
+        ]
+        for row in dict.fromkeys(rows):
+            own = [k for k, name in enumerate(self.effects.names) if name.partition(" ")[0] == row]
+            at = self._of_effects[own]
+            known = self.covariance[:, at]
+            off = self.step[at] - self.effects.means[own]
+            ways = np.column_stack([ways, known @ np.linalg.pinv(known[at]) @ off])
+            names += (row,)
         return names, ways
 
     @cached_property
@@ -580,20 +587,23 @@ class Posterior:
         count = len(self.effects.names)
         actual = np.diag(self.uncertainty.nuisance_covariance)[-count:] if count else own
         predicted = np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
+        # Some effects are seldom as large as their prior allows.
+        response = np.eye(count) - self.covariance[np.ix_(places, places)]
+        predicted -= response**2 @ (1 - self.effects.typical**2)
         # The shape of the errors of mesh and time step is not known.
         by_shape = self._priors[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
-        found = self._toe()
+        found = []
         for k, name in enumerate(self.fit.names[len(self.fit.names) - count :]):
-            if predicted[k] < UNSEEN or name in TOE.components:
+            if predicted[k] < UNSEEN:
                 continue
             off = float(values[k] - self.effects.means[k])
             found.append(
                 EffectEstimate(
                     name,
                     float(self.effects.means[k] * sizes[k]),
-                    float(sizes[k]),
+                    float(self.effects.typical[k] * sizes[k]),
                     float(values[k] * sizes[k]),
                     float(np.sqrt(own[k]) * sizes[k]),
                     off / float(np.sqrt(predicted[k])),
@@ -601,24 +611,6 @@ class Posterior:
                 )
             )
         return tuple(sorted(found, key=lambda each: -abs(each.surprise)))
-
-    def _toe(self) -> list[EffectEstimate]:
-        """Return the share of the slope that a toe lacks in all, as a list; empty without one.
-
-        Its surprise is by how many standard deviations the data exclude that there is no toe, beside an
-        error of the law (`LAW_ERROR`): the size of a usual toe surprises nobody, but its shape, which is
-        not known, distorts the estimates.
-        """
-        at = [k for k, name in enumerate(self.fit.names) if name in TOE.components]
-        if not at:
-            return []
-        of_phi = np.array(at) - len(self.start)
-        covariance = self.uncertainty.nuisance_covariance[np.ix_(of_phi, of_phi)]
-        shares = self.step[at]
-        size = float(self.effects.deviations[at[0] - self._of_effects[0]])
-        share, error = size * float(shares.sum()), size * float(np.sqrt(covariance.sum()))
-        deviations = share / float(np.hypot(error, LAW_ERROR))
-        return [EffectEstimate(TOE.name, 0.0, 0.0, share, error, deviations)]
 
     def suspected(self, others: Effects, errors: ErrorModel) -> tuple[EffectEstimate, ...]:
         """Return those of other effects with which the least loss decreases most (`AS_WELL`), with the
@@ -655,7 +647,7 @@ class Posterior:
         across = information[np.ix_(places, others)]
         own = information[np.ix_(places, places)] - across @ inverse @ across.T
         own -= np.eye(len(places))  # the priors
-        length = np.sqrt(np.maximum(np.diag(own), 1e-300))
+        length = np.sqrt(np.maximum(np.diag(own), UNSEEN))
         return own / np.outer(length, length)
 
     def _alike(self, k: int) -> tuple[str, ...]:

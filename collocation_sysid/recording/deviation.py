@@ -44,7 +44,7 @@ READABLE_UNITS = {
     "rad": (180 / np.pi, "°"),
     "kg": (1e3, " g"),
 }
-READABLE_UNITS |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, "")}
+READABLE_UNITS |= {"N m": (1e3, " mN m"), "1": (1e2, " %"), "σ": (1.0, ""), "": (1.0, "")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +91,9 @@ class Deviation:
     wide : float or None
         Standard deviation with which it is sought where the residuals contradict the description, of
         a deviation that the budget does not contain.
+    typical : mapping of str to float
+        Standard deviations of right descriptions, by component, that are smaller than `considered`:
+        larger estimates are surprises. The data correct such a deviation in static tests too.
     remedy : str
         What to measure or state in order to reduce it, as an imperative phrase without full stop.
     of : str
@@ -159,6 +162,7 @@ class Deviation:
     considered: Positive | None = None
     by_origin: Mapping[str, Positive] = field(default_factory=dict, hash=False)
     wide: Positive | None = None
+    typical: Mapping[str, Positive] = field(default_factory=dict, hash=False)
     remedy: str = ""
     of: Component = "recording"
     axes: str = ""

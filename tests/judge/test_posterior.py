@@ -193,6 +193,18 @@ def test_the_interval_of_a_surprising_effect_contains_the_estimate_without_it(rn
         assert abs(moved[k]) < deviation < 1.5 * abs(moved[k]), name
 
 
+def test_a_row_with_a_surprise_counts_for_all_that_its_components_change(rng):
+    by_parameters, columns = 3.0 * slopes(rng, 4), 3.0 * slopes(rng, 2)
+    fit = linear_fit(by_parameters, -columns @ [2.0, 1.0])
+    names = ("initial_slope excess", "initial_slope shape")
+    found = posterior(fit, columns, *names)
+    without = posterior(fit, columns[:, :0])
+    assert [abs(of_effect(found, name).surprise) > 4 for name in names] == [True, False]
+    labels, ways = found.sources
+    assert labels == (*names, "initial_slope")
+    np.testing.assert_allclose(ways[:4, 2], (found.step - np.append(without.step, [0, 0]))[:4])
+
+
 def test_the_effect_of_the_time_step_is_not_learnt(rng):
     """Constants are corrected by its mean whatever the residuals are, which are judged without it."""
     by_parameters, column = slopes(rng, 4), 5.0 * slopes(rng, 1)
@@ -275,6 +287,32 @@ def test_an_effect_that_the_data_determine_corrects_the_value_and_adds_nothing(r
     own = of_effect(found, "mass")
     assert own.value / own.deviation == pytest.approx(2.0, abs=1e-3)
     assert own.surprise == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_surprise_is_relative_to_what_is_typical_of_right_descriptions(rng):
+    """An initial slope has a wide prior, but is 0 ± 0.1 in right descriptions."""
+    by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
+    residual = rng.normal(size=len(columns))
+    names = ("initial_slope excess", "mass", "initial_slope shape")
+    found = posterior(linear_fit(by_parameters, residual), columns, *names)
+    rows = np.hstack([by_parameters, columns])
+    mean, covariance = by_bayes(by_parameters, residual, columns, np.zeros(3))
+    estimator = covariance @ rows.T
+    of_truth = estimator @ rows @ np.diag([0, 0, 0, 1, 0.1 / 0.85, 1, 1])
+    variances = np.sum(estimator**2, axis=1) + np.sum(of_truth**2, axis=1)
+    for k, name in enumerate(names, start=4):
+        own = of_effect(found, name)
+        assert own.surprise == pytest.approx(mean[k] / np.sqrt(variances[k])), name
+    assert of_effect(found, names[0]).deviation == pytest.approx(0.1)
+
+
+def test_static_tests_correct_only_what_may_be_larger_than_is_typical(rng):
+    columns = slopes(rng, 3)
+    fit = linear_fit(slopes(rng, 4), rng.normal(size=len(columns)))
+    own = effects(columns, "mass", "initial_slope excess", "initial_slope shape")
+    found = Posterior.from_fit(fit, own, PARAMETERS, Q, GIVEN, is_learnt=False)
+    assert found.effects.names == ("initial_slope excess", "initial_slope shape")
+    assert found.considered.names == ("mass",)
 
 
 def test_effects_that_look_alike_name_each_other(rng):

@@ -281,6 +281,7 @@ ALLOWED = {
     **dict.fromkeys(("Region.cells", "UnderGravity.nodes"), "-1.0 nan inf shape"),
     # Names and constants that are used elsewhere, or not declared by a law and then ignored.
     **dict.fromkeys(("by_origin", "constants", "statements", "ipopt"), "table"),
+    **dict.fromkeys(("Deviation.typical", "NuisanceRow.typical"), "table"),
 }
 # Arguments that the package sets itself.
 INTERNAL = {"body_measure", "located"}

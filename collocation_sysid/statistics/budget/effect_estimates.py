@@ -30,7 +30,7 @@ class EffectEstimate:
 
     name: str  # name with its component, and with a number if several recordings have it
     mean: float
-    deviation: float  # standard deviation of the prior; 0 if the budget does not contain the effect
+    deviation: float  # that is expected; 0 if the budget does not contain the effect
     value: float
     std_error: float
     # Value less mean over the standard deviation that this difference has for a true description.
@@ -108,13 +108,14 @@ def effect_concerns(
         return []
     known = sorted((*suspects, *effects), key=lambda each: -abs(each.surprise))
     instead = [each.name for each in known if each.surprise**2 > AS_WELL * worst.surprise**2]
-    alike = dict.fromkeys(source_label(name) for name in (*instead, *worst.alike))
-    others = [label for label in alike if label != source_label(worst.name)][:MOST_NAMED]
+    row = effect_row(worst.name)
+    alike = [name for name in (*instead, *worst.alike) if effect_row(name) is not row]
+    others = [*dict.fromkeys(map(source_label, alike))][:MOST_NAMED]
     data = {
         "effect": worst.describe(),
         "surprise": abs(worst.surprise),
         "alike": f"; {listed(others)} would look the same" if others else "",
-        "remedy": effect_row(worst.name).remedy,
+        "remedy": row.remedy,
     }
     return [
         Concern("effect/surprising", "doubtful" if abs(worst.surprise) > gross else "check", data)

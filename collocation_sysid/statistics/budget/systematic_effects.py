@@ -83,7 +83,7 @@ FLAT_SHAPE_FACTOR = 1.0
 # Strains within which the slope of a toe approaches that of the law, two of which describe those
 # between too, and the largest strain of a curve below which they are as much less: what is no small
 # part of a curve is not its beginning.
-TOE_STRAINS = (0.003, 0.01)
+TOE_STRAINS = np.array([0.003, 0.01])
 TOE_RANGE = 0.04
 # Poisson's ratio of an incompressible material.
 INCOMPRESSIBLE_POISSON = 0.5
@@ -754,11 +754,13 @@ def _specimen_sticking(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(stiffer * at.internal_n() * is_pressed[:, None])
 
 
-def _specimen_toe(at: ExperimentAtAnswer, index: int) -> Effect | None:
-    """Return the effect of a toe, per share of the slope of the measured curve that is missing at no
-    load: stresses are too small by this share of the slope times w (1 − exp(−|ε| / w)), less that of
-    the smallest strain, an offset of the strain that `strain_zero` contains. The strain w is that of
-    `TOE_STRAINS`, less for curves that end below `TOE_RANGE`. None if the strains are exact.
+def _initial_slope(at: ExperimentAtAnswer, index: int) -> Effect | None:
+    """Return the effect of another slope at no load, per share of the slope of the measured curve.
+
+    Stresses are too large by this share of the slope times w (1 − exp(−|ε| / w)), less that of the
+    smallest strain, an offset of the strain that `strain_zero` contains: by the mean of those of both
+    strains w of `TOE_STRAINS`, less for curves that end below `TOE_RANGE`, or by half their
+    difference. None if the strains are exact.
     """
     experiment = at.iterate.transcription.experiment
     deformation = experiment.specimen
@@ -770,12 +772,13 @@ def _specimen_toe(at: ExperimentAtAnswer, index: int) -> Effect | None:
     largest = float(size.max())
     if not largest:
         return None
-    width = TOE_STRAINS[index] * min(1.0, largest / TOE_RANGE)
-    lost = np.sign(strain) * width * (np.exp(-size.min() / width) - np.exp(-size / width))
+    widths = TOE_STRAINS * min(1.0, largest / TOE_RANGE)
+    excess = widths * (np.exp(-size[:, None] / widths) - np.exp(-size.min() / widths))
     slope_pa = float(np.nanmax(np.abs(stress_pa))) / largest
     direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
     force_n = np.zeros_like(at.iterate.x)
-    force_n[:, 3 * (1 + normal) + direction] = slope_pa * lost / STRESS_PER_FORCE
+    strain_of_force = np.sign(strain) * (excess @ [0.5 - index, 0.5])
+    force_n[:, 3 * (1 + normal) + direction] = slope_pa * strain_of_force / STRESS_PER_FORCE
     return Effect(force_n)
 
 
@@ -966,18 +969,6 @@ def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
     return section_effect(at) if other and other.name == [*SECTIONS][index] else None
 
 
-TOE = Deviation(
-    "specimen_toe",
-    "1",
-    considered=0.6,
-    description="share of the slope of a specimen's curve that is missing at no load, because grips or "
-    "faces do not hold the whole section yet, for each strain within which it returns",
-    remedy="leave out the rows of small strains, in which grips or faces may not hold the whole section, "
-    "with window_s, and let strain_zero be unknown",
-    effect=_specimen_toe,
-    axes=" ".join(f"{strain:g}" for strain in TOE_STRAINS),
-    of_specimens=True,
-)
 ASSUMPTIONS = (
     Deviation(
         "body_scale",
@@ -1218,7 +1209,19 @@ ASSUMPTIONS = (
         effect=_specimen_sticking,
         of_specimens=True,
     ),
-    TOE,
+    Deviation(
+        "initial_slope",
+        "",
+        considered=0.85,
+        typical={"initial_slope excess": 0.1},
+        description="relative excess of the slope of a specimen's curve at no load over that of its law: "
+        "negative in a toe, where grips or faces do not hold the whole section yet",
+        remedy="leave out the rows of small strains, in which grips or faces may not hold the whole section "
+        "(a toe) or fillers may stiffen rubber, with window_s, and let strain_zero be unknown",
+        effect=_initial_slope,
+        axes="excess shape",
+        of_specimens=True,
+    ),
     Deviation(
         "platen_friction",
         "",
