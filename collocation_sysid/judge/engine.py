@@ -271,9 +271,8 @@ class _Refits:
         try:
             changed = replace(collocation, experiments=experiments)
             first = experiments[0]
-            if is_near or first.specimen is not None or first.is_static:
-                start = self.answer if is_near or first.specimen is None else {}
-                changed = changed.with_parameters(changed.parameters.with_estimates(start))
+            if is_near or (first.is_static and first.specimen is None):
+                changed = changed.with_parameters(changed.parameters.with_estimates(self.answer))
             else:  # a large mistake makes all constants wrong: begin as a solve without guesses does
                 changed = start_problem(without_guesses(changed)).collocation
             solution = method(associated_at_guess(changed))

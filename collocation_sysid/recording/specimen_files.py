@@ -647,6 +647,23 @@ def moduli_of(experiment: Experiment) -> dict[str, Array]:
     return moduli_per_stress(specimen_strains(experiment)[0]) if experiment.specimen else {}
 
 
+def initial_modulus_pa(experiment: Experiment) -> float:
+    """Return Young's modulus [Pa] by the median |stress / strain| of the smaller strains of a
+    specimen, or NaN.
+    """
+    assert experiment.specimen is not None
+    strain, _ = specimen_strains(experiment)
+    stress = experiment.readings[0]
+    stress_pa = stress.measured_values[:, 0]
+    is_known = np.isfinite(stress_pa) & (strain != 0)
+    if stress.name != STRESS_NAME or not is_known.any():
+        return np.nan
+    order = np.argsort(np.abs(strain[is_known]))[: len(strain) // 2 + 1]
+    slope = float(np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order])))
+    ratio = experiment.specimen.young_ratio
+    return slope / (ratio if np.isfinite(ratio) else 1.0)
+
+
 def deformed_gradients(experiment: Experiment) -> Array:
     """Return F (T, 3, 3) that the grasps of a specimen prescribe, with 1 in place of free
     components.

@@ -33,6 +33,7 @@ from collocation_sysid import (
     Problem,
     ReducedSpace,
     Region,
+    Specimen,
     Status,
     Tied,
     Unknown,
@@ -45,6 +46,7 @@ from collocation_sysid.methods.starts.initial_trajectories import associated_at_
 from collocation_sysid.methods.starts.start import Start
 from collocation_sysid.methods.starts.stiffness_scan import (
     CLEARLY_BETTER,
+    SOFT_PA,
     ScanState,
     TrialSimulation,
     scan_stiffness,
@@ -565,3 +567,21 @@ def test_the_scan_looks_beyond_the_free_fall_of_a_body():
     best_pa = scan.young_pa[scan.best]
     assert FALLEN["young_pa"] / 3 < best_pa < FALLEN["young_pa"] * 3
     assert scan.samples > 13
+
+
+def test_specimens_start_from_the_initial_slope_of_their_stresses_without_a_scan():
+    strain = np.linspace(0.0, 0.1, 11)
+    known = {"poisson": 0.49}
+    tests = [
+        Specimen(test, strain, slope_pa * strain, 300.0).experiment(name=test)
+        for test, slope_pa in (("uniaxial", 60e3), ("equibiaxial", 120e3), ("planar", 80e3))
+    ]
+    start = start_problem(Problem(tests, known | {"young_pa": Unknown()}).collocation())
+    assert start.scan is None
+    assert start.collocation.parameters.guesses["young_pa"] == pytest.approx(60e3)
+    assert "E = 6e+04 Pa of the initial slope" in start.note
+    lateral = Specimen(
+        "uniaxial", strain, np.full(11, np.nan), 300.0, lateral_stretch=1 - 0.4 * strain
+    ).experiment()
+    unloaded = start_problem(Problem([lateral], known | {"young_pa": Unknown()}).collocation())
+    assert unloaded.collocation.parameters.guesses["young_pa"] == pytest.approx(SOFT_PA)

@@ -44,7 +44,7 @@ from ...recording.specimen import (
     cell_of_other_test,
 )
 from ...recording.specimen_checks import is_unloading
-from ...recording.specimen_files import specimen_strains
+from ...recording.specimen_files import initial_modulus_pa, specimen_strains
 from ...statistics.hypothesis import Hypothesis
 from ...statistics.thresholds import KIND_CHANGE, LIKELIER
 
@@ -94,7 +94,7 @@ def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
     stated = _refit(solution, few, SCREENING)
     if stated is None:
         return
-    slopes_pa = [_initial_slope(each) for each in few]
+    slopes_pa = [initial_modulus_pa(each) for each in few]
     tests = [each.specimen.test for each in originals if each.specimen is not None]
     alike = [[k for k, each in enumerate(tests) if each == test] for test in dict.fromkeys(tests)]
     alone = [[index] for index, each in enumerate(few) if len(each.t_s) >= FEWEST_SAMPLES]
@@ -191,19 +191,6 @@ def _refit(
     return refit.unless_interrupted()
 
 
-def _initial_slope(experiment: Experiment) -> float:
-    """Return Young's modulus [Pa] by the median |stress / strain| of the smaller strains, or NaN."""
-    strain, _ = specimen_strains(experiment)
-    stress_pa = experiment.readings[0].measured_values[:, 0]
-    is_known = np.isfinite(stress_pa) & (strain != 0)
-    if not is_known.any():
-        return np.nan
-    order = np.argsort(np.abs(strain[is_known]))[: len(strain) // 2 + 1]
-    slope = float(np.median(np.abs(stress_pa[is_known][order] / strain[is_known][order])))
-    ratio = 1.0 if experiment.specimen is None else experiment.specimen.young_ratio
-    return slope / (ratio if np.isfinite(ratio) else 1.0)
-
-
 def _square_sum(parts: Sequence[ExperimentIterate]) -> float:
     """Return χ²: the sum of the squares of residuals and nuisance parameters."""
     residuals = (np.nansum(r**2) for part in parts for _, r in scaled_residuals(part))
@@ -221,7 +208,7 @@ def likely_mistakes(experiment: Experiment, other_slopes_pa: Sequence[float]) ->
     # Strips from a sheet with fibres differ in their slopes by the angle at which they were cut.
     has_fibres = any(part.axes is not None for part in experiment.body.parts)
     others_pa = () if has_fibres else other_slopes_pa
-    ratios = [other / _initial_slope(experiment) for other in others_pa]
+    ratios = [other / initial_modulus_pa(experiment) for other in others_pa]
     for what, stated in LOAD_FACTORS.items():
         for factor in (stated, 1 / stated):
             if any(1 / SLOPE_RANGE < ratio / factor < SLOPE_RANGE for ratio in ratios):

@@ -42,12 +42,15 @@ class ScanSummary:
         return (
             f"{self.reason}: started from E = {self.young_pa[self.best]:.3g} Pa after a scan of "
             f"{len(self.young_pa)} stiffnesses in {self.time_s:.2g} s"
-            + (
-                f", beyond the default bound of {YOUNG.bounds[1]:.3g} Pa of soft bodies"
-                if self.young_pa[self.best] > YOUNG.bounds[1]
-                else ""
-            )
+            f"{beyond_default(self.young_pa[self.best])}"
         )
+
+
+def beyond_default(young_pa: float) -> str:
+    """Return an addition to a note if Young's modulus [Pa] is beyond its default bound, else ""."""
+    if young_pa <= YOUNG.bounds[1]:
+        return ""
+    return f", beyond the default bound of {YOUNG.bounds[1]:.3g} Pa of soft bodies"
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ from ...program.collocation import Collocation, ExperimentIterate
 from ...program.forward.newton_solver import NewtonOptions
 from ...program.least_squares import SquareRootInformation
 from ...program.measurement_residual import huber_as_least_squares
+from ...recording.specimen_files import initial_modulus_pa
 from ..horizon import motion_shares, rows_of_share
 from ..options import SHARES
 from ..reduced_space import ReducedSpace
@@ -39,7 +40,7 @@ from ..solve_recorder import interrupted_solution, keep
 from .initial_trajectories import complete_variables, simulate_trajectories
 from .memory import memory_start
 from .power_law import power_law_start
-from .start import NO_GUESS, Scan, Start
+from .start import NO_GUESS, Scan, Start, beyond_default
 
 # Largest Young's modulus of the scan [Pa].
 STIFFEST_PA = 1e7
@@ -89,7 +90,8 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
 
     Specimens of laws in powers of the stretches without a guess start from `power_law_start`; the
     note states which constants their measurements do not determine, which are then fixed. Tables of
-    moduli over frequency or time start from `memory_start`, unless the guesses are as good.
+    moduli over frequency or time start from `memory_start`, unless the guesses are as good, and
+    other specimens without a guess of a modulus from the initial slope of their stresses.
 
     Given guesses are kept, unless the body cannot be simulated with them. If it fits worse than an
     undeformed one, and the scan finds initial values that fit clearly better (`CLEARLY_BETTER`), the
@@ -118,6 +120,8 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
         found = collocation.with_parameters(usual)
         return Start(found, start.fitted_variables(found), note=start.note)
     if any(is_modulus(name) for name in unguessed):
+        if are_specimens:
+            return _start_of_curves(collocation)
         result = scan_stiffness(collocation, is_complete=is_complete)
         return Start(collocation.with_parameters(result.parameters), scan=result)
     if unguessed:
@@ -147,6 +151,19 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
         f"{best:.3g} there"
     )
     return Start(found, scan=replace(result, reason=reason), stated=collocation)
+
+
+def _start_of_curves(collocation: Collocation) -> Start:
+    """Return a start with typical values at Young's modulus of the initial slope of the stresses."""
+    slopes = [initial_modulus_pa(each.experiment) for each in collocation.transcriptions]
+    known = [slope for slope in slopes if slope > 0]
+    young_pa = float(np.median(known)) if known else SOFT_PA
+    bounded = collocation.parameters
+    if is_beyond := beyond_default(young_pa):
+        bounded = bounded.map_components(_with_wider_modulus)
+    found = collocation.with_parameters(typical_parameters(bounded, young_pa))
+    what = "of the initial slope of the stresses"
+    return Start(found, note=f"{NO_GUESS}: started from E = {young_pa:.3g} Pa {what}{is_beyond}")
 
 
 def rescue(collocation: Collocation, reason: str, is_complete: bool = False) -> Scan | None:
