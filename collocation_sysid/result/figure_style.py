@@ -13,7 +13,7 @@ from math import inf
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context, rcdefaults
+from matplotlib import rc_context, rcParamsDefault
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
@@ -58,8 +58,8 @@ def own_settings() -> Iterator[None]:
     It is a decorator, too: of functions that make figures. The figures are written with the same
     settings.
     """
-    with rc_context():
-        rcdefaults()
+    # `rcdefaults` reads all styles of matplotlib.
+    with rc_context({key: rcParamsDefault[key] for key in rcParamsDefault if key != "backend"}):
         yield
 
 

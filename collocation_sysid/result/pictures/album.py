@@ -38,8 +38,8 @@ from .stress_strain import force_picture, harmonic_picture, relaxation_picture, 
 def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, Figure]:
     """Return all pictures of a run except that of its Jacobian, by file name without ending.
 
-    Pictures without data are left out. A run of specimens alone has those of the intervals, of the
-    budget and of its measurements over strain only.
+    Pictures without data are left out. A run of specimens alone has those of its measurements over
+    strain only.
 
     Parameters
     ----------
@@ -49,21 +49,22 @@ def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, F
     result : Result
         Content of ``result.json`` of the same run.
     """
+    drawn = (named for replay in replays for named in experiment_pictures(replay))
+    if replays and all(replay.strain is not None for replay in replays):
+        return with_unique_names(drawn)
     names = [n for n, item in result.parameters.items() if not item.fixed and n in result.estimates]
     pictures = dict[str, Figure]()
-    has_body = not replays or any(replay.strain is None for replay in replays)
-    if result.history and has_body:
+    if result.history:
         pictures["convergence"] = convergence(result.history, names)
-    if (scan := result.scan) is not None and has_body:
+    if (scan := result.scan) is not None:
         pictures["scan"] = scan_picture(scan.young_pa, scan.misfit, best=scan.best)
     confidence = Confidence.from_result(result)
     if confidence is not None and len(confidence.names) > 1:
         pictures["confidence"] = confidence_ellipses(confidence)
-        if has_body:
-            pictures["correlation"] = correlation_matrix(confidence)
+        pictures["correlation"] = correlation_matrix(confidence)
     known = result.uncertainty
     # Alone, each combination is one of the constants.
-    if has_body and known is not None and any(len(each.names) > 1 for each in known.directions):
+    if known is not None and any(len(each.names) > 1 for each in known.directions):
         members = {name for each in known.directions for name in each.names}
         ends = {n: result.parameters[n].combined95 for n in names if n in members}
         alone = {
@@ -82,7 +83,6 @@ def all_pictures(replays: Sequence[MotionRecord], result: Result) -> dict[str, F
             pictures["elements"] = elements_picture(body.undeformed_m, body.tetrahedra)
         for name, values in body.fields.items():
             pictures[f"field_{name}"] = field_picture(body, name, values=values)
-    drawn = (named for replay in replays for named in experiment_pictures(replay))
     return with_unique_names(chain(pictures.items(), drawn))
 
 
