@@ -14,6 +14,7 @@ Exit codes: 0 converged, 1 not converged or, with ``solve --strict``, doubtful, 
 from __future__ import annotations
 
 import ast
+import gc
 import io
 import logging
 import os
@@ -97,8 +98,11 @@ class LazyCommands(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name not in command_sources():
             return None
+        gc.disable()  # nothing that modules define is ever garbage
         with error_console.status("starting"):  # on a terminal only; it takes a second
             family = import_module(command_sources()[cmd_name][0]).commands.registered_commands
+        gc.freeze()
+        gc.enable()
         info = next(each for each in family if _command_name(each.callback.__name__) == cmd_name)
         how = {"pretty_exceptions_short": False, "rich_markup_mode": None}
         return get_command_from_info(info, **how)

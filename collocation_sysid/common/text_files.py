@@ -12,7 +12,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import yaml
 
 from ..errors import InputError, excerpt
 from .files import DAMAGE, reason, require_regular, require_size
@@ -30,7 +29,6 @@ _PLAINER = {
     "Cannot overwrite a value": "this key is given twice",
     "Illegal character '\\n'": "a text lacks its closing quote",
 }
-_YamlLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_text(path: Path, what: str, most: int | None = None) -> str:
@@ -86,7 +84,9 @@ def parse_yaml(text: str) -> Any:
         If it is not valid, nested too deeply, or its aliases stand for more values than the text has
         characters.
     """
-    loader = _YamlLoader(text)
+    import yaml  # only logs and cameras have such files
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)(text)
     try:
         root = loader.get_single_node()
         if _value_count(root, {}) > len(text):
@@ -102,7 +102,8 @@ def _value_count(node: Any, known: dict[int, float]) -> float:
     """Return the number of values of a node with its aliases, infinite for one that has itself."""
     if id(node) not in known:
         known[id(node)] = np.inf
-        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        value = getattr(node, "value", None)
+        parts = value if isinstance(value, list) else ()
         nodes = (each for part in parts for each in (part if isinstance(part, tuple) else (part,)))
         known[id(node)] = 1 + sum(_value_count(each, known) for each in nodes)
     return known[id(node)]

@@ -8,6 +8,7 @@ others.
 from __future__ import annotations
 
 import glob
+import html
 import os
 import platform
 import re
@@ -17,7 +18,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,7 +96,7 @@ def _checked_arrays(
             )
         if array.dtype.kind == "b":
             arrays[name] = array.astype(np.int8)
-    return {escape(name, {'"': "&quot;"}): array for name, array in arrays.items()}
+    return {html.escape(name): array for name, array in arrays.items()}
 
 
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> None:
@@ -117,7 +117,7 @@ def write_pvd(path: str | Path, frames: Sequence[tuple[float, str | Path]]) -> N
     lines = []
     for t_s, file in frames:
         name = Path(os.path.relpath(Path(file).resolve(), folder)).as_posix()
-        lines.append(f'<DataSet timestep="{t_s:.9g}" part="0" file={quoteattr(name)}/>\n')
+        lines.append(f'<DataSet timestep="{t_s:.9g}" part="0" file="{html.escape(name)}"/>\n')
     Path(path).write_text(
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n<Collection>\n'
         f"{''.join(lines)}</Collection>\n</VTKFile>\n",
