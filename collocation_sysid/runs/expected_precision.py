@@ -377,8 +377,9 @@ def _other_test(experiment: Experiment, test: str, values: Mapping[str, float]) 
     blank = Specimen(test, strain, np.zeros_like(strain), 1.0, t_s=experiment.t_s)
     added = blank.experiment(body=body, name=f"added {test}")
     (stresses_pa,) = simulate(added, values).custom_sensor_values
-    specimen = replace(blank, sigma_pa=float(relative * np.abs(stresses_pa).max()))
-    return specimen.experiment(body=body, name=f"added {test}")
+    (gauge,) = added.readings
+    sigma_pa = float(relative * np.abs(stresses_pa).max())
+    return replace(added, readings=[replace(gauge, sigma=sigma_pa)])
 
 
 def _held_longer(transcription: Transcription) -> Experiment | None:

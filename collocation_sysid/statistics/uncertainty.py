@@ -356,11 +356,11 @@ def _compare_recordings(
     fit: LinearisedFit, parameters: Parameters, q: Array, errors: ErrorModel
 ) -> RecordingComparison | None:
     """Return the comparison of single recordings with their own error bars; None if fewer than two
-    recordings have more measurements than parameters.
+    recordings have more measurements than parameters, or all residuals are zero.
 
     Each recording is evaluated by `uncertainty_from_fit` with the error model `errors`.
     """
-    if len({block.name for block in fit.blocks}) < 2:
+    if len({block.name for block in fit.blocks}) < 2 or not fit.chi_squared:
         return None
     known: dict[str, tuple[Array, Array, Array]] = {}
     sizes = relative_derivatives(parameters, q)

@@ -208,9 +208,12 @@ def _effect_of(row: Deviation, at: ExperimentAtAnswer, axis: int) -> Effect | No
 def _changes_by_effects(
     fitted: ExperimentAtAnswer, effects: Sequence[tuple[Effect | None, float]]
 ) -> Iterator[Array]:
-    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects, in σ."""
+    """Yield the changes (T, M, 3, a) of the residuals of each measurement by a effects, in σ; those
+    by None are zero and not computed.
+    """
     part = fitted.iterate
-    count = len(effects)
+    present = [k for k, (effect, _) in enumerate(effects) if effect is not None]
+    count = len(present)
     transcription = part.transcription
     prescribed = part.equations.prescribed
     x = part.x
@@ -218,9 +221,8 @@ def _changes_by_effects(
     rows = np.zeros((*x.shape, count))
     displacements_m = np.zeros((*prescribed.positions_m.shape, count))
     start_m = np.zeros((x.shape[1], count))
-    for k, (effect, sigma) in enumerate(effects):
-        if effect is None:
-            continue
+    for k, (effect, sigma) in enumerate(effects[place] for place in present):
+        assert effect is not None
         if effect.force_n is not None:
             forces[..., k] = sigma * effect.force_n
         if effect.mass_kg is not None:
@@ -248,7 +250,10 @@ def _changes_by_effects(
     for residual, _, values, changes in propagate_columns(
         part, solver, columns=columns, inertia_n=rows[:, transcription.sensed_dofs]
     ):
-        yield residual.residual_changes(values, changes, phi=part.phi)
+        own = residual.residual_changes(values, changes, phi=part.phi)
+        complete = np.zeros((*own.shape[:-1], len(effects)))
+        complete[..., present] = own
+        yield complete
 
 
 def propagate_columns(
