@@ -143,7 +143,8 @@ def validate_arguments(
     refusal : Refusal
         Error about an invalid argument.
     accepts_defaults : bool
-        Whether values that are the default of their argument are passed as they are.
+        Whether values that are the default of their argument are passed as they are; a default of
+        None always is.
     """
     is_class = isinstance(called, type)
     function: Any = called.__init__ if is_class else called
@@ -151,14 +152,14 @@ def validate_arguments(
     stated_fields = fields(called) if is_dataclass(called) else ()
     made = {each.name for each in stated_fields if each.default_factory is not MISSING}
 
-    def made_validators() -> list[tuple[str, Any, Any]]:
+    def made_forms() -> list[tuple[str, Any, Any]]:
         stated = {n: f for n, f in forms().items() if n in signature.parameters and f is not None}
         return [
-            (n, signature.parameters[n].default, _validator(_of_all(f, signature.parameters[n])))
+            (n, signature.parameters[n].default, _of_all(f, signature.parameters[n]))
             for n, f in stated.items()
         ]
 
-    validators = _Kept(made_validators)
+    kept_forms = _Kept(made_forms)
 
     @wraps(function)
     def call(*arguments: Any, **by_name: Any) -> Any:
@@ -167,12 +168,13 @@ def validate_arguments(
         except TypeError as error:
             raise TypeError(f"{_title(called)}: {error}{_other_constructors(called)}") from None
         stated = bound.arguments
-        for name, default, validator in validators():
+        for name, default, form in kept_forms():
             value = stated.get(name, default)
-            if (accepts_defaults and value is default) or (name in made and name not in stated):
+            is_accepted = value is default and (accepts_defaults or default is None)
+            if is_accepted or (name in made and name not in stated):
                 continue
             try:
-                stated[name] = validator.validate_python(value)
+                stated[name] = _validator(form).validate_python(value)
                 continue
             except ValidationError as error:
                 faults = error.errors(include_url=False)
