@@ -203,6 +203,8 @@ def test_with_the_scan_described_the_interval_contains_the_truth(described):
     estimate = run.estimates["young_pa"]
     low, high = combined(estimate)
     assert low < TRUTH["young_pa"] < high
+    assert estimate.optimum == pytest.approx(TRUTH["young_pa"], rel=1e-3)
+    # Corrected for an error of the mesh, which the simulated recording does not have.
     assert estimate.value == pytest.approx(TRUTH["young_pa"], rel=0.02)
     assert "rest_shape" not in significant(run)
 
@@ -210,11 +212,12 @@ def test_with_the_scan_described_the_interval_contains_the_truth(described):
 def test_the_budget_contains_the_error_of_a_scan_in_an_unknown_orientation():
     run = cs.run(problem_of(measured(None, mesh_from="scan"), **ONE_STEP), seek_causes=False)
     estimate = run.estimates["young_pa"]
-    without, error = (
-        abs(value / TRUTH["young_pa"] - 1) for value in (estimate.optimum, estimate.value)
-    )
+    # The errors of mesh and time step, which the simulated recording does not have, are left out.
+    assert estimate.known_effect is not None
+    corrected = estimate.optimum * np.exp(estimate.known_effect)
+    without, error = (abs(value / TRUTH["young_pa"] - 1) for value in (estimate.optimum, corrected))
     assert without > 0.3
-    assert error < without
+    assert error < without / 2
     low, high = combined(estimate)
     assert low < TRUTH["young_pa"] < high
     assert run.trust.verdict != "good"

@@ -174,7 +174,7 @@ def test_an_interruption_keeps_the_last_and_best_iterate(method: Penalty, last: 
     assert solution.history[-1].number == last
     last_loss = solution.history[-1].loss
     assert sum(part.loss for part in solution.parts) == pytest.approx(last_loss)
-    assert solution.history[-1].misfit < 0.1 * solution.history[0].misfit
+    assert solution.history[-1].misfit < 0.02 * solution.history[0].misfit
 
 
 @pytest.mark.long
@@ -194,6 +194,7 @@ def test_nuisance_parameters_may_be_estimated_by_gradients_alone():
     collocation = Collocation([measured(cube_with_nuisance(5))], GUESS)
     options = Penalty(schedule="constant", rho=1e3, max_iterations=60)
     solution = options(collocation)
+    # Conjugate gradients end at the limit of 60 iterations, at 0.09.
     assert solution.history[-1].misfit < 0.1 * solution.history[0].misfit
 
 

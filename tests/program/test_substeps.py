@@ -125,6 +125,7 @@ def test_the_value_is_corrected_for_the_step_and_lies_within_both_intervals():
         each, optimum = coarse.estimates[name], coarse.optimum[name].value
         assert holds(each.statistical95, each.value)
         assert holds(each.combined95, each.value)
+        # The standard error by noise alone is half of the error of the optimum.
         assert abs(each.value - TRUTH[name]) < 0.7 * abs(optimum - TRUTH[name])
         assert coarse.result.parameters[name].optimum == optimum
         assert coarse.parameters[name] == each.value

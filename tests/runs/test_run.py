@@ -75,7 +75,8 @@ def test_nuisance_is_reported_with_unit_prior_and_error(finished):
     first = [nuisance[f"camera offset of low, {axis} [m]"] for axis in "xyz"]
     for found, truth in zip(first, OFFSET_M, strict=True):
         assert found.prior == 0.003
-        assert 0 < found.std_error < 3e-4
+        # With the effects of the budget, which are learnt beside the offsets.
+        assert 0 < found.std_error < 2.5e-4
         assert abs(found.value - truth) < 4 * found.std_error
 
 

@@ -102,6 +102,7 @@ def test_the_optimum_is_that_of_the_search_with_all_points(monkeypatch):
     # Points that change to other triangles leave some per cent of a standard error open.
     assert abs(difference) < 0.03 * error
     assert standard_error(solution) == pytest.approx(error, rel=1e-3)
+    # So do up to 5 of the loss, at any tolerance of the search: here 3.4.
     assert solution.history[-1].loss == pytest.approx(
         direct.history[-1].loss, abs=several_starts.SAME_LOSS / 2
     )
@@ -203,7 +204,7 @@ def test_a_search_at_a_known_minimum_ends():
     assert all(is_at(line) for line in known.history)
     assert not is_at(replace(last, share=0.5))
     assert not is_at(replace(last, loss=highest + 11.0))
-    assert not is_at(replace(last, parameters={"young_pa": 1.2 * known.parameters["young_pa"]}))
+    assert not is_at(replace(last, parameters={"young_pa": 1.11 * known.parameters["young_pa"]}))
 
 
 def test_all_points_have_the_correspondences_of_the_thinned_solution(many):
