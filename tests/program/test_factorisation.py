@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from itertools import product
 
 import numpy as np
@@ -12,7 +13,8 @@ from kit.problems import TRUTH, box
 
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.pattern import SymmetricPattern
-from collocation_sysid.program.linear_algebra.factorisation import Factoriser
+from collocation_sysid.program.linear_algebra import factorisation
+from collocation_sysid.program.linear_algebra.factorisation import NONE, Choice, Factoriser
 from collocation_sysid.program.linear_algebra.supernodal import load_mkl
 
 # On a bar the mesh graph is a narrow band; where every node meets every other, it is full.
@@ -20,7 +22,7 @@ BAR = box((0.04, 0.04, 0.4), (1, 1, 10))
 FULL = SymmetricPattern.from_cells(np.arange(90)[None], 90)
 WIDE = SymmetricPattern.from_cells(np.arange(300)[None], 300)
 SMALL = SymmetricPattern.from_cells(np.arange(7)[None], 7)
-CHOICES = [
+CHOICES: list[tuple[Choice, SymmetricPattern]] = [
     ("band", BAR.pattern),
     ("sparse", BAR.pattern),
     ("auto", FULL),
@@ -148,6 +150,30 @@ def test_pivots_of_wide_bands_decide_the_stability_of_sliding(choice, stiffness:
     np.testing.assert_allclose(
         full_matrix(WIDE, values, skew) @ factor.solve(right), right, atol=1e-9
     )
+
+
+@pytest.mark.parametrize(("choice", "shift"), [("sparse", 100.0), ("band", -100.0), ("band", 0.5)])
+def test_factors_of_superlu_are_made_on_the_thread_that_frees_them(
+    monkeypatch, choice: Choice, shift: float
+):
+    """SciPy loses their memory otherwise: 20 GB in ten minutes of a search, until the system ended it."""
+    threads, splu = set(), factorisation.splu
+
+    def watched(*arguments, **options):
+        threads.add(threading.get_ident())
+        return splu(*arguments, **options)
+
+    monkeypatch.setattr(factorisation, "splu", watched)
+    free = without_first_nodes(WIDE)
+    matrices = [random_values(WIDE, 100.0, seed=k) for k in range(3)]
+    matrices += [random_values(WIDE, shift, seed=k) for k in range(3, 6)]
+    factors = Factoriser(WIDE, free, choice).factorise_each(
+        lambda k: (matrices[k], NONE), 6, threads=2
+    )
+    right = np.ones(len(free))
+    for values, factor in zip(matrices, factors, strict=True):
+        np.testing.assert_allclose(kept(WIDE, values, free) @ factor.solve(right), right, atol=1e-9)
+    assert threads == {threading.get_ident()}
 
 
 def test_factors_that_live_together_do_not_share_their_memory():

@@ -16,7 +16,9 @@ matrix is well conditioned, as the masses make it in time steps of motions.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
@@ -67,6 +69,14 @@ TINY = 1e-300
 
 # Skew part of a symmetric matrix.
 NONE = np.zeros(0)
+
+# State of a thread that computes factors for another one: SciPy frees a factor of SuperLU only on the
+# thread that made it, otherwise its memory is lost.
+_helping = threading.local()
+
+
+class _NotOnThisThreadError(Exception):
+    """A factor of SuperLU is needed on a thread that computes factors for another one."""
 
 
 class Factor(Protocol):
@@ -559,19 +569,25 @@ class Factoriser:
             If a matrix is singular or not finite.
         """
         factors: dict[int, Factor] = {}
+        caller = threading.get_ident()
 
         def run(start: int, stop: int) -> None:
+            _helping.is_helping = threading.get_ident() != caller
             for k in range(start, stop):
-                values, skew = matrix(k)
-                factors[k] = self.factorise(
-                    values,
-                    skew,
-                    buffer=buffers[k] if buffers else None,
-                    is_single=is_single,
-                    accuracy=accuracy,
-                )
+                if k in factors:
+                    continue
+                with suppress(_NotOnThisThreadError):
+                    values, skew = matrix(k)
+                    factors[k] = self.factorise(
+                        values,
+                        skew,
+                        buffer=buffers[k] if buffers else None,
+                        is_single=is_single,
+                        accuracy=accuracy,
+                    )
 
-        run_in_slices(run, count, threads=threads)
+        run_in_slices(run, count, threads=threads if self.is_banded or self.is_supernodal else 1)
+        run(0, count)  # those that other threads left
         return [factors[k] for k in range(count)]
 
     @cached_property
@@ -609,6 +625,8 @@ class Factoriser:
         return _SparseFactor(lu, columns.order, columns.rank, positive_definite=is_definite)
 
     def _superlu(self, values: Array, pivot_below: float, skew: Array = NONE) -> SuperLU:
+        if getattr(_helping, "is_helping", False):
+            raise _NotOnThisThreadError
         entries = values[self._full_source]
         if skew.size:
             entries += self._signs * skew[self._full_source]
