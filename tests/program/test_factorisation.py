@@ -31,7 +31,7 @@ CHOICES: list[tuple[Choice, SymmetricPattern]] = [
 ]
 IDS = ["bar-band", "bar-sparse", "full-auto", "full-sparse", "small-auto"]
 if load_mkl() is not None:
-    CHOICES += [("supernodal", BAR.pattern), ("supernodal", FULL), ("supernodal", SMALL)]
+    CHOICES.extend([("supernodal", each) for each in (BAR.pattern, FULL, SMALL)])
     IDS += ["bar-supernodal", "full-supernodal", "small-supernodal"]
 
 
