@@ -532,7 +532,7 @@ class Sweep:
             else solver.estimate_factor_size()
         )
         bytes_each = 4 if self.has_single_precision else 8
-        return bytes_each * values
+        return int(bytes_each * solver.memory_ratio * values)
 
     @property
     def has_single_precision(self) -> bool:

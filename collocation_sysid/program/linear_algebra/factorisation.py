@@ -317,6 +317,13 @@ class Factoriser:
             self._ordered_columns.counts.sum()
         )  # L, U, and their row numbers at half the size
 
+    @property
+    def memory_ratio(self) -> float:
+        """Memory of a factor over that of its numbers: SciPy copies L and U of SuperLU, whose pivots tell
+        whether the matrix is definite, and SuperLU allocates more than it uses (measured).
+        """
+        return 1.0 if self.is_banded or self.is_supernodal else 8 / 3
+
     def estimate_unsymmetric_factor_size(self) -> int:
         """Return the number of floating-point numbers in the factor of an unsymmetric matrix: twice
         that of a symmetric one within a skyline, otherwise the same.
