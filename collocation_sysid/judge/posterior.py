@@ -24,7 +24,8 @@ considered: its estimate is closer than what residuals tell of it.
 A single curve of a static test does not tell effects from each other, nor from the law of the
 material, which is never exact. There effects are considered but not learnt: the estimates are
 corrected for their means, and their priors add to the variance (Schmidt, NASA TN D-1235, 1962). Only
-those that may be much larger than is typical (`Deviation.typical`), such as a toe, are learnt.
+those that may be much larger than is typical (`Deviation.typical`), such as a toe, are learnt. The
+residuals by which the fit is judged contain an error of the mesh as large as they show it.
 
 An effect that redefines a constant, such as another damping law for γ_r, does not change that
 constant: the constant is the one given the stated definition, b = 0.
@@ -162,6 +163,19 @@ class Effects:
             ),
         )
 
+    def with_shown_mesh(self, fit: LinearisedFit, parameters: Parameters) -> Effects:
+        """Return the effects with an error of the mesh as large as residuals and prior show it: its
+        mean may be wrong by more than the noise.
+        """
+        mesh, _ = DISCRETISATION
+        wide, _ = self.only(k for k, name in enumerate(self.names) if name == mesh.name).added_to(
+            self.without([mesh.name]).expected_in(fit), parameters
+        )
+        sizes = gauss_newton_step(wide)[len(fit.names) :]
+        means = self.means.copy()
+        means[[name == mesh.name for name in self.names]] = sizes
+        return replace(self, means=means)
+
     def added_to(self, fit: LinearisedFit, parameters: Parameters) -> tuple[LinearisedFit, Array]:
         """Return the fit with the effects as its last parameters, and their definition: the matrix
         (p + a, p + a) that turns these parameters into those of the body.
@@ -275,7 +289,7 @@ class Posterior:
         derived_at : callable, optional
             ``derived_at(q)``, the derived moduli at q; by default those of the fit.
         """
-        _, time_step = DISCRETISATION
+        mesh, time_step = DISCRETISATION
         corrected = [k for k, name in enumerate(effects.names) if effect_row(name).typical]
         learnt = effects.without([time_step.name]) if is_learnt else effects.only(corrected)
         considered = effects.only(
@@ -285,6 +299,9 @@ class Posterior:
         expected = considered.expected_in(wide)
         step = gauss_newton_step(expected)
         after = expected.after_step(step)
+        if mesh.name in considered.names:
+            shown = considered.with_shown_mesh(wide, parameters).expected_in(wide)
+            after = replace(after, blocks=shown.after_step(gauss_newton_step(shown)).blocks)
         there = np.clip(q + step[: len(q)], *parameters.bounds_q)
         if derived_at is not None:
             after = replace(after, derived=derived_at(there))
@@ -425,7 +442,8 @@ class Posterior:
         offset = self.definition @ self.step
         definition = np.eye(count + own)
         definition[:count, :count] = self.definition
-        kept, units = (np.array(each) for each in zip(*rows.values(), strict=True))
+        kept = np.array([k for k, _ in rows.values()], dtype=np.int64)
+        units = np.array([unit for _, unit in rows.values()])
         of_body = units[:, None] * definition[kept]
         return JointPosterior(
             tuple(rows),

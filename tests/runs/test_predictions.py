@@ -79,7 +79,7 @@ def test_a_prediction_is_judged_by_its_misfit_over_sigma(softer, verdict):
 @pytest.mark.long
 def test_a_prediction_off_by_more_than_noise_and_description_explain_is_doubtful():
     assert predicted(1.0, is_exact=True).trust.verdict == "good"
-    finished = predicted(1.1, is_exact=True)
+    finished = predicted(1.14, is_exact=True)
     first, *_ = finished.trust.concerns
     assert (first.code, first.grade) == ("prediction/misses", "doubtful")
     assert first.data["sigmas"] < 1.2  # each marker is within its noise, all together are not
@@ -149,8 +149,13 @@ ACROSS, ALONG = (0.0, 9.81, 0.0), (9.81, 0.0, 0.0)
 
 
 @cache
-def image_predicted(young_pa: float) -> cs.Run:
-    problem = cs.Problem([recorded(ACROSS)], BAR_TRUTH | {"young_pa": young_pa})
+def image_predicted(young_pa: float, is_exact: bool = False) -> cs.Run:
+    deviations = cs.Assumptions.exact() if is_exact else cs.Assumptions()
+    problem = cs.Problem(
+        [recorded(ACROSS)],
+        BAR_TRUTH | {"young_pa": young_pa},
+        uncertainty=cs.UncertaintyOptions(assumptions=deviations),
+    )
     return cs.run(problem, seek_causes=False)
 
 
@@ -159,6 +164,7 @@ def test_predicted_depth_is_compared_with_the_image_and_graded():
     right, wrong = image_predicted(1.5e5), image_predicted(0.3e5)
     good, bad = (each.rollouts["experiment"].depth["front"] for each in (right, wrong))
     assert right.trust.verdict == "good"
+    assert image_predicted(1.5e5, is_exact=True).result.trust.verdict == "good"
     assert good.rms_m == pytest.approx(DEPTH_NOISE_M, rel=0.25)
     assert good.share_beyond_gate == 0.0
     assert wrong.trust.verdict == "doubtful"

@@ -138,6 +138,31 @@ def test_estimated_change_of_a_nearly_incompressible_body_is_as_small_as_the_tru
     assert needed < np.log(after / before) < 2 * needed
 
 
+@pytest.mark.parametrize("size", [0.0, 0.5, 1.0, 1.5])
+def test_residuals_of_static_tests_are_judged_with_the_error_of_the_mesh_that_they_show(size):
+    """An error of the mesh that is `size` times as large as estimated."""
+    collocation = coarse_problem("tet10").collocation()
+    z, _ = initial_variables(collocation)
+    fit = linearise_fit(collocation, z)
+    changes = [extrapolated(c, MESH_ORDER) for c in mesh_residual_changes(collocation, z)]
+    rng = np.random.default_rng(0)
+    seen = [
+        replace(b, residual=(rng.normal(size=b.residual.shape) - size * c[..., 0]) * b.is_measured)
+        for b, c in zip(fit.blocks, changes, strict=True)
+    ]
+    nothing = ResidualChanges((), [each[..., :0] for each in changes])
+    effects = Effects.from_changes(nothing, {}, {}, {"mesh": changes})
+    found = Posterior.from_fit(
+        replace(fit, blocks=tuple(seen)), effects, collocation.parameters, z[: collocation.nq],
+        ErrorModel(errors="independent"),
+        is_learnt=False,
+    )  # fmt: skip
+    assert max(np.abs(each).max() for each in changes) > 5.0
+    # Two standard deviations of 70 degrees of freedom are 0.34.
+    assert 0.66 < found.uncertainty.level.pooled < 1.34
+    assert found.considered.means == pytest.approx([2.0])
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("element", ["tet4", "tet10", "tet10-p0"])
 def test_the_posterior_is_nearer_to_the_truth_and_contains_the_error_of_the_mesh(element):
