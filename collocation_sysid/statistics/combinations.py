@@ -409,14 +409,17 @@ def _equal_modulus(
 ) -> str | None:
     """Return the derived modulus of these constants alone that is about as precise."""
     others = np.setdiff1d(np.arange(len(covariance)), members)
+    variances, directions = _eigenpairs(covariance[np.ix_(members, members)])
+    # Of what is not determined at all, first derivatives tell nothing further away.
+    half_widths = np.minimum(NORMAL_95 * np.sqrt(np.maximum(0.0, variances)), np.log(HOPELESS))
     for name, slope in moduli.items():
         if not is_modulus(name):
             continue
         size = np.abs(slope[members]).max(initial=0.0)
         if not size or np.abs(slope[others]).max(initial=0.0) > SMALLEST_POWER * size:
             continue
-        deviation = float(np.sqrt(max(0.0, slope @ covariance @ slope)))
-        if NORMAL_95 * deviation <= SAME * np.log(best.factor):
+        half_width = np.linalg.norm(half_widths * (directions @ slope[members]))
+        if half_width <= SAME * np.log(best.factor):
             return name
     return None
 
