@@ -136,7 +136,8 @@ def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
         with search_activity(f"testing hypothesis {count}"):
             accepted = refits.accepted(each)
             tested += [] if accepted is None else [accepted]
-    if is_specimen:  # laws and toes also decrease the misfit of many corrections
+    # Laws and toes also decrease the misfit of many corrections, as a longer search does.
+    if is_specimen or not solution.status.converged:
         tested = [each for each in tested if (each.remaining or 0.0) <= 1.0]
     return _named_alone_or_together(tested, refits.loss)
 
