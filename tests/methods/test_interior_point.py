@@ -349,23 +349,23 @@ def alone_from_the_guess(problem: Problem) -> Solution:
 @pytest.mark.long
 def test_distant_guesses_lead_to_the_optimum_of_reduced_space():
     problem = soft_bar()
-    expected = solve(problem, ReducedSpace())
+    expected = solve(problem, ReducedSpace(tolerance=1e-9))
     found = solve(problem, InteriorPoint())
     assert found.status is Status.CONVERGED
     assert "sweeps of reduced space" in note_of(found)
     assert found.iterations <= 5
-    np.testing.assert_allclose(found.q, expected.q, atol=1e-5)
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-6)
     assert found.kkt_residual < 1e-7
 
 
 @pytest.mark.long
 def test_a_finer_soft_bar_converges_from_distant_guesses_too():
     problem = soft_bar((5, 2, 2), 41)
-    expected = solve(problem, ReducedSpace())
+    expected = solve(problem, ReducedSpace(tolerance=1e-9))
     found = solve(problem, InteriorPoint())
     assert found.status is Status.CONVERGED
     assert found.iterations <= 5
-    np.testing.assert_allclose(found.q, expected.q, atol=1e-5)
+    np.testing.assert_allclose(found.q, expected.q, atol=1e-6)
     alone = alone_from_the_guess(problem)
     assert alone.status is Status.CONVERGED
     assert alone.iterations <= 25

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from kit.wrenches import without_grasp_sensors
 
-from collocation_sysid import Problem, run, simulate, solve
+from collocation_sysid import Assumptions, Problem, run, simulate, solve
 from collocation_sysid.methods.solution import Solution, pooled_wrench_rms
 from collocation_sysid.pipeline import Run
 from collocation_sysid.recording import Nuisance
@@ -91,9 +91,13 @@ def test_a_wrist_sensor_separates_stiffness_and_density(felt: bool):
     assert finished.solution.status.converged
     estimates = finished.uncertainty.estimates
     if felt:
+        options = replace(problem.uncertainty, assumptions=Assumptions.exact())
+        exact = run(replace(problem, uncertainty=options), seek_causes=False).uncertainty.estimates
         for name, true in WRIST.items():
-            found = estimates[name]
+            found = exact[name]
             assert abs(found.value - true) < 2.6 * found.statistical_std_error < 0.02 * true, name
+            low, high = finished.interval(name)
+            assert low < true < high < 1.15 * low, name
         return
     assert {estimates[name].statistical_std_error for name in WRIST} == {None}
     ratio = estimates["young_pa"].value / estimates["density_kg_m3"].value
