@@ -88,7 +88,7 @@ def next_step(result: Result, folder: Path) -> str:
     run = shlex.quote(str(folder))
     refinable = _has_mesh(result) and result.budget and result.provenance.problem_file is not None
     if result.trust.verdict == "good" and refinable and "mesh" not in (result.discretisation_kinds):
-        is_estimated = any(each.name == "mesh" for each in result.effects)
+        is_estimated = any("mesh" in shares for shares in result.budget.values())
         in_intervals = "contain as an estimate" if is_estimated else "do not contain"
         return (
             f"{program} refine {run} (measures the mesh error, which the intervals {in_intervals})"

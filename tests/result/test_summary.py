@@ -213,7 +213,14 @@ def test_the_next_command_suits_the_result():
     file = replace(result.provenance, problem_file="p.toml")
     good = replace(result, provenance=file, trust=replace(result.trust, concerns=()))
     assert good.trust.verdict == "good"
-    assert "refine 'runs/a swing' (" in next_step(good, folder)
+    # Also of static tests, in which the mesh is not estimated but considered.
+    for shares, said in (
+        ({"mesh": 0.4, "noise": 0.6}, "contain as an estimate"),
+        ({"noise": 1.0}, "do not"),
+    ):
+        step = next_step(replace(good, budget={"young_pa": shares}, effects=()), folder)
+        assert "refine 'runs/a swing' (" in step
+        assert said in step
 
 
 def test_the_combined_covariance_agrees_with_the_table():
