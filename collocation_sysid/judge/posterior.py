@@ -163,19 +163,6 @@ class Effects:
             ),
         )
 
-    def with_shown_mesh(self, fit: LinearisedFit, parameters: Parameters) -> Effects:
-        """Return the effects with an error of the mesh as large as residuals and prior show it: its
-        mean may be wrong by more than the noise.
-        """
-        mesh, _ = DISCRETISATION
-        wide, _ = self.only(k for k, name in enumerate(self.names) if name == mesh.name).added_to(
-            self.without([mesh.name]).expected_in(fit), parameters
-        )
-        sizes = gauss_newton_step(wide)[len(fit.names) :]
-        means = self.means.copy()
-        means[[name == mesh.name for name in self.names]] = sizes
-        return replace(self, means=means)
-
     def added_to(self, fit: LinearisedFit, parameters: Parameters) -> tuple[LinearisedFit, Array]:
         """Return the fit with the effects as its last parameters, and their definition: the matrix
         (p + a, p + a) that turns these parameters into those of the body.
@@ -299,9 +286,14 @@ class Posterior:
         expected = considered.expected_in(wide)
         step = gauss_newton_step(expected)
         after = expected.after_step(step)
-        if mesh.name in considered.names:
-            shown = considered.with_shown_mesh(wide, parameters).expected_in(wide)
-            after = replace(after, blocks=shown.after_step(gauss_newton_step(shown)).blocks)
+        if mesh.name in considered.names:  # its mean may be wrong by more than the noise
+            others = considered.without([mesh.name])
+            shown = considered.only(
+                k for k, name in enumerate(considered.names) if name not in others.names
+            )
+            with_mesh, _ = shown.added_to(others.expected_in(wide), parameters)
+            judged = with_mesh.after_step(gauss_newton_step(with_mesh)).only(range(len(wide.names)))
+            after = replace(after, blocks=judged.blocks)
         there = np.clip(q + step[: len(q)], *parameters.bounds_q)
         if derived_at is not None:
             after = replace(after, derived=derived_at(there))
