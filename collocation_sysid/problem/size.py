@@ -142,10 +142,7 @@ def require_feasible(size: Size, say: Say | None = None) -> None:
     is_large = size.samples == 1 and size.nodes > ANNOUNCED_NODES
     if say is not None and (is_large or size.time_s() > ANNOUNCED_SOLVE_S):
         act = "a solve" if size.unknowns else "a simulation"
-        say(
-            f"{what}: {act} takes about {size.memory_mb() / 1e3:.2g} GB of memory, or more; "
-            "check estimates its time"
-        )
+        say(f"{what}: {act} may take more than a minute; check estimates its time")
 
 
 def announce_reading(files: Iterable[Path], say: Say) -> None:
