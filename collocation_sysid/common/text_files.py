@@ -86,7 +86,8 @@ def parse_yaml(text: str) -> Any:
     """
     import yaml  # only logs and cameras have such files
 
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)(text)
+    # libyaml, the loader in C, ends the process at deep nesting with some versions of PyYAML.
+    loader = yaml.SafeLoader(text)
     try:
         root = loader.get_single_node()
         if _value_count(root, {}) > len(text):
