@@ -227,7 +227,9 @@ def run(
 
                 if not answer.is_consistent:
                     say("testing possible causes of the misfit")
-                causes = find_misspecifications(answer.solution, answer.is_consistent)
+                causes = find_misspecifications(
+                    answer.solution, answer.is_consistent, problem.assumed_deviations
+                )
                 is_explained = answer.is_consistent or any(
                     each.suffices for each in answer.suspects
                 )

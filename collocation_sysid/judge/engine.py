@@ -4,7 +4,7 @@ fitted again, and named only if their correction brings the residuals to the noi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from ..recording.experiment import Experiment
 from ..recording.measurement_selection import measured_count
 from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
 from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL
-from .fit import Corrected, TestedFit, discrepancy, has_trend, thinned, with_corrected
+from .fit import Corrected, TestedFit, discrepancy, has_trend, least_loss, thinned, with_corrected
 from .modes import find_misspecifications_by_modes
 from .motion import motion_candidates, motion_rows
 from .registry import SOURCES
@@ -58,7 +58,9 @@ TESTED = {
 
 
 def find_misspecifications(
-    solution: Solution, is_consistent: bool = False
+    solution: Solution,
+    is_consistent: bool = False,
+    deviations: Mapping[str, float | None] | None = None,
 ) -> tuple[Hypothesis, ...]:
     """Return likely mistakes in the description of a solved problem, likeliest first, with the factor
     by which the misfit decreases without them as `strength`.
@@ -68,15 +70,18 @@ def find_misspecifications(
     is_consistent : bool
         Whether the posterior is as expected of a true description: then only what such a fit does
         not exclude is tested.
+    deviations : mapping of str to float or None, optional
+        Standard deviations of effects of the budget by name; by default the usual ones.
 
     Notes
     -----
     What the data show by themselves comes first: nothing is fitted again if it is nearly certain
     (`CERTAIN`), or if the residuals are noise.
     """
+    deviations = deviations or {}
     sources = present(SOURCES, [part.transcription.experiment for part in solution.parts])
     if is_consistent:
-        return rank(each for source in sources for each in source.consistent(solution))
+        return rank(e for source in sources for e in source.consistent(solution, deviations))
     found = [each for source in sources for each in source.fitted(solution)]
     for part, fitted_m in zip(solution.parts, solution.readings_m, strict=True):
         experiment = part.transcription.experiment
@@ -87,7 +92,7 @@ def find_misspecifications(
     if _certainty(found) < CERTAIN:
         found += _shown_by_modes(solution, worst)
     if misfits[worst] > 1.0 and _certainty(found) < CERTAIN:
-        found += _tested(solution, solution.parts[worst].transcription.experiment)
+        found += _tested(solution, solution.parts[worst].transcription.experiment, deviations)
     return rank(found)
 
 
@@ -112,7 +117,9 @@ def _shown_by_modes(solution: Solution, number: int) -> Iterator[Hypothesis]:
             yield each
 
 
-def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
+def _tested(
+    solution: Solution, experiment: Experiment, deviations: Mapping[str, float | None]
+) -> list[Hypothesis]:
     """Return the mistake without which the first samples of an experiment, or all specimens, fit as
     well as noise allows; several as one hypothesis if the fits do not tell them apart, or if none
     suffices.
@@ -120,7 +127,7 @@ def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
     is_specimen = experiment.specimen is not None
     if is_specimen and not solution.status.converged:
         return []
-    refits = _Refits(solution, _fitted_again(solution, experiment))
+    refits = _Refits(solution, _fitted_again(solution, experiment), deviations)
     stated = refits.fit(None)
     if stated is None:
         return []
@@ -139,6 +146,9 @@ def _tested(solution: Solution, experiment: Experiment) -> list[Hypothesis]:
     # Laws and toes also decrease the misfit of many corrections, as a longer search does.
     if is_specimen or not solution.status.converged:
         tested = [each for each in tested if (each.remaining or 0.0) <= 1.0]
+    if is_specimen and tested:  # nothing is wrong if an effect of the budget explains it as well
+        least = min(refits.loss(each.corrected) for each in tested)
+        tested = tested if refits.loss(None) > least + INDISTINGUISHABLE else []
     return _named_alone_or_together(tested, refits.loss)
 
 
@@ -186,9 +196,15 @@ class _Refits:
     from the problem's guess, or from the answer and its motion.
     """
 
-    def __init__(self, solution: Solution, stated: Sequence[Experiment]) -> None:
+    def __init__(
+        self,
+        solution: Solution,
+        stated: Sequence[Experiment],
+        deviations: Mapping[str, float | None],
+    ) -> None:
         self.whole = solution
         self.stated = stated
+        self.deviations = deviations
         fitted = [each.experiment for each in solution.collocation.transcriptions]
         samples = sum(len(each.t_s) for each in fitted)
         own = sum(len(each.t_s) for each in stated)
@@ -248,13 +264,17 @@ class _Refits:
             return None
         return max(map(discrepancy, refit.parts))
 
-    def loss(self, corrected: Corrected) -> float:
-        """Return the loss with that expected of measurements left out; infinite without a fit."""
+    def loss(self, corrected: Corrected | None) -> float:
+        """Return the loss, of specimens that with the effects of the budget, with that expected of
+        measurements left out; infinite without a fit.
+        """
         refit = self.fit(corrected)
         if refit is None:
             return np.inf
         fitted = with_corrected(self.stated, corrected)
         left_out = sum(map(measured_count, self.stated)) - sum(map(measured_count, fitted))
+        if self.stated[0].specimen:
+            return least_loss(refit, self.deviations) + left_out
         return refit.history[-1].loss + left_out
 
     def _fit(self, corrected: Corrected | None, is_near: bool) -> Solution | None:

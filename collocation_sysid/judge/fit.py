@@ -17,7 +17,7 @@ from ..recording.deviation import Deviation
 from ..recording.experiment import Experiment
 from ..recording.markers import Markers
 from ..recording.measurement import Measurement, root_mean
-from ..statistics.budget.consider_analysis import changed_residuals
+from ..statistics.budget.consider_analysis import changed_residuals, changes_of_assumptions
 from ..statistics.distributions import largest_deviation, normal_isf
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.linearised import LinearisedFit, linearise_fit
@@ -202,6 +202,16 @@ def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
     jacobian = np.concatenate([jacobian, np.diag(fit.prior_jacobian)[:, free]])
     explained = np.linalg.lstsq(jacobian, values, rcond=1e-10)[0]
     return (remaining := values - jacobian @ explained).T @ remaining
+
+
+def least_loss(fit: Solution, deviations: Mapping[str, float | None]) -> float:
+    """Return χ² after a linear step from a fit in its parameters and in all effects of the budget,
+    with their standard deviations by name in place of the usual ones.
+    """
+    effects = changes_of_assumptions(fit.collocation, fit.z, deviations).blocks
+    gram = projected_gram(linearise_fit(fit.collocation, fit.z), effects)
+    own, among = gram[0, 1:], gram[1:, 1:]
+    return float(gram[0, 0] - own @ np.linalg.solve(among + np.eye(len(among)), own))
 
 
 def linear_step(

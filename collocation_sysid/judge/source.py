@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from ..methods.solution import Solution
@@ -30,11 +30,12 @@ class Source:
     candidates : callable
         ``candidates(fit)``: those that may be corrected and fitted again.
     consistent : callable
-        ``consistent(solution)``: those that a consistent fit does not exclude.
+        ``consistent(solution, deviations)``: those that a consistent fit does not exclude, with the
+        standard deviations of effects of the budget that are not the usual ones.
     """
 
     kind: type
     described: Callable[[Experiment], Iterable[Hypothesis]] = _nothing
     fitted: Callable[[Solution], Iterable[Hypothesis]] = _nothing
     candidates: Callable[[TestedFit], Iterable[Candidate]] = _nothing
-    consistent: Callable[[Solution], Iterable[Hypothesis]] = _nothing
+    consistent: Callable[[Solution, Mapping[str, float | None]], Iterable[Hypothesis]] = _nothing

@@ -355,9 +355,10 @@ def mistaken(mistake, test):
     strain = (
         np.linspace(-0.02, -0.5, 20) if mistake == "compression" else np.linspace(0.02, 0.8, 20)
     )
-    stress_pa = simulated(test, strain)["stress"] + 500.0 * rng.normal(size=20)
+    stress_pa = simulated(test, strain)["stress"]
     if mistake == "true-stress":
         stress_pa = stress_pa * (1 + strain)
+    stress_pa = stress_pa + 500.0 * rng.normal(size=20)
     if mistake == "compression":
         strain, stress_pa = -strain, -stress_pa
     return cs.Specimen(test, strain, stress_pa, 500.0).experiment(name="pull")

@@ -95,6 +95,18 @@ def test_unloading_is_no_mistake_of_the_description(law):
     assert "only unloading" in "".join(order_warnings(test))
 
 
+def test_the_noise_of_a_stress_is_corrected_with_it():
+    """Else a correction to smaller stresses fits better than the truth."""
+    pull = cs.Specimen("planar", STRAIN, neo_hookean_pa(STRAIN), SIGMA_PA).experiment()
+    rows = {row.name: row for row in likely_mistakes(pull, ())}
+    corrected, _ = rows["specimen-true-stress"].correct(pull, np.ones(1))
+    ratios = [
+        each.readings[0].measured_values / each.readings[0].sample_sigmas
+        for each in (corrected, pull)
+    ]
+    np.testing.assert_allclose(*ratios)
+
+
 def test_nothing_is_named_after_a_search_that_did_not_converge():
     test = cs.Specimen("uniaxial", STRAIN, neo_hookean_pa(STRAIN) * (1 + STRAIN), SIGMA_PA)
     problem = cs.Problem(

@@ -74,6 +74,17 @@ def test_a_slope_at_no_load_that_the_data_show_is_the_first_reason(slack, sign):
     assert "(a toe) or fillers may stiffen rubber, with window_s" in run.trust.reasons[0]
 
 
+@pytest.mark.parametrize(
+    ("largest", "noise", "seed", "names"), [(0.4, 0.003, 0, YEOH), (0.1, 0.01, 1, ("mu_pa",))]
+)
+def test_a_curve_that_is_stiffer_at_first_is_of_no_other_kind_of_test(largest, noise, seed, names):
+    """As a planar or a uniaxial test it fits better, but not beside the slope at no load."""
+    run = run_of_lap_joint(-0.006, largest, noise, seed, names)
+    assert not run.causes
+    low_pa, high_pa = interval_pa(run)
+    assert low_pa < YOUNG_PA < high_pa
+
+
 def test_a_toe_is_named_beside_a_motion_and_has_the_unit_of_its_own_prior():
     run = cs.run(swing_and_pull(0.006, 31, 0))
     low_pa, high_pa = interval_pa(run)

@@ -13,7 +13,7 @@ mistake is therefore named only if its correction leaves noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -25,7 +25,15 @@ from ...common.display import readable_stress
 from ...errors import InputError, SimulationError, listed
 from ...fem.laws.moduli import engineering_constants
 from ...judge.doubt import Correction, Doubt
-from ...judge.fit import Candidate, TestedFit, has_trend, scaled_residuals, thinned, with_corrected
+from ...judge.fit import (
+    Candidate,
+    TestedFit,
+    has_trend,
+    least_loss,
+    scaled_residuals,
+    thinned,
+    with_corrected,
+)
 from ...judge.source import Source
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
@@ -122,10 +130,10 @@ def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
                 )
 
 
-def likelier_kinds(solution: Solution) -> list[Hypothesis]:
+def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -> list[Hypothesis]:
     """Return the hypothesis, as a list, that specimens which fit are of another kind of test, with
-    which they fit far better; empty unless all recordings are specimens of one kind. A flexible law
-    fits the curve of another kind too, with other constants.
+    which they fit far better, both with the effects of the budget; empty unless all recordings are
+    specimens of one kind. A flexible law fits the curve of another kind too, with other constants.
     """
     experiments = [part.transcription.experiment for part in solution.parts]
     kinds = {each.specimen.test if each.specimen else "" for each in experiments}
@@ -147,9 +155,9 @@ def likelier_kinds(solution: Solution) -> list[Hypothesis]:
     }
     if stated is None or not refits:
         return []
-    losses = {test: _square_sum(each.parts) for test, each in refits.items()}
+    losses = {test: least_loss(each, deviations) for test, each in refits.items()}
     likeliest = min(losses, key=losses.__getitem__)
-    best, stated_loss = refits[likeliest], _square_sum(stated.parts)
+    best, stated_loss = refits[likeliest], least_loss(stated, deviations)
     change = abs(np.log(_young_pa(best) / _young_pa(stated)))
     # The stress in unloading is not that of the law. Where the law is wrong too, correlated residuals
     # remain, and χ² does not tell the kinds apart.
@@ -160,7 +168,11 @@ def likelier_kinds(solution: Solution) -> list[Hypothesis]:
     data = {
         "stated": kinds.pop(),
         "young": _young_text(stated),
-        "kinds": [f"{likeliest} ({_young_text(best)})"],
+        "kinds": [
+            f"{test} ({_young_text(refits[test])})"
+            for test in sorted(losses, key=losses.__getitem__)
+            if losses[test] <= losses[likeliest] + LIKELIER
+        ],
     }
     of = listed([f"'{each.name}'" for each in experiments])
     strength = float(np.sqrt(stated_loss / losses[likeliest]))
@@ -319,7 +331,8 @@ def _with_stress(experiment: Experiment, factors: Array) -> Experiment:
         replace(
             gauge,
             values=gauge.measured_values * factors[:, None],
-            sigma=gauge.sigma * max(1.0, float(np.median(np.abs(factors)))),
+            sigma=gauge.sample_sigmas * np.abs(factors)[:, None],
+            sigma_ratios=None,
         )
         if gauge.unit == STRESS_UNIT and len(gauge.sample_times_s) == len(factors)
         else gauge
