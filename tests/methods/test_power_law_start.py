@@ -152,6 +152,18 @@ def test_a_single_term_may_have_a_negative_exponent():
     assert start.young_pa == pytest.approx(3 * 690, rel=0.03)
 
 
+@pytest.mark.parametrize("largest", [0.5, 0.6, 0.7, 0.8])
+def test_of_two_signs_that_fit_alike_the_positive_one_counts(largest):
+    """Of α and −α no planar test shows which, because the width keeps its stretch of one."""
+    stretch = 1 + np.linspace(0.02, largest, 30)
+    noise_pa = 1e3 * np.random.default_rng(0).normal(size=30)
+    stress_pa = 1e5 * (stretch**2.3 - stretch**-4.3) + noise_pa
+    specimen = cs.Specimen("planar", stretch - 1, stress_pa, 1e3)
+    _, items = start_of(without_guess("ogden-1", [specimen], kappa_pa=1e9))
+    assert items["alpha_1"].guess == pytest.approx(3.3, rel=0.05)
+    assert items["mu_1_pa"].guess == pytest.approx(1e5, rel=0.1)
+
+
 def test_terms_that_run_together_are_held_apart():
     """Large factors of opposite signs, whose exponents differ by a tenth."""
     tests = []

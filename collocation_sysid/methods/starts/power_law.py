@@ -326,9 +326,11 @@ class _PowerLawFits:
             return None
         least = min(fit.loss for fit in fits)
         equal = least + EQUAL_LOSS * max(1.0, least / self.measurements)
-        # A uniaxial test alone hardly distinguishes α from −2α.
+        # A uniaxial test alone hardly distinguishes α from −2α, and planar tests and shear do not
+        # distinguish α from −α, of which the positive one counts.
         best = min(
-            (fit for fit in fits if fit.loss <= equal), key=lambda fit: np.abs(fit.alpha).sum()
+            (fit for fit in fits if fit.loss <= equal),
+            key=lambda fit: np.sum(np.abs(fit.alpha) - 0.01 * fit.alpha),
         )
         return self._improve(best)
 
