@@ -102,7 +102,7 @@ def _certainty(found: Sequence[Hypothesis]) -> float:
 
 def cause_notes(solution: Solution, causes: Sequence[Hypothesis]) -> tuple[str, ...]:
     """Return a note that no cause of a misfit was found; empty if there is one, or no misfit."""
-    if causes or max(map(discrepancy, solution.parts)) <= 1.0:
+    if causes or not solution.history or max(map(discrepancy, solution.parts)) <= 1.0:
         return ()
     is_static = all(each.experiment.is_static for each in solution.collocation.transcriptions)
     return (f"{NO_CAUSE} ({TESTED[is_static]})",)
@@ -125,7 +125,8 @@ def _tested(
     suffices.
     """
     is_specimen = experiment.specimen is not None
-    if is_specimen and not solution.status.converged:
+    is_lost = not solution.history  # not even the first values could be simulated
+    if is_lost or (is_specimen and not solution.status.converged):
         return []
     refits = _Refits(solution, _fitted_again(solution, experiment), deviations)
     stated = refits.fit(None)
