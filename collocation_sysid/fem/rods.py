@@ -46,6 +46,8 @@ from .meshes.mesh import ElementNodes, TetMesh
 # Stiffness of a section against changes of its shape, in units of EA. A moment M stretches directors
 # by about EI κ²/(10 EA), 0.01 % where the radius of curvature is 20 times that of the section.
 SECTION_STIFFNESS = 10.0
+# Angle by which a rod that was not stated to be straight may be bent by itself [rad].
+ROD_CURVATURE = 0.5
 _ANGLES = 2 * np.pi / 3 * np.arange(3)
 # Centre and directors of a section from its nodes: rows for r, h₁ d₁ and h₂ d₂.
 _DIRECTORS = np.stack([np.full(3, 1 / 3), 2 / 3 * np.cos(_ANGLES), 2 / 3 * np.sin(_ANGLES)])

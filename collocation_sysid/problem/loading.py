@@ -40,7 +40,7 @@ from ..fem.meshes.structured import (
 )
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
-from ..fem.rods import CrossSection, RodMesh, rod_mesh
+from ..fem.rods import ROD_CURVATURE, CrossSection, RodMesh, rod_mesh
 from ..fem.spatial_field import Field
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Specimen
@@ -132,7 +132,7 @@ def problem_arguments(
             "every experiment has validation = true; expected at least one to fit", path
         )
     folder = path.parent if folder is None else Path(folder)
-    unknowns = _with_natural_strains(file.parameters)
+    unknowns: Sections = file.parameters
     code = CodeLoader(folder, allow_code)
     with located(path):
         for name, method in file.solver.methods.items():
@@ -145,6 +145,7 @@ def problem_arguments(
         cells = SpecimenCells(file.object, code)
         if file.recordings:
             body, size = _load_object(file, folder, code=code, simulation=simulation, say=say)
+            unknowns = _with_natural_strains(unknowns, body)
             mesh_warnings = [oddity.message for oddity in size_and_density_hypotheses(body)]
         else:
             first = file.specimens[0]
@@ -228,7 +229,11 @@ def _load_object(
         with_guessed_densities(section, file.parameters),
         mesh,
         code=code,
-        natural_curvature=any(constant.name in file.parameters for constant in NATURAL_STRAINS),
+        natural_curvature=isinstance(mesh, RodMesh)
+        and (
+            section.rest_shape is None
+            or any(constant.name in file.parameters for constant in NATURAL_STRAINS)
+        ),
     )
     size = replace(size, nodes=len(body.nodes.points_m))
     require_feasible(replace(size, substeps=1), say)
@@ -354,12 +359,20 @@ def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterato
         raise InputError("; ".join([*odd, error.message]), source, where=where) from error
 
 
-def _with_natural_strains(parameters: Sections) -> Sections:
-    """Return parameters in which natural curvatures and twist are zero beside a stated one."""
-    names = [constant.name for constant in NATURAL_STRAINS]
-    if not any(name in parameters for name in names):
+def _with_natural_strains(parameters: Sections, body: Body) -> Sections:
+    """Return parameters with all natural curvatures and twists of a rod: zero beside a stated one,
+    and estimated with a prior where neither they nor the rest shape are stated.
+    """
+    names = [[*body.constants][k] for k in body.natural_strain_indices]
+    if not names:
         return parameters
-    return dict.fromkeys(names, 0.0) | dict(parameters)
+    missing: ParameterSection | float = 0.0
+    if not any(name in parameters for name in names):
+        assert isinstance(body.mesh, RodMesh)
+        deviation = ROD_CURVATURE / float(body.mesh.s_m[-1])
+        prior = {"mean": 0.0, "deviation": deviation}
+        missing = ParameterSection.model_validate({"guess": 0.0, "prior": prior})
+    return dict(parameters) | {name: missing for name in names if name not in parameters}
 
 
 def _stations_m(file: ProblemFile) -> list[float]:

@@ -261,7 +261,7 @@ class ObjectSection(Section):
         shape in which the object hung or stood under its own weight while it was scanned.
         "straight": the centreline of a rod is a shape under load, and the rod is straight without
         stress. By default the mesh counts as stress-free, and the result states how much the estimates would
-        change if it is not.
+        change if it is not; natural curvatures and twist of a rod are then estimated.
     made : Made, optional
         How the object was made, which selects default deviations of [uncertainty.assumptions] and
         the plausible densities: "cast" in a mould, cut from or moulded as "foam", "printed", or

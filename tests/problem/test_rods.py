@@ -8,6 +8,7 @@ import pytest
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.problem.new import create_problem
+from collocation_sysid.recording.writers import write_markers_csv
 
 TRUTH = {"bending_n_m2": 1e-3, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
 
@@ -66,6 +67,44 @@ def test_the_rest_shape_of_a_curved_centreline_is_as_stated(rest_shape, problem)
     length_m = 0.4 * np.pi / 2
     bent = 0.5 * TRUTH["bending_n_m2"] * length_m / 0.4**2
     assert energy == pytest.approx(bent if rest_shape == "straight" else 0.0, rel=5e-3, abs=1e-12)
+
+
+def test_natural_curvature_is_unknown_unless_the_rest_shape_or_a_curvature_is_stated(problem):
+    stated = cs.Problem.read(problem).parameters
+    assert {item.name for item in stated.free} == TRUTH.keys()
+    changed(problem, 'rest_shape = "straight"', "")
+    unstated = cs.Problem.read(problem).parameters
+    bent = {item.name: item.prior for item in unstated.free if item.name not in TRUTH}
+    names = {"curvature_1_1_m", "curvature_2_1_m", "twist_1_m"}
+    assert bent == dict.fromkeys(names, (0.0, pytest.approx(0.5 / 0.6)))
+    changed(problem, "gamma_m_1_s  = {}", "gamma_m_1_s  = {}\ncurvature_1_1_m = {}")
+    one = cs.Problem.read(problem).parameters
+    assert {item.name for item in one.free} == TRUTH.keys() | {"curvature_1_1_m"}
+
+
+@pytest.mark.long
+def test_a_cable_that_is_bent_by_itself_is_identified_unless_it_is_stated_to_be_straight(problem):
+    natural = {"curvature_1_1_m": 0.25, "curvature_2_1_m": -0.2, "twist_1_m": 0.1}
+    changed(problem, "sections = 41", "sections = 21")
+    changed(problem, 'name = "swing"', 'name = "swing"\nwindow_s = [0.0, 1.5]')
+    straight = problem.read_text(encoding="utf-8")
+    changed(problem, 'rest_shape = "straight"', "")
+    (experiment,) = cs.Problem.read(problem).experiments
+    tracks_m = cs.simulate(
+        experiment, TRUTH | natural | {"torsion_n_m2": 3e-4, "axial_n": 200.0}
+    ).markers_m
+    noise_m = np.random.default_rng(2).normal(scale=5e-4, size=tracks_m.shape)
+    names = experiment.markers.names
+    write_markers_csv(problem.parent / "markers.csv", experiment.t_s, names, tracks_m + noise_m)
+    wrench = 'wrench = { file = "wrench.csv", sigma_n = 0.01, sigma_nm = 0.001 }'
+    run = cs.run(cs.Problem.read(changed(problem, wrench, "")))
+    assert run.trust.verdict == "good"
+    for name, true in (TRUTH | natural).items():
+        low, high = run.interval(name)
+        assert low <= true <= high
+    problem.write_text(straight.replace(wrench, ""), encoding="utf-8")
+    wrong = cs.run(cs.Problem.read(problem))
+    assert any("rest shape" in each.message for each in wrong.trust.concerns)
 
 
 @pytest.mark.parametrize(

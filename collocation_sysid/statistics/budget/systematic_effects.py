@@ -29,7 +29,7 @@ from ...fem.laws.constants import GAMMA_M, GAMMA_R, TORSION, without_region
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import boundary_of
-from ...fem.rods import RodMesh
+from ...fem.rods import ROD_CURVATURE, RodMesh
 from ...model.contact.summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
@@ -91,8 +91,6 @@ INCOMPRESSIBLE_POISSON = 0.5
 UNKNOWN_ORIENTATION = 0.58
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
-# Angle by which a rod that was not stated to be straight may be bent by itself [rad].
-ROD_CURVATURE = 0.5
 # Differences by a displacement: its largest entry over the length of an edge.
 SMALL_STRAIN = 1e-4
 _MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
@@ -898,14 +896,14 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     """Return None if the problem states the rest shape.
 
     Of a rod: natural curvature about d₁ and d₂, and natural twist, in units of `ROD_CURVATURE` over
-    the length of the rod.
+    the length of the rod, also if it is stated to be straight; None if they are constants.
     """
-    if at.body.rest_shape is not None:
-        return None
     if isinstance(at.body.mesh, RodMesh):
         size = ROD_CURVATURE / float(at.body.mesh.s_m[-1])
         curved = at.body.with_natural_curvature(np.eye(3)[axis] * size)
         return None if curved is None else Effect(at.internal_n(body=curved) - at.internal_n())
+    if at.body.rest_shape is not None:
+        return None
     return Effect(
         at.force_change_by_reference(
             sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
@@ -986,7 +984,8 @@ ASSUMPTIONS = (
         description="share of the weight of the body under which the mesh was deformed when "
         "it was made, along each axis, if object.rest_shape is not stated",
         remedy="state object.rest_shape: whether the mesh is free of stress, or the shape in "
-        "which the body hung or stood during its scan",
+        "which the body hung or stood during its scan; omit it for a rod whose natural curvature is "
+        "to be estimated",
         effect=_rest_shape,
         axes="x y z",
         by_origin={"scan": UNKNOWN_ORIENTATION},
