@@ -60,8 +60,8 @@ MESSAGES = {
     "specimen-percent": 'strains fit as percent: name the unit in the column, "strain (%)"',
     "specimen-kind": "the curve fits as that of a {test} test, with the same law: check the kind "
     "of test; if it is right, compare laws with compare-models --materials",
-    "specimen-kind/likelier": "the curve fits better as that of another kind of test, with the "
-    "same law: {kinds}, instead of {stated} ({young}): check the kind of test",
+    "specimen-kind/likelier": "the curve fits better, with the same law, as {kinds}, instead of "
+    "{stated} ({young}): check the kind of test and of stress",
     "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
     "without it: leave the column out if this was not measured",
     "specimen-area": "its stresses agree with those of the other specimens if they are "

@@ -279,6 +279,17 @@ def test_a_kind_of_test_that_a_flexible_law_fits_is_not_good_in_silence():
 
 
 @pytest.mark.long
+def test_true_stresses_are_named_beside_a_kind_of_test_that_fits_alike():
+    strain = np.linspace(0.1, 3.0, 30) / 30
+    stress_pa = (1 + strain) * neo_hookean_pa(strain)
+    run = run_of_curve("uniaxial", strain, stress_pa, seed=1, law="neo-hookean", sigma_pa=280.0)
+    (cause,) = run.causes
+    assert cause.code == "specimen-kind/likelier"
+    assert "as true stress (E = 29" in cause.message
+    assert "and simple-shear (E = " in cause.message
+
+
+@pytest.mark.long
 def test_nothing_is_said_where_a_curve_of_small_strains_does_not_show_the_kind_of_test():
     strain = np.linspace(0.01, 0.1, 12)
     run = run_of_curve("uniaxial", strain, neo_hookean_pa(strain), seed=2, law="neo-hookean")

@@ -131,9 +131,10 @@ def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
 
 
 def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -> list[Hypothesis]:
-    """Return the hypothesis, as a list, that specimens which fit are of another kind of test, with
-    which they fit far better, both with the effects of the budget; empty unless all recordings are
-    specimens of one kind. A flexible law fits the curve of another kind too, with other constants.
+    """Return the hypothesis, as a list, that specimens which fit are of another kind of test, or have
+    true stresses, with which they fit far better, both with the effects of the budget; empty unless
+    all recordings are specimens of one kind. A flexible law fits the curve of another kind too, with
+    other constants.
     """
     experiments = [part.transcription.experiment for part in solution.parts]
     kinds = {each.specimen.test if each.specimen else "" for each in experiments}
@@ -144,9 +145,10 @@ def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -
     chosen = [thinned(each, COMPARING[0]) for each in experiments]
     corrections: dict[str, list[Experiment]] = {}
     for each in chosen:
-        for row in _other_kinds(each):
+        for row in (_mistake("specimen-true-stress", _of_engineering_stress), *_other_kinds(each)):
             if hypothesis := row.hypothesis(each):
-                corrections.setdefault(hypothesis.data["test"], []).append(hypothesis.corrected)
+                other = hypothesis.data.get("test", "true stress")
+                corrections.setdefault(other, []).append(hypothesis.corrected)
     stated = _refit(solution, chosen, COMPARING)
     refits = {
         test: refit
@@ -156,26 +158,25 @@ def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -
     if stated is None or not refits:
         return []
     losses = {test: least_loss(each, deviations) for test, each in refits.items()}
-    likeliest = min(losses, key=losses.__getitem__)
-    best, stated_loss = refits[likeliest], least_loss(stated, deviations)
-    change = abs(np.log(_young_pa(best) / _young_pa(stated)))
+    least, stated_loss = min(losses.values()), least_loss(stated, deviations)
+    likely = [
+        each for each in sorted(losses, key=losses.__getitem__) if losses[each] <= least + LIKELIER
+    ]
+    best = refits[likely[0]]
+    changes = [abs(np.log(_young_pa(refits[each]) / _young_pa(stated))) for each in likely]
     # The stress in unloading is not that of the law. Where the law is wrong too, correlated residuals
     # remain, and χ² does not tell the kinds apart.
     has_unloading = any(is_unloading(specimen_strains(each)[0]) for each in experiments)
-    is_likelier = stated_loss - losses[likeliest] >= LIKELIER and change > KIND_CHANGE
+    is_likelier = stated_loss - least >= LIKELIER and max(changes) > KIND_CHANGE
     if not is_likelier or has_unloading or any(map(has_trend, best.parts)):
         return []
     data = {
         "stated": kinds.pop(),
         "young": _young_text(stated),
-        "kinds": [
-            f"{test} ({_young_text(refits[test])})"
-            for test in sorted(losses, key=losses.__getitem__)
-            if losses[test] <= losses[likeliest] + LIKELIER
-        ],
+        "kinds": [f"{each} ({_young_text(refits[each])})" for each in likely],
     }
     of = listed([f"'{each.name}'" for each in experiments])
-    strength = float(np.sqrt(stated_loss / losses[likeliest]))
+    strength = float(np.sqrt(stated_loss / least))
     return [Hypothesis("specimen-kind/likelier", of, data=data, strength=strength)]
 
 
