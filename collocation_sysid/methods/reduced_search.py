@@ -55,6 +55,10 @@ INSIGNIFICANT = 1e-6
 # So does, with impacts, a rejection where a full step is below this share of each standard error:
 # ripples of the loss, about one of χ², are larger than what such a step can gain.
 NEAR = 0.3
+# And a rejection where it is below this share without impacts: points on the surface of a mesh leave
+# their faces within such a step, so that further steps creep along the edges. Losses below 1, of data
+# without noise, are to be known better.
+SETTLED = 0.03
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -126,7 +130,8 @@ class SearchOptions(MethodOptions):
     tolerance : float
         The search ends when a step changes the logarithm of no parameter by more than this value.
         It ends also when a step is predicted to be within 1e-3 standard errors, or within less with
-        a tolerance below the default.
+        a tolerance below the default, and when a step is rejected where the shared parameters are
+        within 0.03 standard errors.
     least_decrease : float
         The search ends also when the next step, unless the trust region shortens it, is predicted
         to decrease the loss by less than this fraction times the largest change of a parameter's
@@ -498,13 +503,15 @@ class ReducedSearch:
                 and is_full_step
                 and point.loss - point.predicted_loss(step) <= INSIGNIFICANT
             )
-            is_within_noise = self.has_impacts and self._is_near(
-                point, self._full_step(point, curvature), NEAR
-            )
+            share = NEAR if self.has_impacts else SETTLED * min(1.0, float(np.sqrt(point.loss)))
+            is_within_noise = self._is_near(point, self._full_step(point, curvature), share)
+            if is_within_noise and not self.has_impacts:
+                # Steps of the parameters would disturb the equations of motion again.
+                point = self._make_feasible(horizon, point)
             if ((is_short or is_insignificant) and self._is_feasible(point, NEARLY_FEASIBLE)) or (
                 is_within_noise and self._is_feasible(point, INFEASIBLE)
             ):
-                return Status.CONVERGED  # rounding, or ripples, keep it from getting better
+                return Status.CONVERGED  # rounding, kinks, or ripples keep it from getting better
             if self.has_unlabelled and length <= LEAST_DETERMINED_SHARE:
                 # The association changes the loss by more than such a step.
                 # The intervals contain the minima that other correspondences have so near.

@@ -26,8 +26,8 @@ from .budget.consider_analysis import propagate_columns
 from .linearised import LinearisedFit, linearise_fit
 from .uncertainty import AUTO, ErrorModel, Uncertainty, uncertainty_from_fit
 
-# Samples of D η: the standard deviation that they give is within 5 %.
-DRAWS = 200
+# Samples of D η: the standard deviation that they give is within 9 %.
+DRAWS = 64
 # Fewest samples, for large bodies.
 FEWEST_DRAWS = 32
 # Memory of the samples [bytes].
