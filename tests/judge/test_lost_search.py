@@ -21,7 +21,7 @@ def test_a_rod_that_buckles_at_the_start_ends_with_the_reason():
     markers = cs.Markers(t_s, np.full((5, 1, 3), 0.1), 1e-3, places_m=[[0.3, 0.0, 0.0]])
     stated = {"torsion_n_m2": 3e-4, "axial_n": 200.0, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
     held = cs.Experiment(body, t_s, grasps, markers)
-    run = cs.run(cs.Problem([held], stated | {"bending_n_m2": cs.Unknown()}))
+    run = cs.run(cs.Problem([held], stated | {"bending_n_m2": cs.Unknown(1e-3)}))
     assert [each.code for each in run.trust.concerns] == ["solve/lost"]
     assert "loses its stability" in run.trust.concerns[0].message
     assert not run.causes

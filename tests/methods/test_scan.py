@@ -25,11 +25,15 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid import (
     Body,
+    CrossSection,
     Experiment,
+    Grasp,
     InputError,
+    Markers,
     Nuisance,
     Obstacle,
     Plane,
+    PoseSequence,
     Problem,
     ReducedSpace,
     Region,
@@ -37,7 +41,9 @@ from collocation_sysid import (
     Status,
     Tied,
     Unknown,
+    rod_mesh,
     run,
+    simulate,
     solve,
 )
 from collocation_sysid.fem.meshes.selection import Box
@@ -585,3 +591,21 @@ def test_specimens_start_from_the_initial_slope_of_their_stresses_without_a_scan
     ).experiment()
     unloaded = start_problem(Problem([lateral], known | {"young_pa": Unknown()}).collocation())
     assert unloaded.collocation.parameters.guesses["young_pa"] == pytest.approx(SOFT_PA)
+
+
+def test_a_stiff_rod_without_a_guess_does_not_start_as_a_thin_cable():
+    """The search from the usual stiffness of a cable ended at the lower bound."""
+    mesh = rod_mesh([[0, 0, 0], [0, 0, -0.6]], CrossSection.round(0.01), 13)
+    body = Body(mesh, "cable", density_kg_m3=1200.0)
+    t_s = np.linspace(0.0, 0.6, 61)
+    shift_m = np.outer(0.05 * (1 - np.cos(10 * t_s)), [1, 0, 0])
+    hand = PoseSequence(t_s, shift_m, np.tile([0, 0, 0, 1.0], (61, 1)))
+    places_m = [[0, 0, -0.3], [0, 0, -0.6]]
+    markers = Markers(t_s, np.zeros((61, 2, 3)), 5e-4, places_m=places_m)
+    grasp = Grasp(np.flatnonzero(body.nodes_m[:, 2] > -0.001), hand)
+    swing = Experiment(body, t_s, [grasp], markers, air_density_kg_m3="none")
+    known = {"torsion_n_m2": 0.7, "axial_n": 1e4, "gamma_r_s": 2e-3, "gamma_m_1_s": 0.2}
+    seen = with_markers(swing, simulate(swing, known | {"bending_n_m2": 1.0}).markers_m)
+    problem = Problem([seen], known | {"bending_n_m2": Unknown()})
+    found = solve(problem).parameters["bending_n_m2"]
+    assert found == pytest.approx(1.0, rel=0.02)

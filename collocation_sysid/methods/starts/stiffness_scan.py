@@ -25,7 +25,15 @@ import numpy as np
 from ...common.array_types import Array
 from ...common.step_counting import StepUnit, complete_steps, counted_phase
 from ...errors import InputError, SimulationError
-from ...fem.laws.constants import YOUNG, is_modulus, usual_value
+from ...fem.laws.constants import (
+    AXIAL,
+    BENDING,
+    TORSION,
+    YOUNG,
+    is_modulus,
+    usual_value,
+    without_region,
+)
 from ...model.parameters import Parameter, Parameters, with_widest_bounds
 from ...program.collocation import Collocation, ExperimentIterate
 from ...program.forward.newton_solver import NewtonOptions
@@ -52,7 +60,9 @@ STEPS = 15
 LIMITS_PA = 1e13, 1.0
 # Typical Young's modulus of a soft body, where nothing is known [Pa].
 SOFT_PA = 1e4
-# Tolerance of simulations that are only compared.
+# Factors of the usual stiffnesses of a section, which are those of a cable.
+RAISED = 1.0, 30.0, 900.0, 27e3
+# Tolerance of simulations that are only compared. Slender bodies do not move on from such errors.
 LOOSE = NewtonOptions(tolerance=1e-4)
 # Number of failures in a row that end the scan.
 CONSECUTIVE_FAILURES = 2
@@ -126,7 +136,7 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
         return Start(collocation.with_parameters(result.parameters), scan=result)
     if unguessed:
         usual = typical_parameters(collocation.parameters, STIFFEST_PA)
-        collocation = collocation.with_parameters(usual)
+        collocation = _stiff_enough(collocation.with_parameters(usual), unguessed)
     if not _has_free_modulus(collocation):
         return Start(collocation)
     trial = TrialSimulation(collocation)
@@ -151,6 +161,23 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
         f"{best:.3g} there"
     )
     return Start(found, scan=replace(result, reason=reason), stated=collocation)
+
+
+def _stiff_enough(collocation: Collocation, unguessed: Sequence[str]) -> Collocation:
+    """Return the problem with usual stiffnesses of sections, raised until the rod fits no worse than a
+    rigid one: a search converges from a thousand times the stiffness, but not from a hundredth.
+    """
+    stiffnesses = {BENDING.name, TORSION.name, AXIAL.name}
+    raised = [name for name in unguessed if without_region(name) in stiffnesses]
+    parameters = collocation.parameters
+    for factor in RAISED if raised else ():
+        guesses = {name: factor * parameters.guesses[name] for name in raised}
+        stiffer = collocation.with_parameters(parameters.with_guess(guesses))
+        trial = TrialSimulation(stiffer)
+        misfit, failure = trial.evaluate_guess(is_complete=False)
+        if failure is None and misfit <= trial.rigid_misfit:
+            return stiffer
+    return collocation
 
 
 def _start_of_curves(collocation: Collocation) -> Start:
@@ -496,6 +523,8 @@ class TrialSimulation:
     def __init__(self, collocation: Collocation, share: float = SHARES[0]) -> None:
         self.collocation = collocation
         self.share = share
+        is_slender = any(each.body.is_slender for each in collocation.transcriptions)
+        self.options = None if is_slender else LOOSE
         usual = collocation.with_parameters(typical_parameters(collocation.parameters, SOFT_PA))
         self.rows = [rows_of_share(motion, share) for motion in motion_shares(usual)]
         self.all_rows = [each.grid_times for each in collocation.transcriptions]
@@ -527,7 +556,10 @@ class TrialSimulation:
         """
         p = self.collocation.guess_p
         positions, failure = simulate_trajectories(
-            self.collocation, p, rows=self.all_rows if is_complete else self.rows, options=LOOSE
+            self.collocation,
+            p,
+            rows=self.all_rows if is_complete else self.rows,
+            options=self.options,
         )
         if failure is not None:
             return np.nan, failure
@@ -548,7 +580,7 @@ class TrialSimulation:
         """
         p = self._p(young_pa)
         positions, failure = simulate_trajectories(
-            self.collocation, p, rows=self.rows, options=LOOSE, guess=guess
+            self.collocation, p, rows=self.rows, options=self.options, guess=guess
         )
         if failure is not None:
             self.failure = failure
@@ -560,7 +592,7 @@ class TrialSimulation:
         succeeds; if not, the error is stored in `failure`.
         """
         _, failure = simulate_trajectories(
-            self.collocation, self._p(young_pa), rows=self.all_rows, options=LOOSE
+            self.collocation, self._p(young_pa), rows=self.all_rows, options=self.options
         )
         self.failure = failure or self.failure
         return failure is None
