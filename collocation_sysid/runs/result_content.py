@@ -12,6 +12,7 @@ from ..common.display import short
 from ..common.files import RESULT_FILE, damage_refused, read_json
 from ..common.serialisation import optional, read
 from ..errors import InputError
+from ..features import registry  # noqa: F401 (declares the messages of stored concerns)
 from ..features.measurements import FitResult, ForwardResult
 from ..fem.laws.constants import field_coefficient, symbol_of, unit_of
 from ..fem.spatial_field import FieldResolution

@@ -136,6 +136,19 @@ def test_a_problem_is_solved_without_the_judge(tmp_path):
     assert done.stdout.strip() == "True", done.stderr
 
 
+def test_a_stored_result_is_read_with_all_messages():
+    """In a process that has solved nothing, such as that of a report of contact."""
+    code = (
+        "import collocation_sysid.runs.result_content\n"
+        "from collocation_sysid.statistics.concerns import TOPICS\n"
+        "read = {key: {*topic.messages} for key, topic in TOPICS.items()}\n"
+        "import collocation_sysid.cli.problem_commands, collocation_sysid.judge.registry\n"
+        "print(read == {key: {*topic.messages} for key, topic in TOPICS.items()})\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
+
+
 # The methods that need sparse exact matrices, and what checks or measures their programs.
 LIFTING = (
     "program.lifted",
