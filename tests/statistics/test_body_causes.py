@@ -103,7 +103,7 @@ def test_a_refit_begins_at_an_answer_that_rounding_puts_beyond_a_bound():
         experiment, with_material(experiment.body, MATERIALS["st-venant-kirchhoff"])
     )
     assert changed is not None
-    refits = _Refits(solution, [experiment])
+    refits = _Refits(solution, [experiment], {})
     refits.answer["gamma_m_1_s"] = solution.collocation.parameters.free[-1].lower * (1 - 1e-14)
     assert refits.fit(changed) is not None
 
