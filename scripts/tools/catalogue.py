@@ -159,7 +159,7 @@ def _section(entry: CatalogueEntry) -> str:
         f"- Stretch: {stretch.low:.4g} to {stretch.high:.4g} ({stretch.minimum:.4g}, "
         f"{stretch.maximum:.4g}){_rate_words(entry.strain_rate_1_s)}.",
         f"- Verdict: **{entry.verdict}**"
-        + "".join(f"; {reason.split(': ')[0]}" for reason in entry.reasons)
+        + "".join(f"; {reason.rpartition(': ')[0] or reason}" for reason in entry.reasons)
         + ".",
         f"- Source: {entry.source}. Licence: {entry.licence}.\n",
     ]
