@@ -55,10 +55,10 @@ INSIGNIFICANT = 1e-6
 # So does, with impacts, a rejection where a full step is below this share of each standard error:
 # ripples of the loss, about one of χ², are larger than what such a step can gain.
 NEAR = 0.3
-# And a rejection where it is below this share without impacts: points on the surface of a mesh leave
-# their faces within such a step, so that further steps creep along the edges. Losses below 1, of data
-# without noise, are to be known better.
-SETTLED = 0.03
+# And a rejection without impacts, where it is below so many times the share of a step that is
+# insignificant by itself, 0.03 by default: points on the surface of a mesh leave their faces within
+# such a step, so that further steps creep along the edges.
+SETTLED = 30.0
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -503,7 +503,8 @@ class ReducedSearch:
                 and is_full_step
                 and point.loss - point.predicted_loss(step) <= INSIGNIFICANT
             )
-            share = NEAR if self.has_impacts else SETTLED * min(1.0, float(np.sqrt(point.loss)))
+            settled = SETTLED * float(np.sqrt(least_decrease * min(1.0, point.loss)))
+            share = NEAR if self.has_impacts else settled
             is_within_noise = self._is_near(point, self._full_step(point, curvature), share)
             if is_within_noise and not self.has_impacts:
                 # Steps of the parameters would disturb the equations of motion again.
