@@ -134,7 +134,7 @@ def test_two_estimates_with_one_uncertainty_are_alike():
 
 def test_a_column_of_zeros_is_left_out():
     run = answer("placeholder_zero_column")
-    assert run.parameters["c10_pa"] == pytest.approx(171e3, rel=0.02)
+    assert run.solution.parameters["c10_pa"] == pytest.approx(171e3, rel=0.02)
     assert any("taken as not measured" in note for note in run.problem.notes)
 
 
