@@ -120,6 +120,11 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
     )
 
 
+def _has_several_clamps(experiment: Any) -> bool:
+    """Return whether several grasps hold all axes: a turn of a single one is `GRASP_TURN`."""
+    return sum(len(grasp.axes) == 3 for grasp in experiment.body_grasps) > 1
+
+
 def _largest_place_step_m(experiment: Any) -> float:
     return EDGES_A_STEP * float(experiment.body.mesh.quality().edge_mean_m)
 
@@ -293,16 +298,17 @@ GRASP_SHIFT = Deviation(
 CLAMP_TURN = Deviation(
     "clamp_turn_rad",
     "rad",
-    sigma=None,
+    sigma=0.02,
     key="clamp_turn",
     of="grasp",
     axes="x y z",
     changes=("grasps",),
+    applies=_has_several_clamps,
     by="worst",
     label="turn of grasp {which}, {axis}",
     sentence="rotation of a grasp: up to {size}",
-    description="a constant rotation of each grasp about the middle of its nodes, as of a clamp whose "
-    "direction was not measured",
+    description="a constant rotation of each of several grasps about the middle of its nodes, as of "
+    "clamps whose directions were not measured",
     same=_hand_eye_sharing_key,
 )
 STRAIN_ZERO = Deviation(

@@ -108,6 +108,13 @@ def test_each_clamp_turns_about_its_own_middle():
         )
 
 
+@pytest.mark.parametrize(("body", "turned"), [(hung_cube, 0), (bar_with_nuisance, 2)])
+def test_each_of_several_clamps_turns_by_default(body, turned):
+    """The turn of a single clamp is that of the body in its grasp."""
+    nuisance = NuisanceMap.from_experiment(replace(body(), nuisance=Nuisance()))
+    assert len([entry for entry in nuisance.entries if entry.row.key == "clamp_turn"]) == 3 * turned
+
+
 def test_the_equations_have_the_derivatives_of_turned_clamps(rng):
     bar = replace(
         bar_with_nuisance(), nuisance=Nuisance.none(clamp_turn_rad=0.05, hand_eye_rad=0.02)
