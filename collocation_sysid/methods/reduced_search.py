@@ -56,9 +56,9 @@ INSIGNIFICANT = 1e-6
 # ripples of the loss, about one of χ², are larger than what such a step can gain.
 NEAR = 0.3
 # And a rejection without impacts, where it is below so many times the share of a step that is
-# insignificant by itself, 0.03 by default: points on the surface of a mesh leave their faces within
+# insignificant by itself, 0.1 by default: points on the surface of a mesh leave their faces within
 # such a step, so that further steps creep along the edges.
-SETTLED = 30.0
+SETTLED = 100.0
 # Infeasibility over the body's size that is due to rounding.
 FEASIBLE = 1e-12
 # Infeasibility over the body's size at which a search ends if steps no longer change the
@@ -131,7 +131,7 @@ class SearchOptions(MethodOptions):
         The search ends when a step changes the logarithm of no parameter by more than this value.
         It ends also when a step is predicted to be within 1e-3 standard errors, or within less with
         a tolerance below the default, and when a step is rejected where the shared parameters are
-        within 0.03 standard errors.
+        within 0.1 standard errors.
     least_decrease : float
         The search ends also when the next step, unless the trust region shortens it, is predicted
         to decrease the loss by less than this fraction times the largest change of a parameter's
@@ -509,6 +509,8 @@ class ReducedSearch:
             if is_within_noise and not self.has_impacts:
                 # Steps of the parameters would disturb the equations of motion again.
                 point = self._make_feasible(horizon, point)
+                if not self._is_feasible(point, INFEASIBLE):
+                    point = self._make_feasible(horizon, point)
             if ((is_short or is_insignificant) and self._is_feasible(point, NEARLY_FEASIBLE)) or (
                 is_within_noise and self._is_feasible(point, INFEASIBLE)
             ):
