@@ -128,7 +128,7 @@ TENDON = PROBLEM[PROBLEM.index("[[experiment.tendon]]") : PROBLEM.index("[[exper
 SLIPS = {
     "no column": (
         ("tension.csv", "t_s,tension\n0,1\n1,1\n"),
-        "column tension names no unit; .*for example tension \\(n\\)",
+        "column tension names no unit; .*for example tension \\(N\\)",
     ),
     "other unit": (("tension.csv", "t_s,tension_kg\n0,1\n1,1\n"), "a unit of force, one of N, mN"),
     "pushes": (("tension.csv", "t_s,tension_n\n0,1\n1,-2\n"), "line 3.*a tendon only pulls"),

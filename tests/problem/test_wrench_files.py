@@ -52,7 +52,7 @@ def test_components_that_are_not_measured_are_left_out(tmp_path: Path):
 BAD = {
     "no unit": (
         lines("t_s,fx,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),
-        ["fx names no unit", "for example fx (n)"],
+        ["fx names no unit", "for example fx (N)"],
     ),
     "a mass": (
         lines("t_s,fx_kg,fy_n,fz_n,tx_nm,ty_nm,tz_nm"),

@@ -20,7 +20,7 @@ from ...errors import InputError, hint_at, listed
 from ..sample_times import TIME_TOLERANCE_S
 from .source import read_table
 from .text import Table, names_file_in_errors, numeric_cells, times_in_column
-from .units import UNITS, expected_units, si_factor
+from .units import UNITS, expected_units, si_factor, written_unit
 
 
 @dataclass(frozen=True)
@@ -896,13 +896,14 @@ def _unit_error(
     """The remedy states columns where that is possible: by the user (`stated_by`), or by advice."""
     name = name_and_unit(column)[0] or column
     has = f"has the unit {unit}" if unit else "names no unit"
+    written = written_unit(quantity.unit, quantity.dimension)
     remedy = (
         f"convert its values, then call it {quantity.column}"
         if unit
-        else f"add the unit that it has, for example {name} ({quantity.unit})"
+        else f"add the unit that it has, for example {name} ({written})"
     )
     if not unit and stated_by:
-        with_unit = json.dumps(f"{column} ({quantity.unit})", ensure_ascii=False)
+        with_unit = json.dumps(f"{column} ({written})", ensure_ascii=False)
         remedy = f"add the unit that it has, for example {stated_by} = {with_unit}"
     statement = "" if advice is None else advice(_without_names(grid, [column]))
     if MISSING in statement and advice is not None:

@@ -92,13 +92,17 @@ def si_factor(unit_text: str, dimension: str) -> float | None:
     return known.get(bare, known.get(bare.lower()))
 
 
+def written_unit(unit: str, dimension: str) -> str:
+    """Return a unit of a dimension as people write it, such as "N" for "n"."""
+    return (_TORQUES if dimension == "torque" else _WRITTEN).get(unit, unit)
+
+
 def expected_units(unit: str, dimension: str) -> str:
     """Return the expected units of a dimension as text, for messages about another unit; where a
     force is meant and `unit` is one of mass, the text says so.
     """
     mass = dimension == "force" and unit.lower() in _MASSES
-    written = _TORQUES if dimension == "torque" else _WRITTEN
-    units = [written.get(each, each) for each in UNITS[dimension] if each not in _UNWRITTEN]
+    units = [written_unit(each, dimension) for each in UNITS[dimension] if each not in _UNWRITTEN]
     return f"{'a unit of force, ' if mass else ''}one of {', '.join(units)}"
 
 
