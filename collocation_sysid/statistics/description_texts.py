@@ -61,7 +61,7 @@ MESSAGES = {
     "specimen-kind": "the curve fits as that of a {test} test, with the same law: check the kind "
     "of test; if it is right, compare laws with compare-models --materials",
     "specimen-kind/likelier": "the curve fits better, with the same law, as {kinds}, instead of "
-    "{stated} ({young}): check the kind of test and of stress",
+    "{stated} ({young}): check the kind of test and of stress, and the unit of the strain",
     "specimen-placeholder": "its {quantity} is zero in all rows, and the rest fits better "
     "without it: leave the column out if this was not measured",
     "specimen-area": "its stresses agree with those of the other specimens if they are "

@@ -290,6 +290,17 @@ def test_true_stresses_are_named_beside_a_kind_of_test_that_fits_alike():
 
 
 @pytest.mark.long
+def test_percent_that_a_flexible_law_fits_are_not_good_in_silence():
+    strain = np.linspace(0.05, 2.0, 40) / 100
+    noisy_pa = dict(seed=1, sigma_pa=0.01 * neo_hookean_pa(strain)[-1])
+    run = run_of_curve("uniaxial", 100 * strain, neo_hookean_pa(strain), **noisy_pa)
+    (cause,) = run.causes
+    assert cause.code == "specimen-kind/likelier"
+    assert "as percent (E = 2" in cause.message
+    assert run.trust.verdict == "check"
+
+
+@pytest.mark.long
 def test_nothing_is_said_where_a_curve_of_small_strains_does_not_show_the_kind_of_test():
     strain = np.linspace(0.01, 0.1, 12)
     run = run_of_curve("uniaxial", strain, neo_hookean_pa(strain), seed=2, law="neo-hookean")

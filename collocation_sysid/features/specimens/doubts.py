@@ -132,9 +132,9 @@ def specimen_candidates(fit: TestedFit) -> Iterator[Candidate]:
 
 def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -> list[Hypothesis]:
     """Return the hypothesis, as a list, that specimens which fit are of another kind of test, or have
-    true stresses, with which they fit far better, both with the effects of the budget; empty unless
-    all recordings are specimens of one kind. A flexible law fits the curve of another kind too, with
-    other constants.
+    true stresses or strains in percent, with which they fit far better, both with the effects of the
+    budget; empty unless all recordings are specimens of one kind. A flexible law fits the curve of
+    another kind too, with other constants.
     """
     experiments = [part.transcription.experiment for part in solution.parts]
     kinds = {each.specimen.test if each.specimen else "" for each in experiments}
@@ -145,9 +145,14 @@ def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -
     chosen = [thinned(each, COMPARING[0]) for each in experiments]
     corrections: dict[str, list[Experiment]] = {}
     for each in chosen:
-        for row in (_mistake("specimen-true-stress", _of_engineering_stress), *_other_kinds(each)):
+        for row in (
+            _mistake("specimen-true-stress", _of_engineering_stress),
+            _mistake("specimen-percent", _of_ratios),
+            *_other_kinds(each),
+        ):
             if hypothesis := row.hypothesis(each):
-                other = hypothesis.data.get("test", "true stress")
+                name = row.name.removeprefix("specimen-").replace("-", " ")
+                other = hypothesis.data.get("test", name)
                 corrections.setdefault(other, []).append(hypothesis.corrected)
     stated = _refit(solution, chosen, COMPARING)
     refits = {
