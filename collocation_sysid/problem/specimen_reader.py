@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.array_types import Array, Index
 from ..common.time_dependence import at_times, values_over_time
-from ..errors import listed, located
+from ..errors import InputError, listed, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
 from ..recording.homogeneous_deformation import shape_factor
@@ -89,15 +89,15 @@ class SpecimenReader:
             require_plausible_specimen(
                 specimen, is_stretch=not {"stretch", "volume_ratio"}.isdisjoint(table.columns)
             )
-        if not section.modulus:
-            for warning in order_warnings(specimen):
-                self._add_note(warning)
             if table.compressive and specimen.strain.max() > -specimen.strain.min():
-                self._add_note(
+                raise InputError(
                     f"the name of {listed([repr(each) for each in table.compressive])} states "
                     "compression, and its values are read as tension: state strain_sign = -1 and "
                     "stress_sign = -1 where compression is positive"
                 )
+        if not section.modulus:
+            for warning in order_warnings(specimen):
+                self._add_note(warning)
         if table.is_displacement and section.area_m2 is None:
             self._add_note(
                 "the compliance of the test bench is not part of the budget: state area_m2, the "

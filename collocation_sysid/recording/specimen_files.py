@@ -285,7 +285,11 @@ def read_specimen(path: str | Path, layout: SpecimenLayout) -> SpecimenTable:
         is_incompressible=(layout.stress == "true" or layout.test == "biaxial-difference")
         and lateral is None
         and bool(DEFORMATIONS[layout.test].lateral),
-        compressive=tuple(filter(names_compression, table.grid.columns)),
+        compressive=tuple(
+            each
+            for each in layout.columns.values() or table.grid.columns
+            if names_compression(each) and each not in table.unread
+        ),
         columns=tuple(table.values),
         unread=table.unread,
         notes=table.notes,

@@ -323,16 +323,15 @@ def test_rows_out_of_order_are_noted(tmp_path):
     assert any("loading and unloading" in each for each in cs.Problem.read(path).notes)
 
 
-def test_a_column_named_after_compression_with_positive_values_is_noted(tmp_path):
+def test_a_column_named_after_compression_with_positive_values_is_refused(tmp_path):
     rows = np.column_stack([100 * STRAIN, simulated("uniaxial", STRAIN)["stress"]])
     header = "Stauchung [%],Druckspannung [Pa]"
-    (note,) = [
-        each
-        for each in cs.Problem.read(written(tmp_path, header=header, rows=rows)).notes
-        if "compression" in each
-    ]
-    assert "strain_sign = -1" in note
-    assert "'Druckspannung [Pa]'" in note
+    path = written(tmp_path, header=header, rows=rows)
+    with pytest.raises(cs.InputError, match=r"'Druckspannung \[Pa\]' states.*strain_sign = -1"):
+        cs.Problem.read(path)
+    named = PROBLEM + 'columns = { strain = "strain (%)", stress = "stress (Pa)" }\n'
+    both = written(tmp_path, named, "strain (%),stress (Pa),Stauchung [%]", np.c_[rows, STRAIN])
+    assert not any("compression" in each for each in cs.Problem.read(both).notes)
     text = PROBLEM + "strain_sign = -1\nstress_sign = -1\n"
     notes = cs.Problem.read(written(tmp_path, text, header, 0.5 * rows)).notes
     assert not any("compression" in each for each in notes)
