@@ -31,7 +31,6 @@ from .residuals.autocorrelation import Dependence
 from .residuals.diagnostics import MOST_WILD
 from .residuals.noise_level import ROUNDING, NoiseLevel
 from .thresholds import (
-    ABSURD,
     AS_GOOD_AS_CERTAIN,
     CHANCE,
     CLEARLY_PERSISTENT,
@@ -386,13 +385,13 @@ def nuisance_concerns(
 
     Notes
     -----
-    At a limit (within 0.001 standard deviations) the concern is "doubtful". Else it is "check"
-    beyond the deviation that is exceeded with the probability `RARE` by any of the n parameters
-    (Bonferroni): 3.9 standard deviations for one parameter, 4.6 for 20. Beyond `ABSURD` it is
-    "doubtful". Limits may be infinite.
+    At a limit (within 0.001 standard deviations) the concern is "doubtful". Else, as for effects of
+    the budget, it is "check" beyond the deviation that is exceeded with the probability `CHANCE` by
+    any of the n parameters (Bonferroni), 2.6 standard deviations for one parameter and 3.5 for 20,
+    and "doubtful" beyond that of the probability `RARE`, 3.9 and 4.6. Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
-    limit = largest_deviation(len(items), RARE)
+    limit, gross = (largest_deviation(len(items), p) for p in (CHANCE, RARE))
     concerns: list[Concern] = []
     far: dict[str, tuple[float, Concern]] = {}
     for k, (name, phi, lowest, highest) in enumerate(items):
@@ -407,12 +406,12 @@ def nuisance_concerns(
         data: dict[str, object] = {"name": name, "deviations": deviation}
         code = "specimen/far" if is_specimen else "nuisance/far"
         if is_specimen:
-            data["advice"] = HIDING if deviation > ABSURD else WIDENING
+            data["advice"] = HIDING if deviation > gross else WIDENING
         elif rows:
             size, unit = in_readable_unit(deviation * scales[k], rows[k].unit)
             data |= {"size": f"{size:.2g}{unit}"}
             code = "nuisance/large" if deviation * scales[k] > rows[k].largest else "nuisance/sized"
-        far[vector] = deviation, Concern(code, "doubtful" if deviation > ABSURD else "check", data)
+        far[vector] = deviation, Concern(code, "doubtful" if deviation > gross else "check", data)
     concerns += (concern for _, concern in far.values())
     return concerns
 

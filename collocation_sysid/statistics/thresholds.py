@@ -36,9 +36,6 @@ GROSS_PREDICTION = 10.0
 # Onset of a validation recording in standard deviations of its prior: check. Study:
 # verdict_reliability.
 OWN_ONSET = 2.0
-# Nuisance parameters in standard deviations of their priors: "doubtful". Study:
-# verdict_reliability.
-ABSURD = 6.0
 # Time shift in standard deviations of its prior: check. Study: verdict_reliability.
 LATE = 3.0
 # Share of the samples beyond Huber's threshold that is doubtful. Study: verdict_reliability.
@@ -68,8 +65,8 @@ MOST_WILD = 0.05
 # RMS residual over σ up to which residuals count as noise, whatever their correlation. Study:
 # verdict_reliability.
 NOISE = 1.15
-# Probability that a faultless run has any effect of the budget that is not expected, or
-# residuals that are larger than noise. Study: verdict_reliability.
+# Probability that a faultless run has any effect of the budget, or nuisance parameter, that is not
+# expected, or residuals that are larger than noise. Study: verdict_reliability.
 CHANCE = 0.01
 # Factor by which the misfit of a refit must decrease, unless only noise remains. Study:
 # mistakes.
