@@ -1125,7 +1125,6 @@ ASSUMPTIONS = (
     Deviation(
         "rayleigh_damping",
         "1",
-        wide=1.0,
         description="effect of Rayleigh damping, as a fraction of the complete difference of "
         "its damping force from that of the stated law",
         remedy="compare the laws with compare-models --damping on motions that rotate the body",
