@@ -19,11 +19,9 @@ from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
 from ..program.transcription import Transcription
 from ..recording.measurement import root_mean
-from ..recording.nuisance import TIME
 from ..statistics.assessment import (
     DOUBTFUL_ANGLE_RAD,
     InstrumentMisfit,
-    clock_concerns,
     fit_concerns,
     forward_simulation_concerns,
     impact_step_concerns,
@@ -178,9 +176,6 @@ def _nuisance_concerns(transcription: Transcription, phi: Array) -> Iterator[Con
         rows=[entry.row for entry in nuisance.entries],
         scales=nuisance.scales.tolist(),
     )
-    for k in nuisance.indices_of_rows(TIME):
-        scale = float(nuisance.scales[k])
-        yield from clock_concerns(experiment.name, float(phi[k]) * scale, prior_s=scale)
 
 
 def _outlier_counts(solution: Solution) -> tuple[int, int]:

@@ -43,7 +43,6 @@ from .thresholds import (
     GROSS_PREDICTION,
     GROSS_ROLLOUT,
     HARDLY_TAME,
-    LATE,
     LITTLE_DAMPING,
     MARKER_MISFIT,
     MISFIT,
@@ -414,27 +413,6 @@ def nuisance_concerns(
         far[vector] = deviation, Concern(code, "doubtful" if deviation > gross else "check", data)
     concerns += (concern for _, concern in far.values())
     return concerns
-
-
-def clock_concerns(name: str, shift_s: float, prior_s: float) -> list[Concern]:
-    """Return one concern, as a list, if a time shift of either sign exceeds `LATE` standard
-    deviations of its prior; else empty.
-
-    Parameters
-    ----------
-    shift_s : float
-        Estimated shift; positive if the markers were measured later than their times state [s].
-    prior_s : float
-        Standard deviation of its prior [s].
-    """
-    return concern_if(
-        abs(shift_s) > LATE * prior_s,
-        False,
-        code="nuisance/clock",
-        experiment=name,
-        shift_ms=1e3 * abs(shift_s),
-        when="later" if shift_s > 0 else "earlier",
-    )
 
 
 def forward_simulation_concerns(

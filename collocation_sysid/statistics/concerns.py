@@ -212,9 +212,6 @@ TOPICS: dict[str, Topic] = {
             "large": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
             "({size}), more than such an error can be: it hides another error. Compare laws with "
             "compare-models, and check mesh, places and clocks; do not widen its prior",
-            "clock": "the markers of '{experiment}' were measured {shift_ms:.2g} ms {when} than "
-            "their times state: the estimates are corrected for this, but find the cause of the "
-            "difference",
         },
     ),
     "specimen": Topic(

@@ -36,8 +36,6 @@ GROSS_PREDICTION = 10.0
 # Onset of a validation recording in standard deviations of its prior: check. Study:
 # verdict_reliability.
 OWN_ONSET = 2.0
-# Time shift in standard deviations of its prior: check. Study: verdict_reliability.
-LATE = 3.0
 # Share of the samples beyond Huber's threshold that is doubtful. Study: verdict_reliability.
 HARDLY_TAME = 0.2
 # Damping ratio that a scheme adds, over that of the mode: check.
