@@ -170,7 +170,7 @@ def test_what_the_user_names_is_taken_whole(table):
     columns = {"stretch": "λ_UAexp", "stress": "σ_UAexp (MPa)"}
     read = read_specimen(file, layout(columns=columns))
     np.testing.assert_allclose(read.stress_pa, [1e5, 2e5, 3e5, 4e5])
-    with pytest.raises(InputError, match=r'columns.stress = "σ_UAexp \(pa\)"'):
+    with pytest.raises(InputError, match=r'columns.stress = "σ_UAexp \(Pa\)"'):
         read_specimen(file, layout(columns=columns | {"stress": "σ_UAexp"}))
 
 
