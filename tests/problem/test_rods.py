@@ -96,7 +96,7 @@ def test_a_cable_that_is_bent_by_itself_is_identified_unless_it_is_stated_to_be_
     noise_m = np.random.default_rng(2).normal(scale=5e-4, size=tracks_m.shape)
     names = experiment.markers.names
     write_markers_csv(problem.parent / "markers.csv", experiment.t_s, names, tracks_m + noise_m)
-    wrench = 'wrench = { file = "wrench.csv", sigma_n = 0.01, sigma_nm = 0.001 }'
+    wrench = 'wrench = { file = "wrench.csv", sigma_n = 0.01, sigma_nm = 0.001, frame = "world" }'
     run = cs.run(cs.Problem.read(changed(problem, wrench, "")))
     assert run.trust.verdict == "good"
     for name, true in (TRUTH | natural).items():
