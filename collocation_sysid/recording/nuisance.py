@@ -120,9 +120,12 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
     )
 
 
-def _has_several_clamps(experiment: Any) -> bool:
-    """Return whether several grasps hold all axes: a turn of a single one is `GRASP_TURN`."""
-    return sum(len(grasp.axes) == 3 for grasp in experiment.body_grasps) > 1
+def _has_turned_clamps(experiment: Any) -> bool:
+    """Return whether several grasps hold all axes, or another prior than the default is stated: by
+    default the turn of a single one is `GRASP_TURN`.
+    """
+    several = sum(len(grasp.axes) == 3 for grasp in experiment.body_grasps) > 1
+    return several or experiment.nuisance.sigma(CLAMP_TURN) != CLAMP_TURN.sigma
 
 
 def _largest_place_step_m(experiment: Any) -> float:
@@ -303,7 +306,7 @@ CLAMP_TURN = Deviation(
     of="grasp",
     axes="x y z",
     changes=("grasps",),
-    applies=_has_several_clamps,
+    applies=_has_turned_clamps,
     by="worst",
     label="turn of grasp {which}, {axis}",
     sentence="rotation of a grasp: up to {size}",

@@ -115,6 +115,11 @@ def test_each_of_several_clamps_turns_by_default(body, turned):
     assert len([entry for entry in nuisance.entries if entry.row.key == "clamp_turn"]) == 3 * turned
 
 
+def test_a_stated_turn_of_a_single_clamp_is_estimated():
+    stated = replace(hung_cube(), nuisance=Nuisance.none(clamp_turn_rad=0.5))
+    assert NuisanceMap.from_experiment(stated).scales.tolist() == [0.5] * 3
+
+
 def test_the_equations_have_the_derivatives_of_turned_clamps(rng):
     bar = replace(
         bar_with_nuisance(), nuisance=Nuisance.none(clamp_turn_rad=0.05, hand_eye_rad=0.02)

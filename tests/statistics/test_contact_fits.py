@@ -88,7 +88,11 @@ def test_intervals_contain_the_truth_at_their_nominal_rate():
 
 @pytest.mark.parametrize(
     ("off_m", "prior_m", "verdict"),
-    [pytest.param(1.6e-3, 5e-4, "check", marks=pytest.mark.long), (1e-3, 1e-4, "doubtful")],
+    [
+        pytest.param(1.6e-3, 5e-4, "check", marks=pytest.mark.long),
+        pytest.param(2.5e-3, 5e-4, "doubtful", marks=pytest.mark.long),
+        (1e-3, 1e-4, "doubtful"),
+    ],
 )
 def test_an_obstacle_far_from_its_stated_place_is_reported(
     off_m: float, prior_m: float, verdict: str

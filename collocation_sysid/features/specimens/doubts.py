@@ -58,6 +58,8 @@ from ...statistics.thresholds import KIND_CHANGE, LIKELIER
 
 # Fewest samples of a specimen whose curve distinguishes hypotheses.
 FEWEST_SAMPLES = 4
+# Mistakes with which specimens that fit are compared.
+OTHER_READINGS = "specimen-true-stress", "specimen-percent", "specimen-kind"
 # Samples of each specimen, and most iterations, of the fits that screen the mistakes, and of those
 # that compare kinds of test; their tolerance: a misfit is needed, not an estimate.
 SCREENING = (8, 15)
@@ -145,12 +147,8 @@ def likelier_kinds(solution: Solution, deviations: Mapping[str, float | None]) -
     chosen = [thinned(each, COMPARING[0]) for each in experiments]
     corrections: dict[str, list[Experiment]] = {}
     for each in chosen:
-        for row in (
-            _mistake("specimen-true-stress", _of_engineering_stress),
-            _mistake("specimen-percent", _of_ratios),
-            *_other_kinds(each),
-        ):
-            if hypothesis := row.hypothesis(each):
+        for row in likely_mistakes(each, ()):
+            if row.name in OTHER_READINGS and (hypothesis := row.hypothesis(each)):
                 name = row.name.removeprefix("specimen-").replace("-", " ")
                 other = hypothesis.data.get("test", name)
                 corrections.setdefault(other, []).append(hypothesis.corrected)
