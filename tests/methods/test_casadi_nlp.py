@@ -41,10 +41,12 @@ def solved(plugin: str) -> Solution:
 
 
 def answer(plugin: str, collocation: Collocation, watch: Watch | None = None) -> Solution:
-    """Runs of sleqp differ: now and then one fails within it where the next does not."""
-    found = PLUGINS[plugin]()(collocation, watch)
-    failed = plugin == "sleqp" and found.status is Status.NUMERICAL_FAILURE
-    return PLUGINS[plugin]()(collocation, watch) if failed else found
+    """Runs of sleqp differ, as on programs of expressions: some fail where the next does not."""
+    for _ in range(3):
+        found = PLUGINS[plugin]()(collocation, watch)
+        if found.status.converged or plugin != "sleqp":
+            break
+    return found
 
 
 def functions() -> NlpFunctions:
@@ -96,7 +98,7 @@ def test_explicit_grasps_lead_to_the_same_answer(plugin: str):
     collocation = Collocation(
         [measured(hung_cube(4, (1, 1, 2)))], GUESS, has_grasp_constraints=True
     )
-    solution = PLUGINS[plugin]()(collocation)
+    solution = answer(plugin, collocation)
     assert solution.status.converged
     np.testing.assert_allclose(solution.theta[:3], list(TRUTH.values())[:3], rtol=1e-4)
 
