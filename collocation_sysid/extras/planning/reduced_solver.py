@@ -52,7 +52,7 @@ class ReducedTolerances:
     # 1e-6 if both steps end far below it.
     step: float = 1e-9
     # Largest predicted decrease of the objective, relative to it, at convergence.
-    decrease: float = 1e-12
+    decrease: float = 1e-11
     # Share of the objective by which three iterations together must improve it; 0 searches until
     # convergence. Motions that differ by redundant coordinates of the hand are nearly as good as
     # one another, and the search among them is slow.
