@@ -1021,7 +1021,6 @@ ASSUMPTIONS = (
     Deviation(
         "marker_mass_kg",
         "kg",
-        wide=0.01,
         is_one_sided=True,
         description="mass of each marker, which is not part of the mass of the body",
         remedy="weigh the markers and state "
