@@ -74,6 +74,8 @@ def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
 def _clock(fit: TestedFit) -> Iterator[Doubt]:
     """Yield the row of poses that are late or early; its column is the rate of all predictions."""
     prior_s = fit.experiment.nuisance.sigma(TIME) or 0.0
+    rows = fit.part.transcription.nuisance.indices_of_rows(TIME)
+    estimated_s = prior_s * float(fit.part.phi[rows].sum())
     rates = {
         each: np.gradient(values, each.sample_times_s, axis=0) / each.sample_sigmas
         for each, values in fit.predictions.items()
@@ -81,7 +83,9 @@ def _clock(fit: TestedFit) -> Iterator[Doubt]:
     }
 
     def correct(experiment: Experiment, size: Array) -> Correction:
-        lag_s = -float(size[0])
+        # A fit that has followed the lag knows it better than a linear step.
+        is_followed = abs(estimated_s) > ESTIMATED_LAGS * prior_s
+        lag_s = -(estimated_s if is_followed else float(size[0]))
         if abs(lag_s) <= ESTIMATED_LAGS * prior_s:
             return None
         other = with_pose_lag(experiment, lag_s)
