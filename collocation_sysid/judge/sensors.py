@@ -17,6 +17,7 @@ from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement, root_mean
 from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
+from ..statistics.scale_identifiability import relative_moduli
 from ..statistics.thresholds import BETTER, NOISE
 from .doubt import Correction, Doubt
 from .fit import Candidate, TestedFit, scaled_residuals
@@ -41,17 +42,31 @@ def sensor_candidates(fit: TestedFit) -> Iterator[Candidate]:
         if not misses or sensor.counts_pixels or not isinstance(sensor, CustomSensor | Wrench):
             continue
         predicted = _predicted_by_others(fit, sensor)
+        sets_scale = _sets_scale(fit, sensor)
         of = f"{sensor.samples_text or sensor.title} of '{fit.experiment.name}'"
 
         def squares(values: Array, sensor: Measurement = sensor, own: Array = predicted) -> float:
             return float(np.nansum(((values - own) / sensor.sample_sigmas) ** 2))
 
         for row in whole_mistakes(sensor, predicted):
+            if sets_scale and row.name == "sensor-unit":
+                continue
             if (found := row.hypothesis(fit.experiment)) is not None:
                 other = found.corrected.measurements[measurements.index(sensor)]
                 share = squares(other.measured_values) / squares(sensor.measured_values)
                 if share < BETTER**-2:
                     yield share, replace(found, subject=of)
+
+
+def _sets_scale(fit: TestedFit, sensor: Measurement) -> bool:
+    """Whether equilibria have the moduli from this wrench alone: with smaller loads it fits better,
+    because its residuals decrease by the same factor as the moduli.
+    """
+    if not fit.experiment.is_static or not isinstance(sensor, Wrench):
+        return False
+    others = [None if each is sensor else each for each in fit.experiment.measurements]
+    blind = fit.experiment.with_measurements(others)
+    return bool(relative_moduli([blind], fit.solution.collocation.parameters))
 
 
 def _predicted_by_others(fit: TestedFit, sensor: Measurement) -> Array:

@@ -7,12 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kit.problems import GUESS
+from kit.problems import GUESS, TRUTH
+from kit.static import ELASTIC_ONLY, TIMES, block
 from kit.wrench_fits import swung
 
 from collocation_sysid.judge.engine import find_misspecifications
+from collocation_sysid.judge.fit import TestedFit
+from collocation_sysid.judge.sensors import sensor_candidates
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.program.collocation import Collocation, ExperimentIterate
+from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Nuisance, Wrench
 from collocation_sysid.recording.nuisance import TOOL_CENTRE, TOOL_MASS
@@ -96,3 +100,21 @@ def test_a_wrench_with_an_estimated_tool_has_no_cause():
     found_kg = part.phi[mass] * part.transcription.nuisance.scales[mass]
     assert found_kg == pytest.approx(TOOL_KG, rel=0.05)
     assert not find_misspecifications(solution)
+
+
+def test_the_only_load_of_equilibria_has_no_wrong_unit():
+    below, above, *sides = block().grasps
+    zeros = Wrench(TIMES, np.zeros((len(TIMES), 6)), sigma_n=0.01, sigma_nm=1.0)
+
+    def loaded(wrench: Wrench):
+        return replace(block(), grasps=[below, replace(above, wrench=wrench), *sides])
+
+    right = simulate(loaded(zeros), TRUTH)
+    late_n = np.full((len(TIMES), 6), np.nan)
+    late_n[:, 2] = np.interp(TIMES - 0.5, TIMES, right.wrenches[0][:, 2])
+    late = with_markers(loaded(replace(zeros, values=late_n)), right.markers_m)
+    names = [item.name for item in ELASTIC_ONLY.free]
+    soft = ELASTIC_ONLY.with_estimates({name: 0.1 * TRUTH[name] for name in names})
+    solution = ReducedSpace()(Collocation([late], soft))
+    found = [each.code for _, each in sensor_candidates(TestedFit(solution, solution))]
+    assert "sensor-unit" not in found
