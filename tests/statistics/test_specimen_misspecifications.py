@@ -218,6 +218,13 @@ def test_residuals_of_a_simple_law_name_the_law_first():
     assert "move the body" not in text
 
 
+def test_residuals_of_a_law_with_memory_name_the_number_of_branches_first():
+    larger = [Concern("noise/larger", data={"factor": 9.0, "stated": "sigma"})]
+    test = cs.Specimen("uniaxial", STRAIN, neo_hookean_pa(STRAIN), SIGMA_PA)
+    (concern,) = as_specimen_concerns(larger, [test.experiment(prony=("a",))], False)
+    assert "compare-models FILE --prony 1,2 and then --materials neo-hookean," in concern.message
+
+
 def test_a_curve_that_returns_names_unloading_in_place_of_the_law():
     larger = [Concern("noise/larger", data={"factor": 9.0, "stated": "sigma"})]
     up_and_down = np.concatenate([STRAIN, STRAIN[-2::-1]])

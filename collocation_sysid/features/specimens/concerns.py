@@ -177,9 +177,12 @@ def _law_advice(experiments: Sequence[Experiment]) -> str:
     compared = FOAM_LAWS if is_foam else COMPARED_LAWS
     richer = [law.replace(f"-{n}", f"-{n + 1}") for law in laws for n in (2, 3) if f"-{n}" in law]
     others = [*dict.fromkeys((*laws, *richer, *compared))]
+    branches = max(len(part.prony) for part in parts)
+    of_memory = f"--prony {branches},{branches + 1} and then " if branches else ""
     return (
         f"the law {listed(laws)} may be too simple for {' and '.join(_ranges(experiments))}. First "
-        f"compare laws with collocation-sysid compare-models FILE --materials {','.join(others)}"
+        f"compare laws with collocation-sysid compare-models FILE {of_memory}--materials "
+        f"{','.join(others)}"
     )
 
 
