@@ -719,6 +719,17 @@ def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(displacement_m=displacement_m)
 
 
+def _specimen_delay(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect per second by which loads are late; None without memory, or in a table of
+    moduli.
+    """
+    has_delay = at.body.has_memory and not at.body.memory.oscillates
+    if at.iterate.transcription.experiment.specimen is None or not has_delay:
+        return None
+    positions_m = at.iterate.equations.prescribed.positions_m
+    return Effect(displacement_m=-np.gradient(positions_m, at.dynamics.t_s, axis=0))
+
+
 def _effective_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return `_gauge_length` for grips: shoulders of a dogbone stretch less than the middle."""
     experiment = at.iterate.transcription.experiment
@@ -1180,6 +1191,15 @@ ASSUMPTIONS = (
         remedy="measure the length between the marks or grips of the unloaded specimen, or the strain "
         "with a calibrated extensometer",
         effect=_gauge_length,
+        of_specimens=True,
+    ),
+    Deviation(
+        "specimen_delay_s",
+        "s",
+        considered=5e-3,
+        description="delay of the load of a specimen with memory after its strain",
+        remedy="record load and strain by one clock and with the same filter",
+        effect=_specimen_delay,
         of_specimens=True,
     ),
     Deviation(
