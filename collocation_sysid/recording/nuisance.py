@@ -121,10 +121,11 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
 
 
 def _has_turned_clamps(experiment: Any) -> bool:
-    """Return whether several grasps hold all axes, or another prior than the default is stated: by
-    default the turn of a single one is `GRASP_TURN`.
+    """Return whether several rigid grasps hold all axes, or another prior than the default is stated:
+    by default the turn of a single one is `GRASP_TURN`.
     """
-    several = sum(len(grasp.axes) == 3 for grasp in experiment.body_grasps) > 1
+    grasps = [grasp for grasp in experiment.body_grasps if grasp.poses.deformation is None]
+    several = sum(len(grasp.axes) == 3 for grasp in grasps) > 1
     return several or experiment.nuisance.sigma(CLAMP_TURN) != CLAMP_TURN.sigma
 
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
+from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
 from collocation_sysid.recording.measured_faces import face_columns, face_note, read_face
@@ -207,6 +208,12 @@ def test_an_error_of_the_measured_faces_is_an_effect_on_the_load(tmp_path):
         number = found.index(f"measured_face {'xyz'[component]}{'xyz'[along]}")
         change_n = 0.02 * blocks[-1][:, 0, :3, number]
         np.testing.assert_allclose(change_n[:, 2], expected_n[:, 2], atol=1e-4)
+
+
+def test_measured_faces_do_not_turn_by_default(tmp_path):
+    experiment = replace(pressed(tmp_path, 1), nuisance=cs.Nuisance())
+    entries = NuisanceMap.from_experiment(experiment).entries
+    assert "clamp_turn" not in {entry.row.key for entry in entries}
 
 
 def parameters(**stated) -> cs.Parameters:
