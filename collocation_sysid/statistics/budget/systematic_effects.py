@@ -510,13 +510,19 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect | None:
 
 def _drift(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a share that grows linearly in time, zero at the mean time; None for
-    equilibria, whose load grows in time too.
+    equilibria, whose load grows in time too, but for specimens with memory.
     """
-    if at.iterate.transcription.experiment.is_static:
+    if at.iterate.transcription.experiment.is_static and not _is_paced_specimen(at):
         return None
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
+
+
+def _is_paced_specimen(at: ExperimentAtAnswer) -> bool:
+    """Return whether a specimen has memory, and is no table of moduli."""
+    is_specimen = at.iterate.transcription.experiment.specimen is not None
+    return is_specimen and at.body.has_memory and not at.body.memory.oscillates
 
 
 def _memory(at: ExperimentAtAnswer, index: int) -> Effect | None:
@@ -720,11 +726,8 @@ def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _specimen_delay(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect per second by which loads are late; None without memory, or in a table of
-    moduli.
-    """
-    has_delay = at.body.has_memory and not at.body.memory.oscillates
-    if at.iterate.transcription.experiment.specimen is None or not has_delay:
+    """Return the effect per second by which loads are late."""
+    if not _is_paced_specimen(at):
         return None
     positions_m = at.iterate.equations.prescribed.positions_m
     return Effect(displacement_m=-np.gradient(positions_m, at.dynamics.t_s, axis=0))
@@ -1080,6 +1083,7 @@ ASSUMPTIONS = (
         remedy="repeat the first recording at the end",
         effect=_drift,
         by_origin={"tissue": 0.05},
+        of_specimens=True,
     ),
     Deviation(
         "memory_share",
