@@ -52,3 +52,12 @@ def test_the_interval_contains_the_relaxation_time_of_a_drifting_load():
     low, high = interval(recorded, 30.0, stiffness_drift=DRIFT)
     assert low < 30.0 < high
     assert interval(recorded, 30.0)[0] > 30.0
+
+
+def test_tables_of_moduli_have_no_clock():
+    t_s = np.geomspace(1e-3, 10.0, 30)
+    modulus_pa = 2e5 * (1 + 0.4 * np.exp(-t_s / 0.3))
+    table = cs.Specimen.relaxation(t_s, modulus_pa, 1e3).experiment(prony=("a",))
+    exact = interval(table, 0.3)
+    assert exact[0] < 0.3 < exact[1]
+    assert interval(table, 0.3, specimen_delay_s=DELAY_S, stiffness_drift=DRIFT) == exact

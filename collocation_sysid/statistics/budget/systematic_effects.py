@@ -45,6 +45,7 @@ from ...recording.homogeneous_deformation import (
 )
 from ...recording.nuisance import KINDS
 from ...recording.placement import place_markers
+from ...recording.specimen import RELAXED_STRAIN
 from ...recording.specimen_files import specimen_strains
 from .memory_effect import (
     RELAXATION_TIME,
@@ -521,8 +522,10 @@ def _drift(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _is_paced_specimen(at: ExperimentAtAnswer) -> bool:
     """Return whether a specimen has memory, and is no table of moduli."""
-    is_specimen = at.iterate.transcription.experiment.specimen is not None
-    return is_specimen and at.body.has_memory and not at.body.memory.oscillates
+    experiment = at.iterate.transcription.experiment
+    if experiment.specimen is None or not at.body.has_memory:
+        return False
+    return bool(np.abs(specimen_strains(experiment)[0]).max() > 2 * RELAXED_STRAIN)
 
 
 def _memory(at: ExperimentAtAnswer, index: int) -> Effect | None:
