@@ -1,4 +1,4 @@
-"""Errors of a test over time look like memory: rows of the budget contain them."""
+"""Errors of a test over time look like memory; the intervals contain them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collocation_sysid.program.simulation import with_readings
 
 TRUTH = {"young_pa": 2e5, "poisson": 0.495, "a.share": 0.4, "a.tau_s": 0.3}
 CONSTANTS = TRUTH | {"gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
-TIMES = np.arange(0.0, 8.0, 0.05)
+TIMES = np.arange(0.0, 6.0, 0.05)
 DELAY_S, DRIFT = 5e-3, 0.02
 
 
@@ -39,6 +39,29 @@ def test_the_interval_contains_the_relaxation_time_of_a_late_load():
     late = cs.simulate(specimen(strains(TIMES - DELAY_S)), CONSTANTS).custom_sensor_values
     recorded = with_readings(specimen(strains(TIMES)), late)
     low, high = interval(recorded, 0.3, specimen_delay_s=DELAY_S)
+    assert low < 0.3 < high
+    assert interval(recorded, 0.3)[0] > 0.3
+
+
+def test_a_late_sensor_of_a_body_with_memory_is_estimated():
+    body = cs.Body(cs.box_mesh((0.02,) * 3, (1, 1, 2)), density_kg_m3=1e3, prony=("a",))
+    z_m = body.nodes_m[:, 2]
+
+    def pressed(t_s, wrenches_n) -> cs.Experiment:
+        poses = np.tile(np.eye(4), (len(t_s), 1, 1))
+        poses[:, 2, 3] = -0.02 * strains(t_s)
+        wrench = cs.Wrench(TIMES, wrenches_n, sigma_n=0.05, sigma_nm=1.0)
+        held = cs.Grasp(np.flatnonzero(z_m < 1e-9), cs.PoseSequence.fixed())
+        moved = cs.Grasp(
+            np.flatnonzero(z_m > 0.02 - 1e-9), cs.PoseSequence.from_matrices(TIMES, poses)
+        )
+        grasps = [held, replace(moved, wrench=wrench)]
+        return cs.Experiment(body, TIMES, grasps, kind="static", nuisance=cs.Nuisance.none())
+
+    late = cs.simulate(pressed(TIMES - DELAY_S, np.zeros((len(TIMES), 6))), CONSTANTS).wrenches[0]
+    recorded = pressed(TIMES, late)
+    clock = cs.Nuisance.none(sensor_time_s=DELAY_S)
+    low, high = interval(replace(recorded, nuisance=clock), 0.3)
     assert low < 0.3 < high
     assert interval(recorded, 0.3)[0] > 0.3
 

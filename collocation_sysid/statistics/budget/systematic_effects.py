@@ -511,20 +511,20 @@ def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect | None:
 
 def _drift(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of a share that grows linearly in time, zero at the mean time; None for
-    equilibria, whose load grows in time too, but for specimens with memory.
+    equilibria without memory, whose load grows in time too.
     """
-    if at.iterate.transcription.experiment.is_static and not _is_paced_specimen(at):
+    if at.iterate.transcription.experiment.is_static and not _is_paced(at):
         return None
     t_s = at.dynamics.evaluated_s
     since = (t_s - t_s.mean()) / max(np.ptp(t_s), 1e-300)
     return Effect(at.internal_n() * since[:, None])
 
 
-def _is_paced_specimen(at: ExperimentAtAnswer) -> bool:
-    """Return whether a specimen has memory, and is no table of moduli."""
+def _is_paced(at: ExperimentAtAnswer) -> bool:
+    """Return whether equilibria depend on the pace: those with memory, but for tables of moduli."""
     experiment = at.iterate.transcription.experiment
     if experiment.specimen is None or not at.body.has_memory:
-        return False
+        return at.body.has_memory
     return bool(np.abs(specimen_strains(experiment)[0]).max() > 2 * RELAXED_STRAIN)
 
 
@@ -730,7 +730,7 @@ def _gauge_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 def _specimen_delay(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect per second by which loads are late."""
-    if not _is_paced_specimen(at):
+    if at.iterate.transcription.experiment.specimen is None or not _is_paced(at):
         return None
     positions_m = at.iterate.equations.prescribed.positions_m
     return Effect(displacement_m=-np.gradient(positions_m, at.dynamics.t_s, axis=0))
