@@ -84,3 +84,10 @@ def test_tables_of_moduli_have_no_clock():
     exact = interval(table, 0.3)
     assert exact[0] < 0.3 < exact[1]
     assert interval(table, 0.3, specimen_delay_s=DELAY_S, stiffness_drift=DRIFT) == exact
+
+
+def test_a_single_sample_has_no_pace():
+    unknown = CONSTANTS | {"young_pa": cs.Unknown()}
+    test = with_readings(specimen(np.array([0.05]), np.zeros(1)), [np.array([[1e4]])])
+    run = cs.run(cs.Problem([test], unknown), seek_causes=False)
+    assert abs(run.parameters["young_pa"] / (1e4 / 0.05) - 1) < 0.1

@@ -521,10 +521,11 @@ def _drift(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _is_paced(at: ExperimentAtAnswer) -> bool:
-    """Return whether equilibria depend on the pace: those with memory, but for tables of moduli."""
+    """Return whether equilibria depend on the pace: several with memory, but for tables of moduli."""
     experiment = at.iterate.transcription.experiment
-    if experiment.specimen is None or not at.body.has_memory:
-        return at.body.has_memory
+    has_pace = at.body.has_memory and len(at.dynamics.t_s) > 1
+    if experiment.specimen is None or not has_pace:
+        return has_pace
     return bool(np.abs(specimen_strains(experiment)[0]).max() > 2 * RELAXED_STRAIN)
 
 
