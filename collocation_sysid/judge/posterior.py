@@ -628,7 +628,7 @@ class Posterior:
         columns; columns of one name count together. Those that cannot be negative and would be are left
         out.
         """
-        fit = self.fit
+        fit = self.considered.expected_in(self.fit)
         before = least_squares_of_fit(fit).loss(self.step)
         found = []
         for name in dict.fromkeys(others.names):

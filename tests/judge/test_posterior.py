@@ -221,6 +221,15 @@ def test_the_effect_of_the_time_step_is_not_learnt(rng):
     assert not np.allclose(found.q, expected.q, atol=1e-3)
 
 
+def test_no_other_effect_is_suspected_of_what_the_time_step_changes(rng):
+    by_parameters = slopes(rng, 4)
+    residual = rng.normal(size=len(by_parameters))
+    own = effects(5 * rng.normal(size=(len(residual), 1)), "time_step", means=2.0)
+    found = Posterior.from_fit(linear_fit(by_parameters, residual), own, PARAMETERS, Q, GIVEN)
+    unseen = effects(1e-9 * rng.normal(size=(len(residual), 1)), "mass")
+    assert all(each.surprise < 1e-3 for each in found.suspected(unseen, GIVEN))
+
+
 def test_other_effects_are_learnt_beside_the_mean_of_one_that_a_refinement_measures(rng):
     """The refinement corrects the constants alone for the measured change of the residuals."""
     by_parameters, columns = slopes(rng, 4), 0.5 * slopes(rng, 3)
