@@ -17,7 +17,10 @@ from ..common.array_types import Array
 from ..errors import listed
 from ..fem.body import Body
 from ..fem.laws.constants import (
+    AXIAL,
+    BENDING,
     DENSITY,
+    TORSION,
     is_damping,
     is_density,
     is_modulus,
@@ -156,14 +159,15 @@ def _common_scaling(
     """
     if not includes_declared and not all(part.has_free_density for part in body.parts):
         return None
-    scaled = [
-        is_modulus(name)
-        or (
-            without_region(name) == DENSITY.name
-            and not (includes_declared and not slope[place].any())
-        )
-        for place, name in enumerate(body.constants)
-    ]
+
+    def is_scaled(place: int, name: str) -> bool:
+        """Stiffnesses along and about a rod hardly matter where they are stated."""
+        constant = without_region(name)
+        if constant in (DENSITY.name, TORSION.name, AXIAL.name):
+            return bool(slope[place].any()) or not includes_declared
+        return is_modulus(name) or constant == BENDING.name
+
+    scaled = [is_scaled(place, name) for place, name in enumerate(body.constants)]
     return np.where(scaled, theta, 0.0)
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from kit.problem_files import replace_text, run_command
 from kit.problems import hung_cube, noisy
+from kit.rods import bent, cable, clamped
 
 from collocation_sysid import Body
 from collocation_sysid.errors import InputError
-from collocation_sysid.model.parameters import Tied, Unknown
+from collocation_sysid.model.parameters import Parameters, Tied, Unknown
 from collocation_sysid.pipeline import run
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import Experiment, Force, PointMass
@@ -145,6 +146,13 @@ def test_moduli_relative_to_a_density_as_stated_are_called_so():
 
 
 # In a problem file ----------------------------------------------------------------------------
+
+
+def test_the_bending_of_a_cable_is_relative_although_its_axial_stiffness_is_stated():
+    held = clamped(cable(bent()))
+    stated = {"bending_n_m2": Unknown(1e-3), "torsion_n_m2": 3e-4, "axial_n": 200.0}
+    parameters = Parameters.from_mapping(stated | DAMPED)
+    assert relative_moduli([held], parameters) == ("bending_n_m2",)
 
 
 def read(folder, *edits, overrides=()) -> Problem:
