@@ -64,10 +64,10 @@ def find_misspecifications_by_modes(
 
     Notes
     -----
-    Without markers only signs of loads are tested; in a static experiment, or where modes are of no
-    use (`ModalComparison.from_experiment`), no modes are used.
+    Without markers, and of rods, only signs of loads are tested; in a static experiment, or where modes
+    are of no use (`ModalComparison.from_experiment`), no modes are used.
     """
-    if not experiment.markers.names:
+    if not experiment.markers.names or experiment.body.is_slender:
         return rank(load_sign_hypotheses(experiment))
     if experiment.is_static:
         return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
@@ -137,9 +137,11 @@ class ModalComparison:
         -------
         ModalComparison or None
             None if the body has no modes, no single grasp carries it, there are fewer than three
-            samples of markers, or tendons or pressures drive it.
+            samples of markers, tendons or pressures drive it, or it is a rod, whose deflections are far
+            from linear.
         """
-        declared = None if experiment.actuators else DeclaredMotion.from_experiment(experiment)
+        is_left_out = experiment.actuators or experiment.body.is_slender
+        declared = None if is_left_out else DeclaredMotion.from_experiment(experiment)
         if declared is None or np.isfinite(declared.tracks_m[..., 0]).sum() < 3:
             return None
         try:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kit import misdescribed as wrong
 from kit.problem_files import both, replace_text, run_command
 from kit.problems import GUESS, TRUTH, box, released_cube
 from twins import BODIES, SOFT, STIFF, twin
@@ -21,6 +22,7 @@ from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.judge import engine
 from collocation_sysid.judge.engine import find_misspecifications
+from collocation_sysid.judge.modes import find_misspecifications_by_modes
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
@@ -399,3 +401,11 @@ def test_a_refusal_names_the_likeliest_cause(tiny: Path):
     said = " ".join(outcome.err.split())
     assert "from the pose of the grasp" in said
     assert "likely 'swing': the poses would fit if they were 0.001 times as large" in said
+
+
+def test_no_linear_mode_of_a_cable_contradicts_its_description():
+    """The right one was said to have the axes of its markers exchanged."""
+    (experiment,) = wrong.cable_with_marker_at(0.3).experiments
+    constants = {"bending_n_m2": 1e-3, "torsion_n_m2": 3e-4, "axial_n": 200.0}
+    constants |= {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
+    assert find_misspecifications_by_modes(experiment, constants) == ()
