@@ -12,6 +12,7 @@ import pytest
 from kit import misdescribed as wrong
 from kit.problem_files import both, replace_text, run_command
 from kit.problems import GUESS, TRUTH, box, released_cube
+from kit.rods import bent, cable, clamped
 from twins import BODIES, SOFT, STIFF, twin
 from wrong_obstacles import POKING_FAULTS
 from wrong_twins import FAULTS, TRACK_FAULTS, Fault, late, reordered
@@ -409,3 +410,10 @@ def test_no_linear_mode_of_a_cable_contradicts_its_description():
     constants = {"bending_n_m2": 1e-3, "torsion_n_m2": 3e-4, "axial_n": 200.0}
     constants |= {"gamma_r_s": 2e-3, "gamma_m_1_s": 0.3}
     assert find_misspecifications_by_modes(experiment, constants) == ()
+
+
+def test_no_section_of_a_rod_is_held_by_chance():
+    body = cable(bent())
+    held = clamped(body, grasps=[Grasp(np.arange(6), PoseSequence.fixed())])
+    (found,) = check_grasps(held, 0.05)
+    assert grasp_concerns(found) == []

@@ -383,6 +383,8 @@ def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck
         Mean edge length of the mesh [m].
     """
     points_m = experiment.body.nodes.points_m
+    if experiment.body.is_slender:
+        mean_edge_m = 0.0  # arc lengths, which no rounding changes, select the sections
     return tuple(
         _check_grasp(experiment.name, points_m, grasp=g, mean_edge_m=mean_edge_m)
         for g in experiment.body_grasps
