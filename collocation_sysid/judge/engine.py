@@ -83,14 +83,16 @@ def find_misspecifications(
     if is_consistent:
         return rank(e for source in sources for e in source.consistent(solution, deviations))
     found = [each for source in sources for each in source.fitted(solution)]
-    for part, fitted_m in zip(solution.parts, solution.readings_m, strict=True):
-        experiment = part.transcription.experiment
-        found += [*same_tracks(experiment), *filtered_tracks(experiment, fitted_m)]
-        found += exchanged_places(part)
     misfits = [discrepancy(part) for part in solution.parts]
     worst = int(np.argmax(misfits))
     if _certainty(found) < CERTAIN:
         found += _shown_by_modes(solution, worst)
+    # Tracks in a wrong unit look like a single point, or filtered.
+    if _certainty(found) < CERTAIN:
+        for part, fitted_m in zip(solution.parts, solution.readings_m, strict=True):
+            experiment = part.transcription.experiment
+            found += [*same_tracks(experiment), *filtered_tracks(experiment, fitted_m)]
+            found += exchanged_places(part)
     if misfits[worst] > 1.0 and _certainty(found) < CERTAIN:
         found += _tested(solution, solution.parts[worst].transcription.experiment, deviations)
     return rank(found)
