@@ -65,6 +65,8 @@ def _sets_scale(fit: TestedFit, sensor: Measurement) -> bool:
     if not fit.experiment.is_static or not isinstance(sensor, Wrench):
         return False
     others = [None if each is sensor else each for each in fit.experiment.measurements]
+    if others == [None]:
+        return True
     blind = fit.experiment.with_measurements(others)
     return bool(relative_moduli([blind], fit.solution.collocation.parameters))
 

@@ -102,7 +102,8 @@ def test_a_wrench_with_an_estimated_tool_has_no_cause():
     assert not find_misspecifications(solution)
 
 
-def test_the_only_load_of_equilibria_has_no_wrong_unit():
+@pytest.mark.parametrize("has_markers", [True, False])
+def test_the_only_load_of_equilibria_has_no_wrong_unit(has_markers):
     below, above, *sides = block().grasps
     zeros = Wrench(TIMES, np.zeros((len(TIMES), 6)), sigma_n=0.01, sigma_nm=1.0)
 
@@ -113,6 +114,8 @@ def test_the_only_load_of_equilibria_has_no_wrong_unit():
     late_n = np.full((len(TIMES), 6), np.nan)
     late_n[:, 2] = np.interp(TIMES - 0.5, TIMES, right.wrenches[0][:, 2])
     late = with_markers(loaded(replace(zeros, values=late_n)), right.markers_m)
+    if not has_markers:
+        late = late.with_measurements([None, *late.wrenches])
     names = [item.name for item in ELASTIC_ONLY.free]
     soft = ELASTIC_ONLY.with_estimates({name: 0.1 * TRUTH[name] for name in names})
     solution = ReducedSpace()(Collocation([late], soft))
