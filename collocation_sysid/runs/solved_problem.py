@@ -227,6 +227,9 @@ class SolvedProblem:
         were computed.
         """
         effects = effect_concerns(self.effects, self.suspects)
+        grade = effects[0].grade if effects else None
+        if not (self.solution.collocation.nq or self.posterior is None or self.effects):
+            grade = "doubtful"  # nothing but the stated constants explains a difference
         of_fit = tuple(
             solution_concerns(
                 self.solution,
@@ -234,7 +237,7 @@ class SolvedProblem:
                 motions=self.modes_by_experiment.values(),
                 uncertainty=self.uncertainty,
                 phi=self.posterior and self.posterior.phi,
-                surprise=effects[0].grade if effects else None,
+                surprise=grade,
                 is_step_known=self.posterior is not None
                 and self.is_consistent
                 and "time_step" in self.posterior.considered.names,
