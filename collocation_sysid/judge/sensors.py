@@ -64,22 +64,29 @@ def _sets_scale(fit: TestedFit, sensor: Measurement) -> bool:
     """
     if not fit.experiment.is_static or not isinstance(sensor, Wrench):
         return False
-    others = [None if each is sensor else each for each in fit.experiment.measurements]
-    if others == [None]:
-        return True
-    blind = fit.experiment.with_measurements(others)
-    return bool(relative_moduli([blind], fit.solution.collocation.parameters))
+    blind = _without(fit.experiment, sensor)
+    return blind is None or bool(relative_moduli([blind], fit.solution.collocation.parameters))
+
+
+def _without(experiment: Experiment, sensor: Measurement) -> Experiment | None:
+    """Return the experiment with all other measurements; None if there are none."""
+    others = [None if each is sensor else each for each in experiment.measurements]
+    if not any(each is not None and each.has_samples() for each in others):
+        return None
+    try:
+        return experiment.with_measurements(others)
+    except InputError:
+        return None
 
 
 def _predicted_by_others(fit: TestedFit, sensor: Measurement) -> Array:
     """Return the values (S, m) by a fit of all other measurements, else by that of all."""
     part, experiment = fit.part, fit.experiment
-    others = [None if each is sensor else each for each in experiment.measurements]
-    if not any(each is not None and each.has_samples() for each in others):
+    if (other := _without(experiment, sensor)) is None:
         return fit.predictions[sensor]
     collocation = fit.solution.collocation
     try:
-        blind = replace(collocation, experiments=(experiment.with_measurements(others),))
+        blind = replace(collocation, experiments=(other,))
         solution = ReducedSpace(max_iterations=MOST_SWEEPS)(blind)
     except (InputError, SimulationError):
         return fit.predictions[sensor]
