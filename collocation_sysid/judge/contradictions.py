@@ -26,14 +26,15 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
     """Yield a hypothesis of a wrong sign for each grasp and axis of a static experiment where
     displacement and measured force are anticorrelated, below `AGAINST`.
 
-    Tested are axes along which a grasp is displaced by a test bench, or along which an obstacle
-    moves most. Dynamic experiments are not tested, because of inertia.
+    Tested are axes along which a grasp is displaced by a test bench, or along which an obstacle or a
+    face whose displacements were measured moves most, relative to the grasps that hold the others.
+    Dynamic experiments are not tested, because of inertia.
     """
     for k, grasp in enumerate(experiment.grasps if experiment.is_static else (), start=1):
         sensor = experiment.sensors_by_grasp.get(k)
         if sensor is None:
             continue
-        shifts_m = grasp.poses.at(sensor.t_s)[1]
+        shifts_m = _relative_shifts(experiment, grasp, sensor.t_s)
         for axis in grasp.zero or _pushing_axis(grasp, shifts_m, frame=sensor.frame):
             axis_index = "xyz".index(axis)
             displacement_m = shifts_m[:, axis_index]
@@ -53,10 +54,27 @@ def load_sign_hypotheses(experiment: Experiment) -> Iterator[Hypothesis]:
                 yield Hypothesis("sign", f"'{experiment.name}'", data=data, strength=strength)
 
 
+def _relative_shifts(experiment: Experiment, grasp: Grasp, t_s: Array) -> Array:
+    """Return the mean positions (T, 3) [m] of a grasp's nodes, along each axis relative to those of the
+    other grasps that hold it all the time.
+    """
+    nodes_m = experiment.body.nodes_m
+    shifts_m = grasp.positions_at(nodes_m, t_s).mean(axis=1)
+    others = [each for each in experiment.body_grasps if each is not grasp]
+    for axis in grasp.axis_indices:
+        held_m = [
+            each.positions_at(nodes_m, t_s)[:, :, axis].mean(axis=1)
+            for each in others
+            if axis in each.axis_indices and each.is_active(t_s).all()
+        ]
+        shifts_m[:, axis] -= np.mean(held_m, axis=0) if held_m else 0.0
+    return shifts_m
+
+
 def _pushing_axis(grasp: Grasp, shifts_m: Array, frame: Frame) -> str:
-    """Return the world axis along which an obstacle moves most; "" for others."""
+    """Return the world axis along which an obstacle or a measured face moves most; "" for others."""
     moved_m = np.ptp(shifts_m, axis=0)
-    if not isinstance(grasp, Obstacle):
+    if not isinstance(grasp, Obstacle) and grasp.poses.deformation is None:
         return ""
     if not moved_m.any() or frame != "world":
         return ""

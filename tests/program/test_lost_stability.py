@@ -25,14 +25,15 @@ from collocation_sysid.runs.check import check_problem
 
 
 def test_a_straight_rod_between_grasps_that_are_too_near_is_advised_to_state_its_centreline():
-    body = cable(straight(0.8, CrossSection.round(0.006), 41))
+    mesh = straight(0.8, CrossSection.round(0.006), 41)
+    body = cable(mesh)
     t_s = np.arange(3) * 0.01
     upright = np.tile([0, 0, 0, 1.0], (3, 1))
     grasps = [
         Grasp(end, PoseSequence(t_s, np.tile([shift_m, 0, 0], (3, 1)), upright))
         for end, shift_m in zip(ends(body), (0.0, -0.1), strict=True)
     ]
-    markers = Markers(t_s, np.zeros((3, 1, 3)), 5e-4, places_m=[body.mesh.place_m(0.4)])
+    markers = Markers(t_s, np.zeros((3, 1, 3)), 5e-4, places_m=[mesh.place_m(0.4)])
     with pytest.raises(SimulationError, match=r"State object\.centreline") as failed:
         cs.simulate(cs.Experiment(body, t_s, grasps, markers), CABLE | UNDAMPED)
     assert "surface" not in str(failed.value)

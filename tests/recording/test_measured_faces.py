@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
+from collocation_sysid.judge.contradictions import load_sign_hypotheses
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.problem.options import UncertaintyOptions
 from collocation_sysid.program.simulation import with_wrenches
@@ -208,6 +209,20 @@ def test_an_error_of_the_measured_faces_is_an_effect_on_the_load(tmp_path):
         number = found.index(f"measured_face {'xyz'[component]}{'xyz'[along]}")
         change_n = 0.02 * blocks[-1][:, 0, :3, number]
         np.testing.assert_allclose(change_n[:, 2], expected_n[:, 2], atol=1e-4)
+
+
+def test_measured_faces_that_advance_against_the_load_have_a_wrong_sign(tmp_path):
+    experiment = pressed(tmp_path, 1)
+    seen = with_wrenches(experiment, cs.simulate(experiment, VALUES).wrenches)
+    # A sensor below, whose platen gives way towards it.
+    lower, upper = seen.grasps
+    (sensor,) = seen.wrenches
+    below = replace(lower, wrench=sensor.with_samples(TIMES, -sensor.values))
+    for right in (seen, replace(seen, grasps=[below, replace(upper, wrench=None)])):
+        assert not [*load_sign_hypotheses(right)]
+        wrong = right.wrenches[0].with_samples(TIMES, -right.wrenches[0].values)
+        (found,) = load_sign_hypotheses(right.with_measurements([right.markers, wrong]))
+        assert found.data["axis"] == "z"
 
 
 def test_measured_faces_do_not_turn_by_default(tmp_path):
