@@ -27,7 +27,6 @@ from ...model.internal_variables import (
     insert_previous_states,
     start_states,
 )
-from ...model.weight import Weight
 from ...recording.experiment import Experiment
 from ...recording.grasp import prescribed_dofs
 from ..linear_algebra.lapack import one_blas_thread
@@ -120,7 +119,8 @@ def simulate_newmark(
     v[0] = state.v
     step = experiment.timestep_s / steps_per_sample
     reactions_and_positions = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
-    reactions_and_positions[:, 0] = stepper.reactions_and_positions(state, sensed)
+    at_start = stepper.forces(state.t_s)
+    reactions_and_positions[:, 0] = _reactions_and_positions(state, at_start, sensed)
     means_n = np.zeros_like(reactions_and_positions[0])
     if state.local_n is not None:
         means_n[0] = state.local_n[sensed]
@@ -131,7 +131,7 @@ def simulate_newmark(
             row = (k - 1) * steps_per_sample + j
             now = at_times(loads, slice(row - 1, row))
             state = stepper.advance(state, float(ends_s[k - 1, j - 1]), now)
-            reactions_and_positions[:, row] = stepper.reactions_and_positions(state, sensed)
+            reactions_and_positions[:, row] = _reactions_and_positions(state, now.forces, sensed)
             if state.local_n is not None:
                 means_n[row] = state.local_n[sensed]
         x[k] = state.x
@@ -143,6 +143,21 @@ def simulate_newmark(
     reactions_and_positions[0, [0, -1]] -= means_n[[0, -1]]
     reactions, positions = reactions_and_positions
     return x, v, ReactionForces(reactions, position_m=positions)
+
+
+def _force_n(state: _State, forces: Forces) -> Array:
+    """Return all forces (3n,) [N] but local ones."""
+    for each in state.previous_histories:
+        forces = each.insert_at_same_time(forces)
+    return forces.without_local_forces().total(state.x, state.v)[0]
+
+
+def _reactions_and_positions(state: _State, forces: Forces, dofs: Index) -> tuple[Array, Array]:
+    """Return reactions without local ones [N] and positions [m]."""
+    if not len(dofs):
+        return np.zeros(0), np.zeros(0)
+    reaction_n = forces.mass.inertia_kg[0] * state.a - _force_n(state, forces)
+    return reaction_n[dofs], state.x[dofs]
 
 
 class _NewmarkEquations(StepEquations):
@@ -239,13 +254,13 @@ class _Stepper:
         """Return the initial state, with accelerations in balance with the forces."""
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
-        x, v = initial_state(self.experiment, self._forces(time_s), solver)
+        x, v = initial_state(self.experiment, self.forces(time_s), solver)
         previous_histories = start_states(
-            self._forces(time_s), x, v=v, loaded_s=self.experiment.loaded_since_s
+            self.forces(time_s), x, v=v, loaded_s=self.experiment.loaded_since_s
         )
         state = _State(time_s, x, v=v, a=np.zeros_like(x), previous_histories=previous_histories)
-        if self._forces(time_s).has_local_forces:
-            state = replace(state, local_n=self._local_n(self._forces(time_s), x, v))
+        if self.forces(time_s).has_local_forces:
+            state = replace(state, local_n=self._local_n(self.forces(time_s), x, v))
         return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float, loads: _Loads) -> _State:
@@ -270,21 +285,7 @@ class _Stepper:
                     ) from failure
         return state
 
-    def reactions_and_positions(self, state: _State, dofs: Index) -> tuple[Array, Array]:
-        """Return reactions without local ones [N] and positions [m]."""
-        if not len(dofs):
-            return np.zeros(0), np.zeros(0)
-        reaction = self._mass(state.t_s) * state.a - self._force(state, state.t_s)
-        return reaction[dofs], state.x[dofs]
-
-    def _force(self, state: _State, load_s: float) -> Array:
-        """Return all forces (3n,) [N] but local ones under the loads at `load_s`."""
-        forces = self._forces(load_s)
-        for each in state.previous_histories:
-            forces = each.insert_at_same_time(forces)
-        return forces.without_local_forces().total(state.x, state.v)[0]
-
-    def _forces(self, load_s: float) -> Forces:
+    def forces(self, load_s: float) -> Forces:
         """Return the forces at `load_s`, local ones at each state."""
         return Forces.from_experiment(self.experiment, load_s, theta=self.theta)
 
@@ -299,14 +300,6 @@ class _Stepper:
     def _solver(self, time_s: float) -> NewtonSolver:
         return self.solvers.for_prescribed(self.experiment.is_prescribed(time_s)[0])
 
-    def _mass(self, time_s: float) -> Array:
-        """Return the masses (3n,) of all dofs at a time [kg]."""
-        return (
-            Weight.from_experiment(self.experiment, time_s)
-            .with_theta(self.theta)
-            .mass.inertia_kg[0]
-        )
-
     def _after_release(self, state: _State, goal_s: float) -> _State:
         """Return new accelerations at dofs released before `goal_s`."""
         before = self._solver(state.t_s)
@@ -318,7 +311,9 @@ class _Stepper:
     def _balanced(self, state: _State, load_s: float, dofs: NDArray[np.int64]) -> _State:
         """Return accelerations of dofs from the forces at `load_s`, without local ones."""
         acceleration = state.a.copy()
-        acceleration[dofs] = self._force(state, load_s)[dofs] / self._mass(load_s)[dofs]
+        forces = self.forces(load_s)
+        force_n = _force_n(state, forces)
+        acceleration[dofs] = force_n[dofs] / forces.mass.inertia_kg[0, dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: NewtonSolver, state: _State, end_s: float, loads: _Loads) -> _State:
