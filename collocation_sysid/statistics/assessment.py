@@ -73,6 +73,11 @@ HIDING = (
     "it hides another error, such as a preload at which the displacement was set to zero (strain_zero "
     "states the strain under it), a law that is too simple, or a wrong unit, area or kind of test"
 )
+# Where the priors of components that are not keys of [experiment.nuisance] are stated.
+STATED_IN = {
+    "images": "the table of the camera's measurement (pose_sigma, clock_sigma_s, …)",
+    "gauge": "the table of the measurement",
+}
 # Ratio of the steps that impacts need and the stated ones from which E is wrong by tens of percent: a
 # falling block with 4 in place of 15 was 46 % too stiff.
 FEW_IMPACT_STEPS = 2.0
@@ -408,7 +413,8 @@ def nuisance_concerns(
             data["advice"] = HIDING if deviation > gross else WIDENING
         elif rows:
             size, unit = in_readable_unit(deviation * scales[k], rows[k].unit)
-            data |= {"size": f"{size:.2g}{unit}"}
+            where = STATED_IN.get(rows[k].of, "[experiment.nuisance]")
+            data |= {"size": f"{size:.2g}{unit}", "where": where}
             code = "nuisance/large" if deviation * scales[k] > rows[k].largest else "nuisance/sized"
         far[vector] = deviation, Concern(code, "doubtful" if deviation > gross else "check", data)
     concerns += (concern for _, concern in far.values())

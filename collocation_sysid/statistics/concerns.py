@@ -197,8 +197,8 @@ TOPICS: dict[str, Topic] = {
         "Nuisance parameters of a recording",
         "motion_capture",
         remedy="An error of the laws, the mesh or a clock can hide in such a value: compare laws with "
-        "compare-models, and check mesh, places, clocks and gravity first. Widen a prior in "
-        "[experiment.nuisance] only if nothing else explains the value and a measurement confirms it.",
+        "compare-models, and check mesh, places, clocks and gravity first. Widen a prior only if nothing "
+        "else explains the value and a measurement confirms it.",
         messages={
             "limit": "{name} ended at the largest value allowed: compare laws with compare-models, "
             "and check mesh, places and clocks, whose errors it can hide",
@@ -208,7 +208,7 @@ TOPICS: dict[str, Topic] = {
             "sized": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
             "({size}): compare laws with compare-models, and check mesh, places and clocks, whose "
             "errors it can hide; if nothing else explains this value, measure it, and widen its "
-            "prior in [experiment.nuisance] if it is confirmed",
+            "prior in {where} if it is confirmed",
             "large": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
             "({size}), more than such an error can be: it hides another error. Compare laws with "
             "compare-models, and check mesh, places and clocks; do not widen its prior",

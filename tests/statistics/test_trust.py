@@ -22,7 +22,7 @@ from collocation_sysid.common.display import plain_text
 from collocation_sysid.common.serialisation import as_json, content, read
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.problem import Problem
-from collocation_sysid.recording.nuisance import GRASP_TURN
+from collocation_sysid.recording.nuisance import GRASP_TURN, IMAGE_TIME
 from collocation_sysid.result.run_sections import remedy_command
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.statistics.assessment import (
@@ -256,6 +256,13 @@ def test_a_turn_that_no_grasp_has_is_no_reason_to_widen_its_prior():
     (found,) = nuisance_concerns(names, [0.0, 5.0, 0.0], *walls, **given)
     assert found.code == "nuisance/sized"
     assert found.message.index("compare laws") < found.message.index("widen")
+
+
+def test_the_prior_of_a_late_camera_is_widened_where_it_is_stated():
+    given = {"rows": [IMAGE_TIME], "scales": [5e-3]}
+    (found,) = nuisance_concerns(["delay of front [s]"], [4.0], [-np.inf], [np.inf], **given)
+    assert "clock_sigma_s" in found.message
+    assert "[experiment.nuisance]" not in found.message
 
 
 def test_a_roll_out_is_measured_by_the_fit_and_the_noise():
