@@ -235,6 +235,16 @@ def test_lost_tracks_are_named(change: Callable[[np.ndarray], np.ndarray]) -> No
     assert "tip_top" in {each.data["point"] for each in found}
 
 
+def test_no_track_is_named_where_the_others_are_not_explained() -> None:
+    true = projected(filming("front"), motion_m())
+    pixels = stuck(true + [20 * NOISE_PX, 0.0])
+    pixels[:, 2, 1] += 100 * NOISE_PX
+    experiment = swung([with_pixels(tracks_of(), pixels)])
+    program = cs.Problem([experiment], parameters=unknown_young()).collocation()
+    (residual,) = program.transcriptions[0].residuals_of(ImageTrackResidual)
+    assert [*track_hypotheses(residual, true, "'front'")] == []
+
+
 def test_samples_after_a_jump_are_left_out() -> None:
     tracks = tracks_of(rng=np.random.default_rng(9))
     pixels = pixels_of(tracks).copy()

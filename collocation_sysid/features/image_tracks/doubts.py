@@ -16,7 +16,8 @@ from . import stated_cameras
 from .residual import ImageTrackResidual
 from .tracks import ImageTracks
 
-# Standard deviations of residuals from which a track is suspicious, and over those of the others.
+# Standard deviations of residuals from which a track is suspicious, if those of the others are below
+# it, and over those of the others.
 SUSPICIOUS = 5.0
 EXPLAINED = 3.0
 
@@ -36,7 +37,7 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
 def track_hypotheses(
     residual: ImageTrackResidual, predicted: Array, of: str
 ) -> Iterator[Hypothesis]:
-    """Yield the tracks of one camera that deviate far more than the others.
+    """Yield the tracks of one camera that deviate far more than the others, which are explained.
 
     Parameters
     ----------
@@ -51,7 +52,8 @@ def track_hypotheses(
     used = np.flatnonzero(compared.any(axis=0)).tolist()
     rms = {k: float(np.sqrt(np.nanmean(off[:, k] ** 2))) for k in used}
     usual = float(np.median([*rms.values()])) if rms else 0.0
-    for k in used:
+    # Where the others are not explained either, something else is wrong.
+    for k in used if usual < SUSPICIOUS else ():
         if rms[k] >= SUSPICIOUS and rms[k] >= EXPLAINED * usual:
             data = {"point": residual.sensor.names[k], "sigmas": rms[k], "others": usual}
             strength = rms[k] / max(usual, 1.0)
