@@ -45,6 +45,7 @@ from ..statistics.plausibility import (
 )
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
+from ..statistics.thresholds import GROSS_MISFIT
 from ..statistics.uncertainty import Uncertainty
 from .check.modes import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation, fit_misfits
@@ -97,7 +98,10 @@ def solution_concerns(
     if status is Status.ACCEPTABLE:
         yield Concern("solve/acceptable")
     if ENDED_BY_ASSOCIATION in solution.notes:
-        yield Concern("solve/jump")
+        # The posterior takes a linear step further, which may explain what the fit does not.
+        squares = sum(part.loss for part in solution.parts)
+        misfit = np.sqrt(squares / max(1, solution.collocation.measurement_count))
+        yield Concern("solve/jump", "doubtful" if misfit > GROSS_MISFIT else "check")
     transcriptions = solution.collocation.transcriptions
     fitted_experiments = [each.experiment for each in transcriptions]
     collocation = solution.collocation

@@ -6,6 +6,7 @@ import json
 import pickle
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,12 @@ from collocation_sysid.common import array_files
 from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
 from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
 from collocation_sysid.features.outlines.residual import OutlinesResidual
-from collocation_sysid.methods.solution import Solution
+from collocation_sysid.methods.reduced_space import ENDED_BY_ASSOCIATION
+from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.observables import ObservableDerivatives
 from collocation_sysid.result.pictures.album import experiment_pictures
 from collocation_sysid.result.replay import read_run
+from collocation_sysid.runs.verdict import solution_concerns
 from collocation_sysid.statistics.pose_noise import uncertainty_at
 
 
@@ -153,6 +156,18 @@ def test_the_modulus_of_a_hanging_bar_follows_from_one_photograph(guess_pa: floa
     assert low < TRUTH["young_pa"] < high
     assert (high - low) / 2 < 0.1 * TRUTH["young_pa"]
     assert abs(estimate.value / TRUTH["young_pa"] - 1) < 0.05
+
+
+@pytest.mark.parametrize(("moved_px", "grade"), [(0, "check"), (40, "doubtful")])
+def test_a_search_that_ends_at_a_jump_with_large_residuals_is_doubtful(
+    moved_px: int, grade: str
+) -> None:
+    exact = {"pose_sigma": cs.PoseSigma(turn_deg=0.0, shift_m=0.0), "centre_sigma_px": 0.0}
+    mask = np.roll(photograph(), moved_px, axis=1)
+    solution = solved(outlines_of(mask, **exact), TRUTH["young_pa"])
+    ended = replace(solution, status=Status.CONVERGED, notes=(ENDED_BY_ASSOCIATION,))
+    found = [each for each in solution_concerns(ended, {}, (), None) if each.code == "solve/jump"]
+    assert [each.grade for each in found] == [grade]
 
 
 @pytest.mark.long
