@@ -35,6 +35,7 @@ from collocation_sysid.runs.result_content import Result
 from collocation_sysid.statistics.budget.combined_intervals import combine
 from collocation_sysid.statistics.budget.consider_analysis import changes_of_nuisances
 from collocation_sysid.statistics.budget.discretisation_error import estimate_changes
+from collocation_sysid.statistics.budget.effect_estimates import EffectEstimate, effect_concerns
 from collocation_sysid.statistics.budget.systematic_effects import (
     ASSUMPTIONS,
     CONSIDERED,
@@ -319,3 +320,12 @@ def test_a_problem_file_states_with_one_word_that_all_is_exact(tmp_path):
     assert read.uncertainty.assumptions == Assumptions.exact()
     with pytest.raises(InputError, match=r'found "exact"; expected a table, or "none"'):
         Problem.read(file, ['uncertainty.assumptions="exact"'])
+
+
+def test_the_sentence_of_an_effect_has_the_deviation_that_its_surprise_counts():
+    layer = EffectEstimate("grip_layer_m", 0.0, 2e-4, -4.3e-4, 1.9e-4, surprise=-4.0)
+    (concern,) = effect_concerns([layer])
+    need = (
+        "the residuals need a grip layer of -0.43 mm, where 0 ± 0.11 mm is expected: 4.0 standard"
+    )
+    assert concern.message.startswith(need)

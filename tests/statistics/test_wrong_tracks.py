@@ -237,7 +237,7 @@ def test_lost_tracks_are_named(change: Callable[[np.ndarray], np.ndarray]) -> No
 
 def test_no_track_is_named_where_the_others_are_not_explained() -> None:
     true = projected(filming("front"), motion_m())
-    pixels = stuck(true + [20 * NOISE_PX, 0.0])
+    pixels = stuck(true + np.array([20 * NOISE_PX, 0.0]))
     pixels[:, 2, 1] += 100 * NOISE_PX
     experiment = swung([with_pixels(tracks_of(), pixels)])
     program = cs.Problem([experiment], parameters=unknown_young()).collocation()

@@ -48,20 +48,22 @@ class EffectEstimate:
         return cls(name, 0.0, 0.0, np.nan, np.nan, float(np.sqrt(gain)), suffices=suffices)
 
     def describe(self) -> str:
-        """Return name, estimate and prior as text; of an effect beyond the budget the name alone."""
+        """Return name, estimate, and that of a true description as text; of an effect beyond the budget
+        the name alone.
+        """
         label = source_label(self.name)
         article = "an" if label[0] in "aeiou" else "a"
         if not self.deviation:
             return f"{article} {label}, of which the description has none"
         unit = effect_row(self.name).unit
-        value, error, mean, sigma = (
-            in_readable_unit(each, unit)[0]
-            for each in (self.value, self.std_error, self.mean, self.deviation)
+        expected = (self.value - self.mean) / self.surprise
+        value, mean, sigma = (
+            in_readable_unit(each, unit)[0] for each in (self.value, self.mean, expected)
         )
         shown = in_readable_unit(1.0, unit)[1]
         return (
-            f"{article} {label} of {value:+.2g} ± {error:.1g}{shown}, where {mean:.2g} ± "
-            f"{sigma:.2g}{shown} is expected"
+            f"{article} {label} of {value:+.2g}{shown}, where {mean:.2g} ± {sigma:.2g}{shown} is "
+            "expected"
         )
 
 
