@@ -1796,6 +1796,7 @@ def test_limits_of_joints_may_be_in_a_python_file_that_runs_if_allowed(tmp_path:
         ("raise ValueError('broken')\n", "raised an error when it was run: ValueError: broken"),
         ("def within_reach(p, r):\n    return p[7]\n", "hand.joint_limits: the function failed"),
         ("def within_reach(p, r):\n    return -1.0\n", "does not depend on the pose"),
+        ("def within_reach(p, r):\n    return p[0] + 0.5\n", "hand.joint_limits: the hand exceeds"),
     ],
 )
 def test_mistakes_in_functions_of_joint_limits_are_explained(tmp_path: Path, text, message):
@@ -1870,6 +1871,12 @@ def test_a_reference_beyond_the_limits_of_the_hand_is_missed(tmp_path: Path):
     assert f"low misses its reference by {1e3 * found['largest_m']:.3g} mm" in line
     assert "limited by workspace_m" in line
     assert (tmp_path / "plan" / "poses.csv").is_file()
+
+
+def test_limits_are_no_remedy_for_a_reference_along_an_axis_that_is_not_free():
+    plan = plan_motion(hung_bar(), task(hand={"free": ["y"], "intervals": 8}), LIMITS)
+    (line,) = [text for text in map(str, plan_summary(plan)) if "misses its reference" in text]
+    assert "no limit of the hand binds; expected a reference that the free coordinates" in line
 
 
 def test_a_plan_that_misses_its_band_exceeds_the_error():

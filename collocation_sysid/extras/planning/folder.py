@@ -276,6 +276,8 @@ def _missed_lines(plan: MotionPlan) -> list[Shown]:
     )
     limits = listed([each.name for each in plan.binding_limits if each.gain_per_percent > 0])
     cause = f"limited by {limits}" if limits else "no limit of the hand binds"
+    possible = "a reference that the free coordinates, the end and the other references allow"
+    remedy = "wider limits" if limits else possible
     if plan.program.task.largest_error_m is not None:
         missed = [
             f"the largest error is {1e3 * plan.largest_error_m:.3g} mm, more than largest_error_m"
@@ -287,7 +289,7 @@ def _missed_lines(plan: MotionPlan) -> list[Shown]:
             for each in plan.program.references
             if (error := plan.tracking_error(each)).largest_m > error.accepted_m
         ]
-    return [Line(f"{each}; {cause}; expected {longer}wider limits", "check") for each in missed]
+    return [Line(f"{each}; {cause}; expected {longer}{remedy}", "check") for each in missed]
 
 
 def _limit_lines(plan: MotionPlan) -> list[Shown]:

@@ -248,9 +248,18 @@ class PlannedProgram:
         return program
 
     def require_start_within_limits(self) -> None:
-        """Raise an `InputError` if the body exceeds its limits before the motion, or a function of the
-        task cannot be evaluated there.
+        """Raise an `InputError` if the hand exceeds the limits of its joints before the motion, the body
+        its own, or a function of the task cannot be evaluated there.
         """
+        joints = np.array(self.hand_limits.names) == "joint_limits"
+        standing_c = np.zeros(self.space.size)
+        if (excess := self.hand_limits.shares(standing_c)[joints].max(initial=0.0) - 1) > 0:
+            raise InputError(
+                f"the hand exceeds them before the motion, by {excess:.2g}; expected values that are "
+                "not positive where the motion begins",
+                None,
+                where="hand.joint_limits",
+            )
         _, limits = self.path_costs, self.path_limits
         standing = np.tile(self.start, (len(self.grid_since_s), 1))
         if limits is not None and (excess := limits.evaluate(standing)[:, 0].max()) > 0:
