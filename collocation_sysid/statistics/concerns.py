@@ -156,7 +156,7 @@ TOPICS: dict[str, Topic] = {
         remedy="Fix such a parameter at a known value, give it a prior or wider bounds, or record a "
         "motion or a test that depends on it.",
         messages={
-            "bound": "{names} ended at a stated bound: widen the bound, or fix the parameter",
+            "bound": "{names} ended at a bound: widen the bound if you stated it, or fix the parameter",
             "default-bound": "{names} ended at a bound that the problem does not state: the best "
             "value may lie beyond it, and the other reasons may follow from this; state guess, "
             "lower and upper, or fix the parameter",

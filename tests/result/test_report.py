@@ -208,7 +208,7 @@ def test_concerns_name_their_remedy(run_folder: Path, tmp_path: Path):
     for topic in ("scheme", "information"):
         assert page.count(f'href="#cure-{topic}"') == page.count(f'id="cure-{topic}"') == 1
     assert "<code>collocation-sysid explain scheme</code>" in page
-    assert "mu_pa ended at a stated bound" in page
+    assert "mu_pa ended at a bound" in page
     assert "usable after checking the reasons below" in page
 
 
