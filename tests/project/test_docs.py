@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 import collocation_sysid as cs
 from collocation_sysid.problem.schema import SHAPES, ProblemFile
+from collocation_sysid.recording import experiment as experiments
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
@@ -46,7 +47,10 @@ def pages_with(language: str) -> list:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The shipped problems in a folder of their own, which is the working directory."""
+    """The shipped problems in a folder of their own, which is the working directory, and the air that
+    a reader of the pages has.
+    """
+    monkeypatch.setattr(experiments, "USUAL_KG_M3", experiments.AIR_KG_M3)
     shutil.copytree(ROOT / "problems", tmp_path / "problems")
     monkeypatch.chdir(tmp_path)
     return tmp_path
