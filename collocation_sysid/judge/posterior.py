@@ -604,6 +604,7 @@ class Posterior:
         by_shape = self._priors[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)
         sizes = self.effects.deviations
+        seen = np.maximum(1 - own, UNSEEN)  # change of the posterior by one of the data alone
         found = []
         for k, name in enumerate(self.fit.names[len(self.fit.names) - count :]):
             if predicted[k] < UNSEEN:
@@ -618,6 +619,7 @@ class Posterior:
                     float(np.sqrt(own[k]) * sizes[k]),
                     off / float(np.sqrt(predicted[k])),
                     self._alike(k),
+                    needed=float((self.effects.means[k] + off / seen[k]) * sizes[k]),
                 )
             )
         return tuple(sorted(found, key=lambda each: -abs(each.surprise)))

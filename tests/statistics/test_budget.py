@@ -322,10 +322,11 @@ def test_a_problem_file_states_with_one_word_that_all_is_exact(tmp_path):
         Problem.read(file, ['uncertainty.assumptions="exact"'])
 
 
-def test_the_sentence_of_an_effect_has_the_deviation_that_its_surprise_counts():
-    layer = EffectEstimate("grip_layer_m", 0.0, 2e-4, -4.3e-4, 1.9e-4, surprise=-4.0)
-    (concern,) = effect_concerns([layer])
-    need = (
-        "the residuals need a grip layer of -0.43 mm, where 0 ± 0.11 mm is expected: 4.0 standard"
-    )
+def test_the_sentence_of_an_effect_has_the_size_that_the_data_need():
+    """A clock is off by 3 ± 0.3 % in the data, and by 0 ± 0.01 % in the prior."""
+    variance = 1 / (1e-4**-2 + 3e-3**-2)
+    value, surprise = variance * 0.03 / 3e-3**2, 0.03 / np.hypot(1e-4, 3e-3)
+    rate = EffectEstimate("clock_rate", 0.0, 1e-4, value, variance**0.5, surprise, needed=0.03)
+    (concern,) = effect_concerns([rate])
+    need = "the residuals need a clock rate of 3 %, where 0 ± 0.3 % is expected: 10.0 standard"
     assert concern.message.startswith(need)

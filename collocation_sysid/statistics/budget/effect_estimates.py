@@ -39,6 +39,8 @@ class EffectEstimate:
     suffices: bool = (
         False  # whether the residuals are noise with this effect, of one beyond the budget
     )
+    # Estimate of the data alone: they hardly change the posterior of what they hardly show.
+    needed: float = np.nan
 
     @classmethod
     def beyond(cls, name: str, gain: float, suffices: bool) -> EffectEstimate:
@@ -48,23 +50,21 @@ class EffectEstimate:
         return cls(name, 0.0, 0.0, np.nan, np.nan, float(np.sqrt(gain)), suffices=suffices)
 
     def describe(self) -> str:
-        """Return name, estimate, and that of a true description as text; of an effect beyond the budget
-        the name alone.
+        """Return name, size that the data need, and that of a true description as text; of an effect
+        beyond the budget the name alone.
         """
         label = source_label(self.name)
         article = "an" if label[0] in "aeiou" else "a"
         if not self.deviation:
             return f"{article} {label}, of which the description has none"
         unit = effect_row(self.name).unit
-        expected = (self.value - self.mean) / self.surprise
-        value, mean, sigma = (
-            in_readable_unit(each, unit)[0] for each in (self.value, self.mean, expected)
+        expected = (self.needed - self.mean) / self.surprise
+        needed, mean, sigma = (
+            f"{float(f'{in_readable_unit(each, unit)[0]:.2g}'):g}"
+            for each in (self.needed, self.mean, expected)
         )
         shown = in_readable_unit(1.0, unit)[1]
-        return (
-            f"{article} {label} of {value:+.2g}{shown}, where {mean:.2g} ± {sigma:.2g}{shown} is "
-            "expected"
-        )
+        return f"{article} {label} of {needed}{shown}, where {mean} ± {sigma}{shown} is expected"
 
 
 @dataclass(frozen=True, eq=False)
