@@ -294,8 +294,7 @@ class _Refits:
         experiments = with_corrected(self.stated, corrected)
         try:
             changed = replace(collocation, experiments=experiments)
-            first = experiments[0]
-            if is_near or (first.is_static and first.specimen is None):
+            if is_near:
                 changed = changed.with_parameters(changed.parameters.with_estimates(self.answer))
             else:  # a large mistake makes all constants wrong: begin as a solve without guesses does
                 changed = start_problem(without_guesses(changed)).collocation

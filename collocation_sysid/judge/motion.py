@@ -57,18 +57,25 @@ def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
     for row in (*_slow_motions(experiment), *mirrored_meshes(experiment)):
         if found := row.hypothesis(experiment):
             yield UNMEASURED, found
+    others = []
+    for other_m_s2, data in other_gravity(experiment.gravity_m_s2):
+        without = replace(experiment, gravity_m_s2=other_m_s2)
+        others.append(Hypothesis("gravity", f"'{experiment.name}'", data=data, corrected=without))
+        # Modes do not contain what gravity along the body does.
+        if np.allclose(other_m_s2, -experiment.gravity_m_s2):
+            yield UNMEASURED, others[-1]
     rows = fit.part.transcription.nuisance.indices_of_rows(*BODY_ROWS)
     if np.abs(fit.part.phi[rows]).max(initial=0.0) < FAR:
         return
     stated = ModalComparison.from_experiment(experiment, fit.whole.parameters)
-    others = [*other_gravity(experiment.gravity_m_s2)]
     if stated is not None and others:
         motion = stated.declared
-        misfits_m = [stated.misfit_m(replace(motion, gravity_m_s2=each)) for each, _ in others]
-        nearest, data = others[int(np.argmin(misfits_m))]
-        without = replace(experiment, gravity_m_s2=nearest)
+        misfits_m = [
+            stated.misfit_m(replace(motion, gravity_m_s2=each.corrected.gravity_m_s2))
+            for each in others
+        ]
         share = (min(misfits_m) / stated.misfit_m(motion)) ** 2
-        yield share, Hypothesis("gravity", f"'{experiment.name}'", data=data, corrected=without)
+        yield share, others[int(np.argmin(misfits_m))]
 
 
 def _clock(fit: TestedFit) -> Iterator[Doubt]:
