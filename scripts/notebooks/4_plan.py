@@ -84,8 +84,8 @@ def measure(poses, t_s):
 # ## 4.2 Identify
 #
 # The hand swings the bar for one second. The model has the default damping law. All assumptions about
-# the description are declared exact, because the recording is simulated. The verdict finds that this is
-# wrong for the damping law, and names the right one; the plan is made with the wrong one nevertheless.
+# the description are declared exact, because the recording is simulated. The verdict finds residuals that
+# are not noise, but does not name the damping law; the plan is made with the wrong one.
 
 # %%
 t_s = 0.02 * np.arange(51)
