@@ -15,6 +15,7 @@ import pytest
 from kit.filmed import T_S, filming, swung, tracks_of, unknown_young
 from kit.problem_files import run_command
 from kit.silhouettes import (
+    POSE,
     SIZE_PX,
     TRUTH,
     bar,
@@ -27,6 +28,7 @@ from kit.silhouettes import (
     rasterised,
 )
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.common import array_files
@@ -156,6 +158,17 @@ def test_the_modulus_of_a_hanging_bar_follows_from_one_photograph(guess_pa: floa
     assert low < TRUTH["young_pa"] < high
     assert (high - low) / 2 < 0.1 * TRUTH["young_pa"]
     assert abs(estimate.value / TRUTH["young_pa"] - 1) < 0.05
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_contour_of_other_points_does_not_end_the_search(seed: int) -> None:
+    rng, pose = np.random.default_rng(seed), POSE.copy()
+    pose[:3, :3] @= Rotation.from_rotvec(np.deg2rad(rng.normal(size=3))).as_matrix()
+    pose[:3, 3] += 0.005 * rng.normal(size=3)
+    mask = rasterised(hanging_m(), camera(pose=pose))
+    solution = solved(outlines_of(mask, pose_sigma=cs.PoseSigma()), 1.6e5)
+    assert ENDED_BY_ASSOCIATION not in solution.notes
+    assert abs(solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.1
 
 
 @pytest.mark.parametrize(("moved_px", "grade"), [(0, "check"), (40, "doubtful")])

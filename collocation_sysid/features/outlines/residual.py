@@ -158,6 +158,7 @@ class OutlinePairs(ImageCorrespondences):
         if len(used) > most:
             used = used[np.linspace(0, len(used) - 1, most).astype(int)]
         place = slice(0, len(used))
+        into["weights"][k] = 0.0
         into["nodes"][k, place] = nodes[used]
         into["weights"][k, place] = points.weights[used]
         into["edges"][k, place] = edges[used]
@@ -230,6 +231,11 @@ class OutlinesResidual(CameraImagesResidual):
         at = ca.horzcat(*(part @ weights for part in ca.horzsplit(values, corners)))
         pixel = self.projected(self.known_errors(own[:count]), at, camera, edge[1])
         return ca.vertcat(ca.dot(outward, pixel - edge) - ca.sum1(own[count:]), 0, 0)
+
+    @property
+    def uncompared_count(self) -> int:
+        """Number of points that the outline could have, and does not have in its present shape."""
+        return int(np.sum(~self.correspondences.weights.any(axis=2)))
 
     @property
     def observable_sigmas(self) -> Array:
