@@ -33,6 +33,7 @@ from collocation_sysid import (
     Nuisance,
     Obstacle,
     Plane,
+    PointMass,
     PoseSequence,
     Problem,
     ReducedSpace,
@@ -609,3 +610,20 @@ def test_a_stiff_rod_without_a_guess_does_not_start_as_a_thin_cable():
     problem = Problem([seen], known | {"bending_n_m2": Unknown()})
     found = solve(problem).parameters["bending_n_m2"]
     assert found == pytest.approx(1.0, rel=0.02)
+
+
+def test_a_steel_wire_without_a_guess_is_simulated_at_the_stiffness_of_metals():
+    """At the moduli of soft bodies the equilibrium of the horizontal wire was not found."""
+    mesh = rod_mesh([[0, 0, 0], [0.7, 0, 0]], CrossSection.round(0.0015), 36, stations_m=[0.05])
+    body = Body(mesh, "rod", density_kg_m3=7850.0)
+    still = PoseSequence([0.0], np.zeros((1, 3)), [[0, 0, 0, 1.0]])
+    grasp = Grasp(np.flatnonzero(body.nodes_m[:, 0] < 0.051), still)
+    markers = Markers([0.0], np.zeros((1, 2, 3)), 5e-4, places_m=[[0.4, 0, 0], [0.7, 0, 0]])
+    tip = PointMass(np.flatnonzero(body.nodes_m[:, 0] > 0.699), 0.01)
+    hung = Experiment(
+        body, [0.0], [grasp], markers, kind="static", masses=[tip], air_density_kg_m3="none"
+    )
+    known = {"poisson": 0.3, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
+    seen = with_markers(hung, simulate(hung, known | {"young_pa": 2e11}).markers_m)
+    found = solve(Problem([seen], known | {"young_pa": Unknown()})).parameters["young_pa"]
+    assert found == pytest.approx(2e11, rel=0.02)

@@ -60,7 +60,8 @@ STEPS = 15
 LIMITS_PA = 1e13, 1.0
 # Typical Young's modulus of a soft body, where nothing is known [Pa].
 SOFT_PA = 1e4
-# Factors of the usual stiffnesses of a section, which are those of a cable.
+# Factors of the usual stiffnesses of a section, which are those of a cable, and of the first modulus
+# of the scan, at which a rod of metal collapses.
 RAISED = 1.0, 30.0, 900.0, 27e3
 # Tolerance of simulations that are only compared. Slender bodies do not move on from such errors.
 LOOSE = NewtonOptions(tolerance=1e-4)
@@ -284,14 +285,23 @@ def scan_stiffness(
 
 
 def _tried(trial: TrialSimulation) -> ScanState:
-    """Return the misfits from stiff to soft, continued beyond an end that fits best."""
+    """Return the misfits from stiff to soft, continued beyond an end that fits best. The scan begins
+    with a stiffer body if the first one cannot be simulated.
+    """
     trials = ScanState(trial)
     step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
     young_pa = [STIFFEST_PA * step**k for k in range(STEPS)]
     low, high = trial.bounds_pa
     within = [young for young in young_pa if low <= young <= high] or [math.sqrt(abs(low * high))]
+    raised = [within[0] * factor for factor in RAISED if within[0] * factor <= max(within[0], high)]
     with counted_phase(StepUnit.STIFFNESS, len(within)):
-        trials.try_sequence(within)
+        for first in raised:
+            trials.try_sequence([first])
+            if np.isfinite(trials.misfits[first]):
+                softer = (first * step**k for k in range(1, 2 * STEPS))
+                within = [first, *(young for young in softer if young >= within[-1])]
+                break
+        trials.try_sequence(within[1:])
     if trials.depends_on_stiffness and trials.is_best_at_end(softest=True):
         trials.extend_range(min(trials.misfits), step)
     if trials.is_best_at_end(softest=False):
