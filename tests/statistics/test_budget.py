@@ -328,5 +328,5 @@ def test_the_sentence_of_an_effect_has_the_size_that_the_data_need():
     value, surprise = variance * 0.03 / 3e-3**2, 0.03 / np.hypot(1e-4, 3e-3)
     rate = EffectEstimate("clock_rate", 0.0, 1e-4, value, variance**0.5, surprise, needed=0.03)
     (concern,) = effect_concerns([rate])
-    need = "the residuals need a clock rate of 3 %, where 0 ± 0.3 % is expected: 10.0 standard"
+    need = "the residuals need a clock rate of +3 %, where 0 ± 0.3 % is expected: 10.0 standard"
     assert concern.message.startswith(need)

@@ -60,11 +60,11 @@ class EffectEstimate:
         unit = effect_row(self.name).unit
         expected = (self.needed - self.mean) / self.surprise
         needed, mean, sigma = (
-            f"{float(f'{in_readable_unit(each, unit)[0]:.2g}'):g}"
+            float(f"{in_readable_unit(each, unit)[0]:.2g}")
             for each in (self.needed, self.mean, expected)
         )
         shown = in_readable_unit(1.0, unit)[1]
-        return f"{article} {label} of {needed}{shown}, where {mean} ± {sigma}{shown} is expected"
+        return f"{article} {label} of {needed:+g}{shown}, where {mean:g} ± {sigma:g}{shown} is expected"
 
 
 @dataclass(frozen=True, eq=False)
