@@ -79,7 +79,7 @@ POKING_FAULTS = {
     ),
 }
 PLATE_FAULTS = {
-    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ("obstacle-pull",)),
+    "obstacle: normal reversed": Fault(obstacles(reversed_normal), ()),
     "obstacle: friction 0 in place of 0.5": Fault(
         obstacles(lambda each: replace(each, friction=0.0)), ()
     ),

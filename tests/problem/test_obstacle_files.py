@@ -136,6 +136,13 @@ def test_two_obstacles_have_two_names():
         replace(cube, grasps=[held, ball, replace(plate, name="ball")])
 
 
+def test_a_plane_whose_normal_points_away_from_the_body_is_refused():
+    cube = pressed_cube(3)
+    held, ball, plate = cube.grasps
+    with pytest.raises(InputError, match="inside 'plate', by up to 100 mm; expected it outside"):
+        replace(cube, grasps=[held, ball, replace(plate, shape=cs.Plane((-1, 0, 0), (0, 0, 0)))])
+
+
 def test_a_body_keeps_its_nodes_and_mass_and_its_obstacles_come_last():
     cube = pressed_cube(3)
     plain = replace(cube, grasps=cube.body_grasps)
