@@ -35,7 +35,7 @@ BODY_ROWS = (TILT, GRASP_TURN, GRASP_SHIFT)
 SLOW_MOTIONS = (4.0, 8.0)
 # Change of a marker, in standard deviations of its noise, from which on it moves.
 BEYOND_NOISE = 10.0
-# Share of χ² that remains of which linear steps come before mirrored meshes.
+# Share of χ² that remains of which linear steps come before mistakes that have none.
 UNMEASURED = 0.9
 
 
@@ -49,8 +49,8 @@ def motion_rows(fit: TestedFit) -> Iterator[Doubt]:
 
 def motion_candidates(fit: TestedFit) -> Iterator[Candidate]:
     """Yield the likely mistakes of a motion without a linear step, by a criterion of their own:
-    sensors, mirrored meshes, films in slow motion, and the direction of gravity if the fit moved the body far
-    from its stated pose.
+    sensors, mirrored meshes, films in slow motion, gravity of the other sign, and any other direction
+    of gravity if the fit moved the body far from its stated pose.
     """
     experiment = fit.experiment
     yield from sensor_candidates(fit)

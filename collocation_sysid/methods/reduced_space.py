@@ -42,7 +42,7 @@ from .experiment_executors import ExperimentExecutor, LocalExecutor
 from .loss_curvature import require_second_derivatives
 from .reduced_search import ReducedSearch, SearchOptions
 from .solution import Solution, Status, Watch
-from .solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, status_of_end
+from .solve_recorder import SEARCH_ENDS, Recorder, SearchEnded, misfit_of, status_of_end
 from .starts.initial_trajectories import complete_variables, simulate_trajectories
 from .trajectory_sweeps import trajectory_positions
 
@@ -198,8 +198,7 @@ def _notes(collocation: Collocation, indefinite_steps: int, z: Array, status: St
             "at the solution: the body is near buckling, or the estimated damping is too large"
         )
     if status in (Status.CONVERGED, Status.STALLED):
-        squares = sum(part.loss for part in collocation.iterates(z))
-        misfit = float(np.sqrt(squares / max(1, collocation.measurement_count)))
+        misfit = misfit_of(collocation, sum(part.loss for part in collocation.iterates(z)))
         if misfit > MISFIT:
             size = f" ({1e3 * collocation.rms_marker_distance_m(z):.3g} mm rms)"
             measurements, noise_key = main_measurement(

@@ -861,19 +861,21 @@ class Experiment:
         names = [obstacle.name for obstacle in self.obstacles]
         if twice := [name for k, name in enumerate(names) if name in names[:k]]:
             raise InputError(f"two obstacles are called {twice[0]!r}; expected different names")
-        if self.start == "given":
+        if self.start == "given" or not names:
             return
         first_s = self.t_s[:1]
+        (turn,), (shift_m,) = self.rigid_motion(first_s)
+        points_m = self.body.nodes.points_m @ turn.T + shift_m
         for obstacle in self.obstacles:
-            rotations, places_m = obstacle.poses.at(first_s)
-            points_m = self.rigid_positions(first_s)[0, : len(self.body.nodes.points_m)]
-            gaps_m = obstacle.shape.signed_distances_m((points_m - places_m[0]) @ rotations[0])
-            deepest_m = -gaps_m.min()
-            if obstacle.is_active(first_s)[0] and gaps_m.max() < FLATNESS * deepest_m:
+            if not obstacle.is_active(first_s)[0]:
+                continue
+            (turn,), (shift_m,) = obstacle.poses.at(first_s)
+            gaps_m = obstacle.shape.signed_distances_m((points_m - shift_m) @ turn)
+            if gaps_m.max() < -FLATNESS * gaps_m.min():
                 raise InputError(
-                    f"the undeformed body lies inside {obstacle.name!r}, by up to {1e3 * deepest_m:.3g} "
-                    "mm; expected it outside: the normal of a plane points out of the solid, towards the "
-                    "body; check unit and place of the solid, too"
+                    f"the undeformed body lies inside {obstacle.name!r}, by up to "
+                    f"{-1e3 * gaps_m.min():.3g} mm; expected it outside: the normal of a plane points out "
+                    "of the solid, towards the body; check unit and place of the solid, too"
                 )
 
     def _check_actuators(self) -> None:

@@ -14,6 +14,7 @@ from ..features.specimens.concerns import as_specimen_concerns
 from ..fem.schemes import as_scheme
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
+from ..methods.solve_recorder import misfit_of
 from ..problem import Problem
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
@@ -99,8 +100,7 @@ def solution_concerns(
         yield Concern("solve/acceptable")
     if ENDED_BY_ASSOCIATION in solution.notes:
         # The posterior takes a linear step further, which may explain what the fit does not.
-        squares = sum(part.loss for part in solution.parts)
-        misfit = np.sqrt(squares / max(1, solution.collocation.measurement_count))
+        misfit = misfit_of(solution.collocation, sum(part.loss for part in solution.parts))
         yield Concern("solve/jump", "doubtful" if misfit > GROSS_MISFIT else "check")
     transcriptions = solution.collocation.transcriptions
     fitted_experiments = [each.experiment for each in transcriptions]

@@ -139,8 +139,12 @@ def test_two_obstacles_have_two_names():
 def test_a_plane_whose_normal_points_away_from_the_body_is_refused():
     cube = pressed_cube(3)
     held, ball, plate = cube.grasps
+    behind = replace(plate, shape=cs.Plane((-1, 0, 0), (0, 0, 0)))
     with pytest.raises(InputError, match="inside 'plate', by up to 100 mm; expected it outside"):
-        replace(cube, grasps=[held, ball, replace(plate, shape=cs.Plane((-1, 0, 0), (0, 0, 0)))])
+        replace(cube, grasps=[held, ball, behind])
+    # Where it is before it acts does not matter, and need not be known.
+    later = cs.PoseSequence(cube.t_s[1:], np.zeros((3, 3)), np.tile([0, 0, 0, 1.0], (3, 1)))
+    replace(cube, grasps=[held, ball, replace(behind, poses=later, from_s=cube.t_s[1])])
 
 
 def test_a_body_keeps_its_nodes_and_mass_and_its_obstacles_come_last():

@@ -254,13 +254,12 @@ class _Stepper:
         """Return the initial state, with accelerations in balance with the forces."""
         time_s = float(self.experiment.t_s[0])
         solver = self._solver(time_s)
-        x, v = initial_state(self.experiment, self.forces(time_s), solver)
-        previous_histories = start_states(
-            self.forces(time_s), x, v=v, loaded_s=self.experiment.loaded_since_s
-        )
+        forces = self.forces(time_s)
+        x, v = initial_state(self.experiment, forces, solver)
+        previous_histories = start_states(forces, x, v=v, loaded_s=self.experiment.loaded_since_s)
         state = _State(time_s, x, v=v, a=np.zeros_like(x), previous_histories=previous_histories)
-        if self.forces(time_s).has_local_forces:
-            state = replace(state, local_n=self._local_n(self.forces(time_s), x, v))
+        if forces.has_local_forces:
+            state = replace(state, local_n=self._local_n(forces, x, v))
         return self._balanced(state, time_s, dofs=solver.free)
 
     def advance(self, state: _State, target_s: float, loads: _Loads) -> _State:
