@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-FOLDERS = [HERE / name for name in ("data", "studies", "benchmarks", "tools")]
+FOLDERS = [HERE / name for name in ("corpus", "data", "studies", "benchmarks", "tools")]
 
 
 def main() -> None:

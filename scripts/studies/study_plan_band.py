@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 from assumed_twins import with_wrong_assumptions
+from effect_twins import DRAWN, at_places, displaced, drawn_errors, tilted_gravity
 from numpy.typing import NDArray
 from script_arguments import make_parser
 from studies import markdown, number
-from study_effects import DRAWN, drawn_errors
-from study_faults import at_places, displaced, tilted_gravity
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError

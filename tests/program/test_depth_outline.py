@@ -234,7 +234,7 @@ def test_starts_are_the_best_stiffness_its_neighbours_and_other_minima():
 @pytest.mark.long
 def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     """Its scan is best at 13.9 kPa, from where a search without outlines ends at 16 kPa, not 25."""
-    from study_depth import SOFT_TRUTH, soft_problem  # pyright: ignore[reportMissingImports]
+    from depth_twins import SOFT_TRUTH, soft_problem  # pyright: ignore[reportMissingImports]
 
     solution = cs.solve(soft_problem(0))
     known = cs.solve(soft_problem(0, SOFT_TRUTH["young_pa"]))
@@ -249,7 +249,7 @@ def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
 def test_points_left_out_beside_creases_do_not_end_the_search():
     """From 35 kPa, where they are still compared; their loss once the shape settles is no loss of
     visible points."""
-    from study_depth import soft_problem  # pyright: ignore[reportMissingImports]
+    from depth_twins import soft_problem  # pyright: ignore[reportMissingImports]
 
     above = cs.solve(soft_problem(1, 3.5e4))
     below = cs.solve(soft_problem(1, 1.8e4))

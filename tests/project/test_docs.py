@@ -91,18 +91,6 @@ def test_commands_of_a_page_run(page: Path, checkout: Path):
             assert said == [each for each in said if each in outcome.out], outcome.out
 
 
-def test_pages_agree_on_how_often_the_verdict_is_right():
-    pages = [
-        ROOT / name
-        for name in ("README.md", "docs/howto/trust.md", "docs/studies/verdict_reliability.md")
-    ]
-    counts = [
-        re.search(r"(\d+) (?:faultless|correct simulated).*?none of (\d+)", each.read_text(), re.S)
-        for each in pages
-    ]
-    assert [found and found.groups() for found in counts] == [("200", "207")] * 3
-
-
 def in_a_problem(code: str) -> dict[str, Any]:
     """A problem that is valid but for the tables of a block, which take the place of its own."""
     whole, block = tomllib.loads(PROBLEM + EXPERIMENT), tomllib.loads(code)

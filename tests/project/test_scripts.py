@@ -17,15 +17,9 @@ FILES = [file for file in sorted(SCRIPTS.glob("*/*.py")) if file.parent.name != 
 # Command lines without the ending of the script's name.
 COMMANDS = (
     "study_contact --parts poked --twins 2",
-    "study_effects --twins 1",
-    "study_faults --twins 2 --only none",
-    "study_hidden_errors --twins 1 --only none",
     "study_interruptions --solves 4",
     "study_starts --methods --starts 1 --factor 2",
-    "study_mistakes --groups tracks --only wxyz --seeds 1",
-    "study_mistakes --groups video --only turned --seeds 1 --check-only",
     "study_starts --starts 1 --bodies cylinder",
-    "study_trust --twins 1 --faulty 1 --only none",
     "benchmark_jacobian --repeats 1",
     "benchmark_shipped foam_cylinder",
 )

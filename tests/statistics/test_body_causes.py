@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hidden_twins import TRUTH, twin
 from kit.problems import GUESS, hung_cube, measured
 from scipy.signal import butter, sosfiltfilt
-from study_hidden_errors import TRUTH, twin
 
 from collocation_sysid import Problem, Unknown
 from collocation_sysid.fem.laws.materials import MATERIALS

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hidden_twins import unplaced
 from kit.depth import looking
 from kit.falling import DURATION_S, FREE, TRUTH, TWIN_HZ, falling_block, noise_of
 from kit.filmed import (
@@ -34,7 +35,6 @@ from kit.filmed import TRUTH as FILMED
 from kit.problems import hung_cube, measured
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from study_hidden_errors import unplaced
 
 import collocation_sysid as cs
 

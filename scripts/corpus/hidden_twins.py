@@ -1,37 +1,23 @@
-"""Errors of the description that the residuals do not show: bias of E, intervals and verdicts.
+"""Errors of the description that residuals show badly or not at all, in twins of a foam block and of
+a bent bar.
 
 A block of foam is moved at random, as in `twins`. Its tracks are simulated with an effect that the
-described body does not have, or with another body, and are fitted with all options at their
-default. The estimated parameters absorb such errors, so that the residuals look like noise. Errors
-of a camera are made in the problems of `filmed_twins` with unknown places. The table has the
-smallest and the largest estimated E over the true one, how many combined intervals contain the true
-E, in how many twins all intervals contain the true constants, the verdicts, how many twins are rated
-"good" with a constant outside its interval, the beginnings of the first reasons, and the mean CPU
-time of a solve.
-
-    python scripts study_hidden_errors [--twins 5] [--only markers memory]
+described body does not have, or with another body. The estimated parameters absorb such errors, so
+that the residuals look like noise. The bent bar differs from its mirror images.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import filmed_twins
 import numpy as np
-import record
 from assumed_twins import anisotropic_law
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
-from script_arguments import make_parser
-from study_independent_twins import compare
 from twins import random_poses
-from wrong_twins import FAULTS, Fault
-from wrong_videos import VIDEO_FAULTS, matrices, with_focal_lengths_times
+from wrong_twins import FAULTS
 
 import collocation_sysid as cs
 from collocation_sysid.statistics.budget.systematic_effects import KnownEffect
@@ -450,24 +436,6 @@ ERRORS: dict[str, tuple[str, Callable[[int], HiddenError]]] = {
     "skin": ("the same, outer layer of 30 % of the stiffness", with_soft_skin),
     "creep": ("the same, moved slowly, memory: share 0.3, 2 s", creeping),
 }
-FILMED: dict[str, tuple[str, Fault]] = {
-    "mirrored-video": ("video mirrored", VIDEO_FAULTS["video: mirrored"]),
-    "zoom": (
-        "video with 1.3 times the focal length",
-        Fault(matrices(with_focal_lengths_times(1.3)), ()),
-    ),
-}
-# Right causes of those errors that have one.
-RIGHT = {
-    "mirrored": "mesh-mirrored",
-    "hanging": "rest-shape",
-    "filtered": "tracks-filtered",
-    "twice": "markers-same",
-    "law": "law",
-    "quaternions": "quaternion-order",
-}
-# Characters of a first reason that the table shows.
-REASON_LENGTH = 60
 
 
 def twin(name: str, seed: int, parameters: Mapping[str, cs.Unknown] = UNKNOWN) -> cs.Problem:
@@ -489,61 +457,3 @@ def twin(name: str, seed: int, parameters: Mapping[str, cs.Unknown] = UNKNOWN) -
         TRUTH | unknown,
         uncertainty=cs.UncertaintyOptions(assumptions=error.assumptions),
     )
-
-
-def fit(name: str, seed: int) -> dict[str, Any]:
-    """Make a twin with an error, a key of `ERRORS` or `FILMED`, and identify it."""
-    if name in FILMED:
-        filmed = filmed_twins.filmed_twin(seed, are_places_known=False)
-        make = partial(FILMED[name][1], filmed, np.random.default_rng(seed))
-        unknown = filmed_twins.UNKNOWN
-        names = [key for key, value in unknown.items() if isinstance(value, cs.Unknown)]
-        return compare(make, filmed_twins.TRUTH, seed, names)
-    return compare(partial(twin, name, seed), TRUTH, seed, ERRORS[name][1](seed).unknown)
-
-
-def main() -> None:
-    """Run the study with the options of the command line, and print its table."""
-    parser = make_parser(__doc__)
-    parser.add_argument("--twins", type=int, default=5, help="of each error")
-    errors = {name: text for name, (text, _) in (*ERRORS.items(), *FILMED.items())}
-    parser.add_argument("--only", nargs="+", choices=tuple(errors), default=tuple(errors))
-    parser.add_argument("--json", type=Path, help="file of results for the record of codes")
-    options = parser.parse_args()
-    print(
-        "| error | E over the true E | E inside | all inside | verdicts | good, one outside "
-        "| first reasons | CPU s |"
-    )
-    print("|---|---|---|---|---|---|---|---|")
-    for name in options.only:
-        answers = [fit(name, seed) for seed in range(options.twins)]
-        print(row(errors[name], answers), flush=True)
-        for answer in answers if options.json else ():
-            right = [RIGHT[name]] if name in RIGHT else []
-            record.append(options.json, f"bar: {name}", right, answer["named"])
-
-
-def row(text: str, answers: Sequence[Mapping[str, Any]]) -> str:
-    """Return the row of an error for the answers to its twins."""
-    verdicts = Counter(answer["verdict"] for answer in answers)
-    reasons = Counter(a["reasons"][0][:REASON_LENGTH] for a in answers if a["reasons"])
-    solved = [answer for answer in answers if answer["constants"]]
-    is_inside = [all(c["inside"] for c in a["constants"].values()) for a in solved]
-    modulus = [answer["constants"]["young_pa"] for answer in solved]
-    ratios = [each["value"] / each["true"] for each in modulus]
-    outside = [a for a, inside in zip(solved, is_inside, strict=True) if not inside]
-    cells = (
-        text,
-        f"{min(ratios):.2f} to {max(ratios):.2f}" if ratios else "–",
-        f"{sum(each['inside'] for each in modulus)} of {len(solved)}",
-        f"{sum(is_inside)} of {len(solved)}",
-        ", ".join(f"{n} {verdict}" for verdict, n in verdicts.items()),
-        str(sum(answer["verdict"] == "good" for answer in outside)),
-        ", ".join(f"{n} {reason}" for reason, n in reasons.items()),
-        f"{np.mean([answer['solve_cpu_s'] for answer in solved]):.0f}" if solved else "–",
-    )
-    return "| " + " | ".join(cells) + " |"
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,9 @@
-"""Twins of the example of a cable: are the true constants inside the intervals?
+"""Twins of the example of a cable.
 
 Each twin is simulated with twice as many sections as the example, and deviates from its description
 by draws from the priors of the budget: mass (1 %), end of the clamp (0.5 mm), stiffness along the
 cable (5 %), direction of gravity (1°), turn and shift in the grasp (0.5° and 1 mm), clocks of markers
 and wrench (5 ms), scale of the cameras (0.2 %), tares (0.1 N and 0.01 N m), and noise.
-
-    python scripts study_cable_twins FOLDER
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from script_arguments import make_parser
 
 import collocation_sysid as cs
 from collocation_sysid.problem.new import TEMPLATES
@@ -75,34 +72,3 @@ def write_twin(folder: Path, seed: int) -> None:
     write_columns_csv(
         folder / "wrench.csv", {"t_s": t_s, **dict(zip(names, wrench.T, strict=True))}
     )
-
-
-def main() -> None:
-    """Print the error of each estimate, in standard errors, and how many intervals contain the truth;
-    answers that are called doubtful do not count.
-    """
-    parser = make_parser(__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--twins", type=int, default=20)
-    arguments = parser.parse_args()
-    inside, deviations = [], []
-    for seed in range(arguments.twins):
-        folder = arguments.folder / f"twin_{seed}"
-        write_twin(folder, seed)
-        run = cs.run(cs.Problem.read(folder / "problem.toml"))
-        cells, row, errors = [], [], []
-        for name, true in TRUTH.items():
-            low, high = run.interval(name)
-            row.append(low <= true <= high)
-            errors.append(3.92 * np.log(run.parameters[name] / true) / np.log(high / low))
-            cells.append(f"{run.parameters[name]:.5g} ({low:.5g} to {high:.5g}), {errors[-1]:+.2f}")
-        print(f"| {seed} | {' | '.join(cells)} | {run.trust.verdict} |", flush=True)
-        if run.trust.verdict != "doubtful":
-            inside.append(row)
-            deviations.append(errors)
-    print(f"{len(inside)} of {arguments.twins} are not doubtful; inside:", np.sum(inside, axis=0))
-    print("RMS of errors over standard errors", np.sqrt(np.mean(np.square(deviations), axis=0)))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,45 +1,25 @@
-"""Verdicts and combined intervals for twins in which every effect of the budget is drawn at once.
+"""Twins of a bar in which every effect of the budget is drawn at once.
 
-The bars, motions and constants are those of `study_independent_twins`. All default assumptions and
-all default nuisance parameters of a recording with markers are wrong by random numbers with their
-default standard deviations; only the damping law is the stated one, because γ_r and γ_m are
-constants of this law. The data are simulated with three tet10 elements across the thickness and with
-shorter time steps than the fit has, and extrapolated to infinitely small ones, so that the fit has
-errors of mesh and time steps too. It has tet10 elements, two across the thickness (225 nodes), 60
-samples, stated places of the markers and no guesses.
-
-Answers are appended to a file with one line of JSON per twin; twins that the file has are not solved
-again.
-
-    python scripts study_effects [--twins 100] [--first 0] [--divisions 2 2 4] [--file effects.jsonl]
+The bars, motions and constants are those of `bar_twins`. All default assumptions and all default
+nuisance parameters of a recording with markers are wrong by random numbers with their default
+standard deviations; only the damping law is the stated one, because γ_r and γ_m are constants of
+this law. The data are simulated with three tet10 elements across the thickness and with shorter time
+steps than the fit has, and extrapolated to infinitely small ones, so that the fit has errors of mesh
+and time steps too. Places of the markers are stated, and there are no guesses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
-from pathlib import Path
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from assumed_twins import SCHEME, with_wrong_assumptions
+from bar_twins import CONSTANTS, LENGTH_M, SAMPLE_S, Twin, draw, hand, mesh_of, section_m
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from script_arguments import make_parser
-from study_faults import at_places, displaced, tilted_gravity
-from study_independent_twins import (
-    CONSTANTS,
-    LENGTH_M,
-    SAMPLE_S,
-    Twin,
-    answer_all,
-    compare,
-    draw,
-    hand,
-    mesh_of,
-    section_m,
-)
+from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
@@ -69,34 +49,16 @@ DRAWN = (
 )
 
 
-def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("--twins", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument(
-        "--divisions", type=int, nargs=3, default=(2, 2, 4), help="boxes of the fit"
-    )
-    parser.add_argument("--file", type=Path, default=Path("effects.jsonl"))
-    arguments = parser.parse_args()
-    seeds = range(arguments.first, arguments.first + arguments.twins)
-    answer_all(arguments.file, seeds, partial(answer, divisions=tuple(arguments.divisions)))
-
-
-def answer(seed: int, divisions: Divisions) -> dict[str, Any]:
-    """Draw a twin, solve it, and compare the answer with the truth."""
-    twin = draw(seed, exact=True)
-    truth = constants(twin)
-    rng = np.random.default_rng((seed, 1))
-    return compare(partial(problem, twin, divisions, rng), truth, seed)
-
-
 def constants(twin: Twin) -> dict[str, float]:
     """Return the true E, ν, γ_r and γ_m."""
     return {name: twin.truth[name] for name in CONSTANTS}
 
 
-def problem(twin: Twin, divisions: Divisions, rng: np.random.Generator) -> cs.Problem:
-    """Return the problem of a recording with errors that are drawn."""
+def problem(seed: int, divisions: Divisions) -> cs.Problem:
+    """Return the problem of a recording with errors that are drawn; so many boxes are those of its
+    mesh.
+    """
+    twin, rng = draw(seed, exact=True), np.random.default_rng((seed, 1))
     stated = recording(twin, divisions, samples=SAMPLES, step_s=SAMPLE_S)
     tracks_m: Array | None = None
     while tracks_m is None:
@@ -187,9 +149,31 @@ def drawn_errors(names: Sequence[str], body: cs.Body, rng: np.random.Generator) 
     return errors
 
 
+def tilted_gravity(experiment: cs.Experiment, rng: np.random.Generator) -> cs.Experiment:
+    """Return the experiment with gravity tilted by random angles of about 1° about x and y."""
+    down = np.array([*np.radians(rng.standard_normal(2)), -1.0])
+    gravity_m_s2 = 9.81 * down / np.linalg.norm(down)
+    return replace(experiment, gravity_m_s2=tuple(gravity_m_s2.tolist()))
+
+
+def displaced(
+    experiment: cs.Experiment, size_m: float, size_rad: float, rng: np.random.Generator
+) -> cs.Experiment:
+    """Return the experiment with the body displaced in the gripper by random errors per axis."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(size_rad * rng.standard_normal(3)).as_matrix()
+    matrix[:3, 3] = size_m * rng.standard_normal(3)
+    (grasp,) = experiment.grasps
+    return replace(experiment, grasps=(cs.Grasp(grasp.nodes, grasp.poses.after(matrix)),))
+
+
+def at_places(experiment: cs.Experiment, places_m: Array) -> cs.Experiment:
+    """Return the experiment with markers at other positions (M, 3) on the body [m]."""
+    markers = replace(
+        experiment.markers, placement=None, located=None, places_m=places_m, attach="embedded"
+    )
+    return replace(experiment, markers=markers)
+
+
 def _size(deviation: float | None) -> float:
     return deviation or 0.0
-
-
-if __name__ == "__main__":
-    main()

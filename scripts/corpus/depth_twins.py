@@ -159,3 +159,89 @@ def _pose_with_error(rng: np.random.Generator) -> Array:
     described_pose[:3, :3] = turn @ pose[:3, :3]
     described_pose[:3, 3] = turn @ (pose[:3, 3] - TARGET_M) + TARGET_M + shift_m
     return described_pose
+
+
+# A soft bar, whose stated camera is far off ------------------------------------------------------------
+
+SOFT_TRUTH = {"young_pa": 2.5e4, "poisson": 0.45, "gamma_r_s": 1e-3, "gamma_m_1_s": 0.1}
+# Camera matrix and image shape (rows, columns) [px].
+SOFT_MATRIX = [[420.0, 0, 160], [0, 420.0, 120], [0, 0, 1]]
+SOFT_SHAPE_PX = (240, 320)
+# Point of the bar at which the camera looks [m], direction from there to the camera, and distance.
+SOFT_CENTRE_M = np.array([0.045, 0.015, -0.04])
+SOFT_VIEW_DIRECTION = np.array([0, -0.9, 0.35])
+SOFT_DISTANCE_M = 0.4
+# Standard deviation of the noise along the rays [m].
+SOFT_NOISE_M = 4e-4
+# Errors of the stated pose: rotation and shift, in random directions.
+SOFT_TURN_RAD = np.radians(2.7)
+SOFT_SHIFT_M = 0.008
+# Standard deviations of the true pose of the camera between images.
+TRUE_TURN_RAD = np.radians(1.0)
+TRUE_SHIFT_M = 0.003
+# Number of parts of each edge of a face for the rendered images; with 4 parts, chords in place of
+# arcs would make E 1.5 % too large.
+SOFT_DIVISIONS = 12
+
+
+@cache
+def soft_body() -> Body:
+    """Return the soft bar, which has a finer mesh; cached."""
+    mesh = box_mesh((0.12, 0.03, 0.02), (6, 2, 1))
+    return Body(mesh, density_kg_m3=1070.0, element="tet10")
+
+
+def soft_experiment(depth: Depth) -> Experiment:
+    """Return the experiment of the soft bar with the default nuisance parameters."""
+    body = soft_body()
+    clamp = Grasp(np.flatnonzero(body.nodes_m[:, 0] < 1e-9), PoseSequence.fixed())
+    return Experiment(body, [0.0], [clamp], kind="static", depths=[depth])
+
+
+def soft_camera(turn_rad: Array, shift_m: Array) -> DepthCamera:
+    """Return the camera of the soft bar, rotated about a point of the bar and shifted [rad, m]."""
+    optical_axis = -SOFT_VIEW_DIRECTION / np.linalg.norm(SOFT_VIEW_DIRECTION)
+    pose = upright_pose(SOFT_CENTRE_M - SOFT_DISTANCE_M * optical_axis, optical_axis)
+    rotation = Rotation.from_rotvec(turn_rad).as_matrix()
+    pose[:3, :3] = rotation @ pose[:3, :3]
+    pose[:3, 3] = rotation @ (pose[:3, 3] - SOFT_CENTRE_M) + SOFT_CENTRE_M + shift_m
+    return DepthCamera(SOFT_MATRIX, pose=pose)
+
+
+@cache
+def soft_shape_m() -> Array:
+    """Return the positions (n, 3) of the nodes of the hanging soft bar [m]; cached."""
+    no_points = Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
+    return simulate(soft_experiment(no_points), SOFT_TRUTH).positions_m[0]
+
+
+def soft_image_m(true_camera: DepthCamera) -> Array:
+    """Return the image of the soft bar without noise [m]; NaN where the bar is not visible."""
+    no_points = Depth("none", [0.0], [np.zeros((1, 3))], 1e-3)
+    surface = VisibleSurface.from_body(soft_body(), no_points)
+    rotations, translations = true_camera.pose_at([0.0])
+    triangles_m = surface.subdivided_triangles(soft_shape_m()[surface.nodes], SOFT_DIVISIONS)
+    return depth_image(true_camera, SOFT_SHAPE_PX, (triangles_m - translations[0]) @ rotations[0])
+
+
+def soft_problem(seed: int, guess_pa: float | None = None) -> Problem:
+    """Return the problem of one noisy image of the soft bar.
+
+    The true pose of the camera differs between seeds, so that the rounding of edges to pixels
+    differs between images; so does the error of the stated pose. Without `guess_pa`, E has no
+    guess.
+    """
+    rng = np.random.default_rng(seed)
+    noise_m = SOFT_NOISE_M * rng.normal(size=SOFT_SHAPE_PX)
+    rotation_axis, direction = rng.normal(size=(2, 3))
+    turn_rad = TRUE_TURN_RAD * rng.normal(size=3)
+    shift_m = TRUE_SHIFT_M * rng.normal(size=3)
+    image_m = soft_image_m(soft_camera(turn_rad, shift_m)) + noise_m
+    camera = soft_camera(
+        turn_rad + SOFT_TURN_RAD * rotation_axis / np.linalg.norm(rotation_axis),
+        shift_m + SOFT_SHIFT_M * direction / np.linalg.norm(direction),
+    )
+    depth = Depth.of_images("front", image_m, camera, SOFT_NOISE_M, spacing_m=0.004)
+    unknown = Unknown() if guess_pa is None else Unknown(guess_pa)
+    parameters = Parameters.from_mapping({**SOFT_TRUTH, "young_pa": unknown})
+    return Problem([soft_experiment(depth)], parameters)
