@@ -9,7 +9,7 @@ ALONE := COLLOCATION_SYSID_THREADS=1 OMP_NUM_THREADS=1
 
 TRIED := build/tried
 
-.PHONY: help solve test test-quick test-long test-dependencies check bench docs dist clean
+.PHONY: help solve test test-quick test-long test-dependencies corpus check bench docs dist clean
 
 help: ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-17s %s\n", $$1, $$2 }' Makefile
@@ -38,6 +38,9 @@ test-dependencies: ## run the tests with the lowest dependencies, and with the n
 	    -c build/$$which.txt -e '.[test]' && \
 	  $(ALONE) build/$$which/bin/python -m pytest -n auto --dist loadfile || exit 1; \
 	done
+
+corpus: $(DEV) ## solve the recordings with known truth; CORPUS has the options of the script
+	@$(BIN)/python scripts corpus $(CORPUS)
 
 check: $(DEV) ## lint, formatting and types
 	@$(BIN)/ruff check

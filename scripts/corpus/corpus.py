@@ -189,7 +189,9 @@ def is_wrong(row: Row) -> bool:
     code = row["reason"]
     if not code or OPEN.match(code):
         return False
-    subject = re.split(r"[;:(,]", row["message"].removeprefix("likely: "))[0]
+    # Without the name of the recording, and without what else the message mentions.
+    stated = re.sub(r"^(likely: )?((?!the )[^:;]*: )?", "", row["message"])
+    subject = re.split(r"[;:(]", stated)[0]
     return not any(re.search(each, f"{code} {subject}", re.I) for each in row["causes"])
 
 

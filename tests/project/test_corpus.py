@@ -60,7 +60,7 @@ def row(name="a", value=1.0, low=0.8, high=1.2, **more):
         ("residuals/persist", "the residuals are not noise", [], False),
         ("effect/surprising", "the residuals need buoyancy of +30: state it", ["grasp"], True),
         ("effect/surprising", "the residuals need a turn in the grasp: widen", ["grasp"], False),
-        ("nuisance/far", "time shift is 5 deviations: check grasp", ["grasp"], True),
+        ("nuisance/far", "swing: time shift is 5 deviations: check grasp", ["grasp"], True),
         ("description/gravity", "likely: gravity along z", ["gravity"], False),
     ],
 )
