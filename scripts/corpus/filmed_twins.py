@@ -66,7 +66,7 @@ def true_pixels(name: str) -> Array:
     places = PLACES_M[name]
     names = [f"{name}_{k}" for k in range(len(places))]
     seen = cs.ImageTracks(name, camera(name), T_S, None, names, places_m=places)
-    simulated = cs.simulate(recording([seen]), TRUTH, "midpoint", substeps=1)
+    simulated = cs.simulate(recording([seen]), TRUTH, "midpoint", substeps=32)
     return simulated.custom_sensor_values[0].reshape(len(T_S), -1, 2)
 
 
