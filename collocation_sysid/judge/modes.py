@@ -363,7 +363,8 @@ def _pose_rows(declared: DeclaredMotion) -> Iterator[Doubt]:
     for order, turn in (("wxyz", -1), ("xyzw", 1)):
         reordered = Rotation.from_quat(np.roll(quaternions, turn, axis=1)).as_matrix()
         without = replace(poses, rotations=reordered).with_first_motion()
-        yield Doubt.whole("quaternion-order", without, order=order)
+        columns = ", ".join(f"q{axis}" for axis in order)
+        yield Doubt.whole("quaternion-order", without, order=order, columns=columns)
 
 
 def _unit_rows(declared: DeclaredMotion, what: str, who: str, section: str) -> Iterator[Doubt]:

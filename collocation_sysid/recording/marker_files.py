@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,9 @@ from .sources.units import METRES_PER_UNIT, require_length_unit
 
 # A frame rate and a column of times agree within this part.
 _RATE_TOLERANCE = 0.01
+# Labels of points that no marker of the motion-capture system's model was assigned to: "*12" of
+# Vicon, "Unlabeled 7" of Motive, or none, behind the name of a subject.
+_UNLABELLED = re.compile(r"(.*:)?(\*\d*|unlabell?ed.*)|", re.IGNORECASE)
 # What the first line begins with.
 _TEXT_FORMATS = {
     trc.BEGINNING: trc.read,
@@ -81,20 +84,22 @@ def read_markers(
 
     Known are C3D (with the extra ``collocation-sysid[c3d]``), TRC, Qualisys TSV, Motive CSV, Vicon
     Nexus CSV, and plain CSV, wide (t_s, <name>_x, <name>_y, <name>_z …, in metres, and optionally
-    <name>_sigma, the standard deviation of each sample) or long (t_s, marker, x_m, y_m, z_m). A
+    <name>_sigma, the standard deviation of each sample) or long (t_s, marker, x_m, y_m, z_m).
+    Without a column of times, frame 1 is at 0 s, or frame 0 if the file begins with it. A
     blank cell or NaN is a missing sample; in motion-capture formats, though not in plain CSV, so is
     one at exactly (0, 0, 0).
 
     Parameters
     ----------
     names : sequence of str, optional
-        Markers to take, in this order; by default all, in the file's order.
+        Markers to take, in this order; by default all, in the file's order, except unlabelled ones
+        that are not in `labels`.
     labels : mapping of str to str, optional
         From labels in the file to names here; other markers keep their labels as names.
     length_unit : {"m", "cm", "mm", "in"}, optional
         Unit of the coordinates, where the file does not state it.
     rate_hz : float, optional
-        Frame rate, where the file states neither it nor times; the first frame is then at 0 s.
+        Frame rate, where the file states neither it nor times.
 
     Raises
     ------
@@ -107,16 +112,17 @@ def read_markers(
     if rate_hz is not None and not 0 < rate_hz < np.inf:
         raise InputError(f"rate_hz is {rate_hz:g}; expected a rate above 0")
     labels = dict(labels or {})
-    raw = _read_tracks(path, _label_chooser(names, labels))
+    notes: list[str] = []
+    raw = _read_tracks(path, _label_chooser(names, labels, notes))
     metres = METRES_PER_UNIT[_length_unit(raw, length_unit)]
     t_s = _times_s(raw, rate_hz)
     used_names = [labels.get(label, label) for label in raw.labels]
-    coordinates, notes = _mark_missing(raw, used_names)
+    coordinates, losses = _mark_missing(raw, used_names)
     return MarkerTable(
         t_s,
         tuple(used_names),
         positions_m=coordinates * metres,
-        notes=(*raw.notes, *notes),
+        notes=(*raw.notes, *notes, *losses),
         sigma_m=None if raw.sigmas is None else raw.sigmas * metres,
     )
 
@@ -135,31 +141,40 @@ def _read_tracks(path: str | Path, choose: LabelChooser) -> RawTracks:
     return plain_csv.read(as_table(source), choose)
 
 
-def _label_chooser(names: Sequence[str] | None, renamed: Mapping[str, str]) -> LabelChooser:
-    """Excluded labels, such as unlabelled markers, are picked only if renamed or requested."""
+def _label_chooser(
+    names: Sequence[str] | None, renamed: Mapping[str, str], notes: list[str]
+) -> LabelChooser:
+    """Unlabelled markers are picked only if renamed or requested; a note is added otherwise."""
 
-    def choose(labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
-        _require_distinct(labels, "two markers are labelled")
+    def choose(labels: Sequence[str]) -> list[int]:
+        requested = {*renamed, *(names or ())}
+        unlabelled = [
+            label for label in labels if _UNLABELLED.fullmatch(label) and label not in requested
+        ]
+        places = [k for k, label in enumerate(labels) if label not in unlabelled]
+        _require_distinct([labels[k] for k in places], "two markers are labelled")
         for label in renamed:
             _require_one_of(label, labels, what="label")
-        known = [renamed.get(label, label) for label in labels]
+        known = [renamed.get(labels[k], labels[k]) for k in places]
         _require_distinct(known, "after renaming two markers are named")
         if names is None:
-            chosen = [
-                k for k, label in enumerate(labels) if label not in excluded or label in renamed
-            ]
             if not labels:
                 raise InputError("the file contains no markers; expected at least one")
-            if not chosen:
+            if not places:
                 remedy = f"label them, or rename with labels: {', '.join(labels)}"
                 raise InputError(f"all markers of the file are unlabelled; {remedy}")
-            return chosen
+            if unlabelled:
+                notes.append(
+                    "unlabelled markers are left out, unless names or labels state them: "
+                    f"{len(unlabelled)}, such as {unlabelled[0]!r}"
+                )
+            return places
         if not names:
             raise InputError("no markers are requested; omit the names to use all markers")
         for name in names:
             _require_one_of(name, known, what="marker")
         _require_distinct(names, "requested more than once: marker")
-        index_of = {name: k for k, name in enumerate(known)}
+        index_of = dict(zip(known, places, strict=True))
         return [index_of[name] for name in names]
 
     return choose
@@ -213,7 +228,8 @@ def _times_s(raw: RawTracks, rate_hz: float | None) -> Array:
             f"rate_hz is {rate_hz:g}, but {raw.rate_key} says {first:g}; expected the same, or no "
             "rate_hz"
         )
-    return np.arange(len(raw.coordinates)) / first
+    frames = np.arange(len(raw.coordinates)) if raw.frames is None else raw.frames
+    return (frames - min(frames[0], 1)) / first
 
 
 def _require_rate(t_s: Array, key: str, rate_hz: float) -> None:
@@ -235,8 +251,8 @@ def _mark_missing(raw: RawTracks, names: Iterable[str]) -> tuple[Array, list[str
     """Return coordinates (T, M, 3) with NaN for missing ones, and a note on them."""
     x = raw.coordinates
     blank = np.asarray(np.isnan(x).all(axis=2))
-    incomplete = np.isnan(x).any(axis=2) & ~blank
-    zero = np.asarray((x == 0.0).all(axis=2)) & raw.zeros_are_missing
+    zero = np.asarray((np.nan_to_num(x) == 0.0).all(axis=2)) & ~blank & raw.zeros_are_missing
+    incomplete = np.isnan(x).any(axis=2) & ~blank & ~zero
     markers_by_loss: dict[str, list[str]] = {}
     for k, name in enumerate(names):
         counts = {"blank": blank[:, k].sum(), "zeros": zero[:, k].sum()}

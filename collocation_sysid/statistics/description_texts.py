@@ -5,8 +5,8 @@ from __future__ import annotations
 MESSAGES = {
     "poses-inverted": "the markers move as if the poses were inverted: invert them; a pose must "
     "map the undeformed body to its current position",
-    "quaternion-order": "the markers move as if the quaternions were in another order: set "
-    'grasp.quaternion = "{order}" or swap the columns',
+    "quaternion-order": "the markers move as if the quaternions were in another order: name their "
+    'columns {columns}, in this order, or set grasp.quaternion = "{order}" if they are numbered',
     "length-unit": "{who} were {factor:g} times as large: {remedy}",
     "gravity": "the markers hang as if gravity were along {axis}: set gravity_m_s2 = [{vector}]",
     "gripper-frame": "the markers move with the poses, but with a constant transform between "

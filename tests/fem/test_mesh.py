@@ -343,6 +343,44 @@ def test_physical_groups_are_cells_and_nodes_by_name_and_dimension(tmp_path, ver
         Named("floor").resolve_cells(mesh)
 
 
+def without_groups(version: str, dimension: int) -> str:
+    """The file in which one entity, or one element, belongs to no physical group."""
+    changes = {
+        ("2.2", 2): ("2 2 2 5 2 3 4 5", "2 2 2 0 2 3 4 5"),
+        ("2.2", 3): ("4 4 2 2 2 2 3 4 5", "4 4 2 0 2 2 3 4 5"),
+        ("4.1", 2): ("2 0 0 0 1 1 1 1 5 0", "2 0 0 0 1 1 1 0 0"),
+        ("4.1", 3): ("2 0 0 0 1 1 1 1 2 1 2", "2 0 0 0 1 1 1 0 1 2"),
+    }
+    old, new = changes[version, dimension]
+    assert old in MSH_FILES[version]
+    return MSH_FILES[version].replace(old, new)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_entities_without_a_group_are_read_in_one_version_and_named_in_the_other(
+    tmp_path, dimension
+):
+    file = tmp_path / "two.msh"
+    file.write_text(without_groups("2.2", dimension))
+    assert len(TetMesh.read(file).tetrahedra) == 2
+    file.write_text(without_groups("4.1", dimension))
+    with pytest.raises(InputError, match=r"others to none; .*Mesh.SaveAll = 0.* = 2\.2") as caught:
+        TetMesh.read(file)
+    assert caught.value.source == file
+
+
+@pytest.mark.parametrize("version", MSH_FILES)
+def test_parametric_coordinates_of_nodes_are_named(tmp_path, version):
+    content = {
+        "2.2": MSH_FILES["2.2"].replace("Nodes\n", "ParametricNodes\n"),
+        "4.1": MSH_FILES["4.1"].replace("3 1 0 5", "3 1 1 5"),
+    }[version]
+    assert content != MSH_FILES[version]
+    (tmp_path / "two.msh").write_text(content)
+    with pytest.raises(InputError, match=r"saved with Mesh\.SaveParametric = 0"):
+        TetMesh.read(tmp_path / "two.msh")
+
+
 @pytest.mark.parametrize("version", MSH_FILES)
 def test_groups_without_a_name_are_called_by_their_tag(tmp_path, version):
     (tmp_path / "two.msh").write_text(MSH_FILES[version])

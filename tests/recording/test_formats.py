@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 import sys
 from pathlib import Path
@@ -166,10 +167,11 @@ def test_markers_are_chosen_ordered_and_renamed(file, name):
 )
 def test_missing_samples_are_counted(file, name, lost):
     table = read_markers(file(TEXTS[name]), **UNIT_GIVEN.get(name, {}))
+    notes = tuple(note for note in table.notes if "unlabelled" not in note)
     if lost[0] == lost[1]:
-        assert table.notes == (f"Tip 1 and base: each 1 of 4 samples missing ({lost[0]})",)
+        assert notes == (f"Tip 1 and base: each 1 of 4 samples missing ({lost[0]})",)
     else:
-        assert table.notes == (
+        assert notes == (
             f"Tip 1: 1 of 4 samples missing ({lost[0]}); base: 1 of 4 samples missing ({lost[1]})",
         )
 
@@ -187,6 +189,110 @@ def test_the_origin_is_a_place_in_a_plain_file(file):
     table = read_markers(file("t_s,a_x,a_y,a_z\n0,0,0,0\n1,0,0,0\n"))
     np.testing.assert_array_equal(table.positions_m, np.zeros((2, 1, 3)))
     assert table.notes == ()
+
+
+# Coordinates y and z of the first marker.
+PAIRS = {"trc": "200\t300", "qualisys": "200\t300", "wide": "0.2,0.3", "vicon": "2,3"}
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("name", [*TEXTS, "vicon", "c3d"])
+def test_a_marker_without_one_coordinate_keeps_the_others(file, tmp_path, name, axis):
+    if name == "c3d":
+        tracks_mm = 1000 * TRACKS_M
+        tracks_mm[:, 0, axis] = np.nan
+        path = write_c3d(tmp_path / "take.c3d", tracks_mm)
+    else:
+        pair = PAIRS.get(name, "200,300")
+        number = re.split("[\t,]", pair)[axis - 1]
+        text = VICON if name == "vicon" else TEXTS[name]
+        path = file(text.replace(pair, pair.replace(number, "")))
+    table = read_markers(path, **UNIT_GIVEN.get(name, {}))
+    is_missing = np.isnan(table.positions_m[:, 0]).all(axis=0)
+    assert is_missing.tolist() == [k == axis for k in range(3)]
+    assert "without all three coordinates" in table.notes[-1]
+
+
+@pytest.mark.parametrize("name", ["trc", "motive"])
+def test_zeros_of_a_marker_without_one_coordinate_are_missing(file, name):
+    pair = PAIRS.get(name, "200,300")
+    text = TEXTS[name].replace(pair, pair.replace("300", ""))
+    lost = {"trc": ("130\t200\t", "0\t0\t"), "motive": ("130,200,", "0,0,")}[name]
+    table = read_markers(file(replaced(text, *lost)))
+    assert np.isnan(table.positions_m[3, 0]).all()
+    assert "1 blank, 1 zeros), 2 of 4 samples without all three" in table.notes[-1]
+
+
+UNLABELLED = ("*0", "*12", "S:*3", "Unlabeled 7", "unlabelled_2", "Unlabeled", "")
+
+
+def vicon(labels, first=1):
+    """The text of a Vicon CSV with markers at (1, 2, 3) mm in two frames."""
+    names = ",,".join(f",{label}" for label in labels)
+    rows = [f"{first + k},0" + ",1,2,3" * len(labels) for k in range(2)]
+    axes, units = ",X,Y,Z" * len(labels), ",mm,mm,mm" * len(labels)
+    return "\n".join(
+        ["Trajectories", "100", f",{names},,", f"Frame,Sub Frame{axes}", f",{units}", *rows, ""]
+    )
+
+
+@pytest.mark.parametrize("label", UNLABELLED)
+@pytest.mark.parametrize("name", ["vicon", "c3d", "trc"])
+def test_unlabelled_points_are_left_out_with_a_note(file, tmp_path, name, label):
+    if name == "vicon":
+        path = file(vicon(["tip", label, "base"]))
+    elif name == "c3d":
+        path = write_c3d(tmp_path / "take.c3d", labels=("tip", label))
+    else:
+        path = file(TRC.replace("base", label or "*"))
+    table = read_markers(path)
+    assert label not in table.names
+    assert any("left out" in note and "1, such as" in note for note in table.notes)
+    if label:
+        assert read_markers(path, names=[label]).names == (label,)
+        assert "second" in read_markers(path, labels={label: "second"}).names
+
+
+def test_many_points_without_a_label_are_no_markers_of_one_name(file):
+    table = read_markers(file(vicon(["", "tip", "*", ""])))
+    assert table.names == ("tip",)
+    assert table.notes == (
+        "unlabelled markers are left out, unless names or labels state them: 3, such as ''",
+    )
+
+
+@pytest.mark.parametrize("label", ["*tip", "label_7", "relabelled", "S:"])
+def test_names_of_labelled_markers_may_be_similar(file, label):
+    assert read_markers(file(vicon(["tip", label]))).names == ("tip", label)
+
+
+# First frames -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("first", "first_s"), [(0, 0.0), (1, 0.0), (101, 1.0), (40001, 400.0)])
+@pytest.mark.parametrize("name", ["vicon", "c3d", "qualisys"])
+def test_frames_count_from_one_at_zero_seconds(file, tmp_path, name, first, first_s):
+    if name == "vicon":
+        path = file(vicon(["tip"], first))
+    elif name == "c3d":
+        path = write_c3d(tmp_path / "take.c3d")
+        content = bytearray(path.read_bytes())
+        content[6:10] = struct.pack("<2H", first, first + 3)
+        path.write_bytes(content)
+    else:
+        lines = QUALISYS.splitlines()
+        frames = [f"{first + k}\t{row}" for k, row in enumerate(lines[11:])]
+        title = "Frame\t" + "\t".join(f"{n} {a}" for n in ("Tip 1", "base") for a in "XYZ")
+        path = file("\n".join([*lines[:11], title, *frames]) + "\n")
+    t_s = read_markers(path, **UNIT_GIVEN.get(name, {})).t_s
+    np.testing.assert_allclose(t_s, first_s + np.arange(len(t_s)) / 100)
+
+
+def test_frame_numbers_have_times_by_a_stated_rate(file):
+    path = file(replaced(vicon(["tip"], 101), "\n100\n", '\n"",x\n'))
+    assert "neither line 2 nor a column of times" in refusal(path)
+    np.testing.assert_allclose(read_markers(path, rate_hz=50.0).t_s, [2.0, 2.02])
+    assert "rate_hz is 50, but line 2 says 100" in refusal(file(vicon(["tip"])), rate_hz=50.0)
 
 
 # Units and rates ----------------------------------------------------------------------------------
@@ -311,6 +417,18 @@ def test_tabs_at_the_end_of_all_rows_are_no_cells(file):
     head, frames = TRC.split("\n\n")
     table = read_markers(file(f"{head}\n\t\t\n" + frames.replace("\n", "\t\n")))
     np.testing.assert_allclose(table.positions_m, TRACKS_M)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        (TRC.replace("\t", " "), "trc"),
+        (TRC[: TRC.index("\n\n")] + TRC[TRC.index("\n\n") :].replace("\t", "  "), "trc"),
+        (QUALISYS.replace("\t", " "), "qualisys"),
+    ],
+)
+def test_blanks_in_place_of_tabs_are_named(file, text, name):
+    assert "separated by tabs" in refusal(file(text), **UNIT_GIVEN.get(name, {}))
 
 
 # Qualisys -----------------------------------------------------------------------------------------
@@ -467,7 +585,7 @@ Frame,Sub Frame,X,Y,Z
 def test_a_vicon_csv_has_its_markers_among_other_blocks(file, above):
     table = read_markers(file(above + VICON))
     assert table.names == ("S:tip", "S:base")
-    np.testing.assert_allclose(table.t_s, [0, 0.01, 0.03])
+    np.testing.assert_allclose(table.t_s, [0.06, 0.07, 0.09])
     np.testing.assert_allclose(table.positions_m[2, 1], [0.004, 0.005, 0.007])
     assert np.isnan(table.positions_m[1, 1]).all()
     blocks = [name for name in ("Devices", "Model Outputs") if name in above]
@@ -480,7 +598,7 @@ def test_a_vicon_csv_has_its_markers_among_other_blocks(file, above):
         (DEVICES, "found the blocks Devices of Vicon Nexus, but no Trajectories"),
         (VICON.replace("mm,mm\n", "mm,deg\n"), "line 5: the units are deg, mm"),
         (VICON.replace("Sub Frame", "Sub"), "line 1: expected below Trajectories"),
-        (VICON.replace("S:base", "S:tip"), "two markers are named 'S:tip'"),
+        (VICON.replace("S:base", "S:tip"), "two markers are labelled 'S:tip'"),
         (VICON.replace("100", "fast"), "'fast'; expected a number above 0"),
     ],
 )
@@ -511,6 +629,75 @@ def write_c3d(path, tracks_mm=1000 * TRACKS_M, labels=("Tip 1", "base"), unit="m
     c3d["data"]["points"] = points
     c3d.write(str(path))
     return path
+
+
+@pytest.mark.parametrize(
+    ("stated", "frames", "first_s"),
+    [
+        ([("POINT", "LONG_FRAMES", [70000.0])], 70000, 0.0),
+        ([("TRIAL", "ACTUAL_START_FIELD", [101, 0]), ("TRIAL", "ACTUAL_END_FIELD", [4564, 1])], 70000, 1.0),
+        ([("TRIAL", "ACTUAL_START_FIELD", [4465, 1]), ("TRIAL", "ACTUAL_END_FIELD", [4468, 1])], 4, 700.0),
+        ([], 65535, 0.0),
+    ],
+)  # fmt: skip
+def test_more_frames_than_a_header_can_count_are_read(tmp_path, stated, frames, first_s):
+    ezc3d = pytest.importorskip("ezc3d")
+    written = 70000 if frames > 4 else 4
+    c3d = ezc3d.c3d()
+    c3d["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    c3d["parameters"]["POINT"]["LABELS"]["value"] = ("tip",)
+    c3d["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    for parameter in stated:
+        c3d.add_parameter(*parameter)
+    points = np.ones((4, 1, written))
+    points[0, 0] += np.arange(written)
+    c3d["data"]["points"] = points
+    path = tmp_path / "long.c3d"
+    c3d.write(str(path))
+    if written == 4:
+        content = bytearray(path.read_bytes())
+        content[6:10] = struct.pack("<2H", 65535, 65535)
+        path.write_bytes(content)
+    table = read_markers(path)
+    np.testing.assert_allclose(
+        table.positions_m[:, 0, 0], np.arange(1, frames + 1) / 1000, rtol=1e-6
+    )
+    np.testing.assert_allclose(table.t_s[[0, -1]], [first_s, first_s + (frames - 1) / 100])
+    assert ("frames after the first 65535, if any, were not read" in table.notes) == (not stated)
+    if frames == 70000:
+        path.write_bytes(path.read_bytes()[:-4096])
+        assert "the header states 70000 frames, but the file contains" in refusal(path)
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.0])
+def test_a_scale_of_zero_in_c3d_is_named(tmp_path, scale):
+    ezc3d = pytest.importorskip("ezc3d")
+    path = write_c3d(tmp_path / "take.c3d")
+    c3d = ezc3d.c3d(str(path))
+    c3d["parameters"]["POINT"]["SCALE"]["value"] = [scale]
+    c3d.write(str(path))
+    message = refusal(path)
+    assert "POINT:SCALE: the factor of all coordinates is 0; expected another" in message
+
+
+@pytest.mark.parametrize("count", [4, 65535, 70000])
+def test_the_number_of_frames_in_c3d_may_be_a_float(tmp_path, count):
+    tracks_mm = np.ones((count, 1, 3)) * np.arange(1, count + 1)[:, None, None]
+    path = write_c3d(tmp_path / "take.c3d", tracks_mm, labels=("tip",))
+    content = path.read_bytes()
+    # Type, dimensions and value of the parameter, which two bytes more make a float.
+    found = re.search(rb"(?s)\xfa.FRAMES(..)\x02\x00..", content)
+    assert found
+    assert content[1534:1536] == b"\0\0"
+    (offset,) = struct.unpack("<H", found[1])
+    record = struct.pack("<HBBf", offset + 2, 4, 0, count)
+    path.write_bytes(
+        content[: found.start(1)] + record + content[found.end() : 1534] + content[1536:]
+    )
+    table = read_markers(path)
+    np.testing.assert_allclose(
+        table.positions_m[:, 0, 0], np.arange(1, count + 1) / 1000, rtol=1e-6
+    )
 
 
 def without_rate(path):

@@ -359,3 +359,31 @@ def test_the_picture_of_a_harmonic_test_has_its_moduli_over_frequency():
     np.testing.assert_allclose(lines["storage, measured"].get_ydata(), storage / 1e3)
     np.testing.assert_allclose(lines["loss, measured"].get_ydata(), loss / 1e3)
     np.testing.assert_allclose(lines["loss, measured"].get_xdata(), FREQUENCY_HZ)
+
+
+@pytest.mark.parametrize(
+    ("storage", "loss"),
+    [("{}′ (Pa)", "{}″ (Pa)"), ("{}' (Pa)", "{}'' (Pa)"), ("{}’ [Pa]", '{}" [Pa]')],
+)
+@pytest.mark.parametrize(("symbol", "test"), [("G", "shear-harmonic"), ("E", "harmonic")])
+def test_symbols_of_moduli_are_recognised(tmp_path, storage, loss, symbol, test):
+    columns = {"ω (rad/s)": 2 * np.pi * FREQUENCY_HZ, storage.format(symbol): STORAGE_PA}
+    named = columns | {loss.format(symbol): LOSS_PA, f"|{symbol}*| (Pa)": LOSS_PA, "δ (°)": LOSS_PA}
+    problems = [
+        cs.Problem.read(harmonic_file(tmp_path, each, test=test))
+        for each in (named, columns | {"tan(δ)": LOSS_PA / STORAGE_PA})
+    ]
+    (first,), (second,) = (each.experiments[0].readings for each in problems)
+    np.testing.assert_allclose(first.measured_values, second.measured_values, rtol=1e-9)
+    assert not any("understood" in note for each in problems for note in each.notes)
+    other = {"shear-harmonic": "harmonic", "harmonic": "shear-harmonic"}[test]
+    with pytest.raises(cs.InputError, match=f'expected test = "{test}"'):
+        cs.Problem.read(harmonic_file(tmp_path, named, test=other))
+
+
+@pytest.mark.parametrize("column", ["|G*| (Pa)", "G* (kPa)", "complex modulus (Pa)"])
+def test_a_complex_modulus_is_called_another_quantity(tmp_path, column):
+    columns = {"frequency (Hz)": FREQUENCY_HZ, column: STORAGE_PA, "tan δ": LOSS_PA / STORAGE_PA}
+    with pytest.raises(cs.InputError) as fault:
+        cs.Problem.read(harmonic_file(tmp_path, columns, test="shear-harmonic"))
+    assert f"{column} is not read, because the word 'complex'" in str(fault.value)

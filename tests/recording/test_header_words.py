@@ -322,3 +322,44 @@ def test_another_quantity_beside_strain_and_stress_is_not_read(table, column):
 @pytest.mark.parametrize("column", ["stretch ratio", "Dehnung (%)", "Längendehnung (%)"])
 def test_usual_words_of_a_header_are_understood(table, column):
     assert not read_specimen(table(f"{column},stress (kPa)"), layout()).notes
+
+
+@pytest.mark.parametrize("ends", [("xx", "yy"), ("XX", "YY"), ("11", "22"), ("x", "y")])
+@pytest.mark.parametrize("kind", ["eng_strain", "Strain", "NOMINAL STRAIN"])
+def test_components_of_a_strain_are_no_units(table, kind, ends):
+    first, second = (f"{kind}_{end}" for end in ends)
+    file = table(f"{first},{second},stress (kPa)")
+    with pytest.raises(InputError, match=r"names no unit; .*: state one with its unit") as caught:
+        read_specimen(file, layout())
+    for column in (first, second):
+        assert f'strain = "{column} (1)", stress = "stress (kPa)"' in str(caught.value)
+        stated = {"strain": f"{column} (%)", "stress": "stress (kPa)"}
+        np.testing.assert_allclose(read_specimen(file, layout(columns=stated)).strain[0], 1e-3)
+
+
+@pytest.mark.parametrize("word", ["log", "Log", "Hencky", "true", "ln"])
+@pytest.mark.parametrize("form", ["strain [{}]", "strain_{}", "phi Y [{}]"])
+def test_kinds_of_a_strain_are_no_units(table, form, word):
+    column = form.format(word)
+    file = table(f"{column},stress (kPa)")
+    with pytest.raises(InputError, match="holds a true strain, the logarithm of the stretch"):
+        read_specimen(file, layout(columns={"strain": column, "stress": "stress (kPa)"}))
+
+
+@pytest.mark.parametrize("column", ["VSG_STRAIN_YY", "vsg_strain_xx", "VSG_STRAIN_XX (1)"])
+def test_virtual_strain_gauges_of_dice_have_green_lagrange_strains(table, column):
+    with pytest.raises(InputError, match="holds a Green-Lagrange strain"):
+        read_specimen(table(f"{column},stress (kPa)"), layout())
+
+
+@pytest.mark.parametrize("column", ["strain_xy (-)", "eng_strain_xy", "Strain XZ (%)"])
+def test_shear_strains_are_no_strains_along_the_specimen(table, column):
+    read = read_specimen(table(f"strain_yy (-),{column},stress (kPa)"), layout())
+    np.testing.assert_allclose(read.strain, [0.1, 0.2, 0.3, 0.4])
+    assert not any("understood" in note for note in read.notes)
+
+
+@pytest.mark.parametrize("column", ["time_second", "Time / min", "elapsed time_h"])
+def test_words_that_are_units_stay_units(table, column):
+    read = read_specimen(table(f"{column},strain (-),stress (kPa)"), layout())
+    assert read.t_s[0] in (0.1, 6.0, 360.0)

@@ -207,3 +207,27 @@ def test_a_bench_for_torsion_is_simulated_and_read_back(tmp_path):
     np.testing.assert_allclose(written.quaternions_xyzw, poses.quaternions_xyzw, atol=1e-9)
     np.testing.assert_allclose(written.positions_m, poses.positions_m, atol=1e-9)
     assert (np.diff(read_wrench(file, timed=False)[1][:, 5]) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("names", "units", "column"),
+    [
+        ("Strain,Stress", ",kPa", "strain"),
+        ("Time,Dehnung,Stress", "s,,kPa", "strain"),
+        ("Time,Stress,Stretch,Comment", "(s),(kPa),,", "stretch"),
+    ],
+)
+def test_a_blank_unit_of_a_ratio_is_one(written, names, units, column):
+    width = names.count(",") + 1
+    rows = [",".join([f"{1 + k / 8:g}"] * width) for k in range(3)]
+    file = written("\n".join([names, units, *rows]))
+    table = read_specimen(file, layout(length_m=None))
+    assert column in table.columns
+    np.testing.assert_allclose(table.strain, np.arange(3) / 8 + (column == "strain"))
+
+
+@pytest.mark.parametrize("load", ["Force", "Stress"])
+def test_a_blank_unit_of_a_load_is_refused(written, load):
+    file = written(f"Strain,{load}\n%,\n1,2\n2,3\n")
+    with pytest.raises(InputError, match=rf"column {load} \(\) names no unit"):
+        read_specimen(file, layout(area_m2=1e-4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -28,7 +29,7 @@ from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.pipeline import run, solve
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.simulation import simulate, with_markers
-from collocation_sysid.recording import Experiment, Grasp, PoseSequence
+from collocation_sysid.recording import Experiment, Grasp, PoseSequence, read_poses
 from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.runs.check.body import check_grasps, grasp_concerns
 from collocation_sysid.statistics.assessment import cause_concerns
@@ -115,6 +116,18 @@ def test_a_quaternion_order_is_named_behind_a_gripper_and_without_places(name: s
     causes = misspecification_hypotheses(wrong)
     assert causes[0].cause == "quaternion-order"
     assert causes[0].strength > 2
+
+
+@pytest.mark.parametrize(("turn", "order"), [(1, "wxyz"), (-1, "xyzw")])
+def test_columns_named_as_advised_are_read(turn: int, order: str, tmp_path: Path):
+    causes = misspecification_hypotheses(gripped(soft("block"), reordered(turn)))
+    columns = re.findall(r"name their columns (.*?), in this order", causes[0].message)[0]
+    values = {"w": 0.8, "x": 0.0, "y": 0.6, "z": 0.0}
+    names = ",".join(columns.split(", "))
+    path = tmp_path / "poses.csv"
+    path.write_text(f"t_s,x_m,y_m,z_m,{names}\n0,0,0,0,{','.join(str(values[k]) for k in order)}\n")
+    np.testing.assert_allclose(read_poses(path).quaternions_xyzw, [[0.0, 0.6, 0.0, 0.8]])
+    assert f'grasp.quaternion = "{order}" if they are numbered' in causes[0].message
 
 
 @pytest.mark.parametrize(("name", "seed"), [*zip(BODIES, [1, 2], strict=True)])

@@ -31,6 +31,14 @@ METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 
 _TETRAHEDRA = ("tetra", "tetra10")
 _TRIANGLES = ("triangle", "triangle6")
+# Files of Gmsh that meshio does not read, by the beginning of a section or by what meshio says.
+_GMSH_FAULTS = {
+    "parametric": "its nodes have parametric coordinates; expected a file that Gmsh saved with "
+    "Mesh.SaveParametric = 0",
+    "gmsh:physical": "some of its entities belong to a physical group and others to none; expected a "
+    "file that Gmsh saved with Mesh.SaveAll = 0, with a group of each entity, or with "
+    "Mesh.MshFileVersion = 2.2",
+}
 _SOLID_CELLS = ("tetra", "hexahedron", "wedge", "pyramid", "polyhedron")
 
 
@@ -257,6 +265,11 @@ def _unreadable_error(done: str, reason: str, path: str | Path) -> InputError:
             f"pip install {package}; or convert the mesh to .vtu",
             path,
         )
+    if done == "read" and b"$ParametricNodes" in Path(path).read_bytes():
+        reason = "parametric"
+    for said, fault in _GMSH_FAULTS.items():
+        if said in reason:
+            return InputError(fault, path)
     return InputError(
         f"the file cannot be {done} as a mesh ({reason}); formats such as .vtu, .vtk, .msh, .mesh "
         "and .inp are known, recognised by the file's ending",

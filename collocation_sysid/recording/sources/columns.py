@@ -190,7 +190,7 @@ _GREEN = ("a Green-Lagrange strain", "√(1 + 2 E)")
 _ALMANSI = ("an Almansi strain", "1/√(1 − 2 e)")
 _LOGARITHM = ("a true strain, the logarithm of the stretch", "the exponential of the true strain")
 STRAIN_MEASURES = {
-    **dict.fromkeys(("lagrange", "lagrangian", "green"), _GREEN),
+    **dict.fromkeys(("lagrange", "lagrangian", "green", "vsg"), _GREEN),
     **dict.fromkeys(("almansi", "euler", "eulerian"), _ALMANSI),
     **dict.fromkeys(_DEFORMED, _LOGARITHM),
 }
@@ -204,7 +204,8 @@ KINDS = {
         r"compressive|druckspann"
     ),
     "shear": re.compile(
-        r"shear|schub|scher|cisaillement|cortante|taglio|torsion|gamma|γ|\btau(?![^\W\d_])|τ"
+        r"shear|schub|scher|cisaillement|cortante|taglio|torsion|gamma|γ|\btau(?![^\W\d_])|τ|"
+        r"(?<![^\W\d_])(xy|yz|xz)(?![^\W\d_])"
     ),
     "simple shear": re.compile(r"\bsimple\b|\beinfache"),
     "pure shear": re.compile(r"\bpure\b|\bplanar\b|\breine"),
@@ -218,6 +219,13 @@ _MODULUS_SYMBOLS = {
     "tension": re.compile(r"\be(?![^\W\d_])"),
     "shear": re.compile(r"\bg(?![^\W\d_])"),
 }
+# Words for symbols.
+_SYMBOLS = {
+    "loss modulus": re.compile(r"\b[ge](''|′′|’’|″|\")"),
+    "storage modulus": re.compile(r"\b[ge]['′’]"),
+    "complex modulus": re.compile(r"\|?\b[ge]\*\|?"),
+    "nominal": _FIRST_PIOLA,
+}
 # Words that state nothing that a reading could contradict.
 _NEUTRAL = (
     "engineering eng nominal technical technische technischer ingénieur measured gemessen "
@@ -226,7 +234,7 @@ _NEUTRAL = (
     "digital camera laser elapsed test run of the in from axial uniaxial tensile compressive "
     "compression zug prüf st first cable tendon chamber relative relaxation dynamic angular "
     "delta δ amount shear sigma σ epsilon eps ε nominale spannungs elastizitäts "
-    "relaxations kolben längen stauch"
+    "relaxations kolben längen stauch xx yy zz"
 )
 # Signs of arithmetic in a name, as in strain^2, 1/strain, stretch - 1 and E*.
 _ARITHMETIC = re.compile(r"[\^*√×÷|]\d*|\d+\s*/|^\s*[-−]|(?:(?<=\d)|(?<=\d ))[-−+]|[-−+]\s*\d+")
@@ -256,6 +264,8 @@ QUALIFIERS = {
     },
 }
 _ALL_QUALIFIERS = frozenset().union(*QUALIFIERS.values())
+# Ends of names that are components and kinds instead of units, as in eng_strain_yy and strain [log].
+_NO_UNITS = _ALL_QUALIFIERS.union(_NEUTRAL.split(), "xyz", ("xy", "yz", "xz"), ("11", "22", "33"))
 # Names of columns in which compression counts as positive.
 _COMPRESSIVE = re.compile(r"stauch|druck(spann|kraft)|compress|compres[ií]", re.IGNORECASE)
 
@@ -525,7 +535,7 @@ def _column_named_by_user(
         own = None
     units = [each for each in (own, unit_of_user if column == bare else own) if each]
     unit = next((each for each in units if not each.isdigit()), "1" if "1" in units else None)
-    if unit is None and quantity.unitless:
+    if unit is None and _needs_no_unit(column, quantity):
         unit = quantity.unit
     if contradiction := _other_measure(column, quantity):
         raise grid.error_at(contradiction)
@@ -601,14 +611,16 @@ def find_time(grid: Table, measured: Collection[int] = ()) -> tuple[int, float] 
 
 def _fitting_names(grid: Table, quantity: Quantity) -> Mapping[int, str | None]:
     """Return the unit by index of each column whose name fits a quantity; None without."""
-    units = {
-        k: name_and_unit(column)[1]
+    return {
+        k: name_and_unit(column)[1] or (quantity.unit if _needs_no_unit(column, quantity) else None)
         for k, column in enumerate(grid.columns)
         if _name_fits(column, quantity)
     }
-    if quantity.unitless:
-        units = {k: unit or quantity.unit for k, unit in units.items()}
-    return units
+
+
+def _needs_no_unit(column: str, quantity: Quantity) -> bool:
+    """Return whether a column without a unit has ratios, as below a blank cell in a row of units."""
+    return quantity.unitless or (quantity.dimension == "ratio" and column.endswith("()"))
 
 
 def _fitting_columns(grid: Table, quantity: Quantity) -> list[tuple[int, float]]:
@@ -761,7 +773,7 @@ def _unknown_words(column: str, quantity: Quantity) -> list[str]:
             return word in known or (last in known and is_known(first))
         return any(pattern.search(word) for pattern in patterns)
 
-    plain = _FIRST_PIOLA.sub("nominal", re.sub(r"['’]s\b", "", name))
+    plain = _without_symbols(re.sub(r"['’]s\b", "", name))
     unknown = [word for word in re.findall(r"[^\W\d_]+", plain) if not is_known(word)]
     return unknown + _ARITHMETIC.findall(plain)
 
@@ -828,7 +840,10 @@ def name_and_unit(column: str) -> tuple[str, str | None]:
     if _key_of(column) in {quantity.key for quantity in KNOWN_QUANTITIES}:
         return column, None
     if (parts := _NAMED.fullmatch(column)) is not None:
-        return parts["name"], parts["bracketed"] or parts["behind"]
+        unit = parts["bracketed"] or parts["behind"]
+        is_word = (unit or "").lower() in _NO_UNITS
+        if not is_word or any(si_factor(unit, each) for each in UNITS):
+            return parts["name"], unit
     parts = _BARE_UNIT.fullmatch(column)
     if parts is not None and any(si_factor(parts["unit"], each) for each in UNITS):
         return parts["name"], parts["unit"]
@@ -844,9 +859,15 @@ def names_compression(column: str) -> bool:
     return _COMPRESSIVE.search(column) is not None
 
 
+def _without_symbols(name: str) -> str:
+    for words, symbol in _SYMBOLS.items():
+        name = symbol.sub(words, name)
+    return name
+
+
 def _words(name: str) -> set[str]:
     """Return sequences of letters in lower case, also as singulars and parts of compounds."""
-    words = set(re.findall(r"[^\W\d_]+", _FIRST_PIOLA.sub("nominal", name.lower())))
+    words = set(re.findall(r"[^\W\d_]+", _without_symbols(name.lower())))
     words |= {word[: -len(end)] for word in words for end in ("s", "es") if word.endswith(end)}
     compounds = [*filter(None, map(_COMPOUND.fullmatch, words))]
     firsts = {c["first"] for c in compounds} & _ALL_QUALIFIERS
@@ -905,11 +926,15 @@ def _unit_error(
     if not unit and stated_by:
         with_unit = json.dumps(f"{column} ({written})", ensure_ascii=False)
         remedy = f"add the unit that it has, for example {stated_by} = {with_unit}"
-    statement = "" if advice is None else advice(_without_names(grid, [column]))
-    if MISSING in statement and advice is not None:
-        statement = advice(grid)
-    if statement and MISSING not in statement:
+    fitting = _fitting_names(grid, quantity)
+    names = [c if fitting.get(k, c) else f"{c} ({written})" for k, c in enumerate(grid.columns)]
+    tables = _without_names(grid, [column]), grid, replace(grid, columns=names)
+    statements = [*map(advice, tables)] if advice else [MISSING]
+    *stated, with_units = ["" if MISSING in each else each for each in statements]
+    if statement := next(filter(None, stated), ""):
         remedy = f"state {statement}; or {remedy}"
+    elif with_units and len({*names} - {*grid.columns}) > 1:
+        remedy = f"state one with its unit, that of the loaded axis, for example {with_units}"
     return grid.error_at(
         f"column {column} {has}; expected {expected_units(unit or '', quantity.dimension)}: "
         f"{remedy}"

@@ -4,7 +4,7 @@ Line 1 has keys and values (Export Frame Rate, Length Units …); then come rows
 Rotation or Position above the columns; cells are blank where a marker is hidden. Columns of Type
 "Marker" are measured. Those of "Rigid Body Marker" are predictions of Motive's rigid-body fit, so
 they are taken only for markers without measured columns. Bodies, bones and their rotations are
-skipped; unlabelled markers are taken only on request.
+skipped.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ _RATES = ("Export Frame Rate", "Capture Frame Rate")
 
 def read(text: str, choose: LabelChooser) -> RawTracks:
     """Read a Motive CSV file; `choose` returns the indices of the markers to read from their
-    labels, with those that begin with "Unlabeled" excluded. A note names each marker that was not
-    measured but fitted by Motive.
+    labels. A note names each marker that was not measured but fitted by Motive.
 
     Raises
     ------
@@ -52,7 +51,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     heads = _column_headings(rows[1:top], rows[top])
     columns = _marker_columns(heads, rows[top].line)
     labels = list(columns)
-    chosen = choose(labels, [name for name in labels if name.startswith("Unlabeled")])
+    chosen = choose(labels)
     titles = [f"{name} {quantity} {axis}".strip() for _, name, quantity, axis in heads]
     table = table_of_rows(titles, rows[top + 1 :])
     header.require_count("Total Exported Frames", len(table.cells), what="frames")
@@ -63,7 +62,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
         labels,
         coordinate_columns=[places for _, places in columns.values()],
         chosen=chosen,
-        time=(1, 1.0),
+        time=1,
         unit=length_unit_of_text(unit, "line 1, Length Units"),
         unit_key="Length Units",
         rate_hz=header.number(rate_key),

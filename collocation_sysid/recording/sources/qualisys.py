@@ -30,7 +30,10 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     count = next((k for k, row in enumerate(rows) if not _KEY.fullmatch(row.cells[0])), len(rows))
     above = {row.cells[0]: row for row in rows[:count]}
     if "MARKER_NAMES" not in above:
-        raise InputError("the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data")
+        raise InputError(
+            "the header lacks MARKER_NAMES; expected a Qualisys TSV file with 3D data, "
+            "separated by tabs"
+        )
     labels = [cell for cell in above["MARKER_NAMES"].cells[1:] if cell]
     header_values = {key: ("".join(row.cells[1:2]), row.line) for key, row in above.items()}
     header = Header(header_values)

@@ -5,9 +5,9 @@ frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from ...common.array_types import Array
 from ...errors import InputError
@@ -30,6 +30,8 @@ class RawTracks:
         Place in the file where the unit is stated, or would be; for messages.
     t_s : (T,) array or None
         Times of a time column.
+    frames : (T,) array or None
+        Numbers of the frames, by which they have times if there is no time column.
     rate_hz : float or None
         Frame rate that the file states.
     rate_key : str
@@ -49,6 +51,7 @@ class RawTracks:
     unit: str | None = None
     unit_key: str = ""
     t_s: Array | None = None
+    frames: Array | None = None
     rate_hz: float | None = None
     rate_key: str = ""
     zeros_are_missing: bool = True
@@ -57,14 +60,9 @@ class RawTracks:
     sigmas: Array | None = None
 
 
-class LabelChooser(Protocol):
-    """A function that picks markers by the labels of a file, before any of their cells is read."""
-
-    def __call__(self, labels: Sequence[str], excluded: Collection[str] = ()) -> list[int]:
-        """Return the indices of the chosen labels; those in `excluded` only if they are requested
-        by name.
-        """
-        ...
+# Picks markers: returns the indices of the chosen labels of a file, before any of their cells is
+# read.
+LabelChooser = Callable[[Sequence[str]], list[int]]
 
 
 def tracks_of_table(
@@ -72,7 +70,7 @@ def tracks_of_table(
     labels: Sequence[str],
     coordinate_columns: Sequence[Sequence[int]],
     chosen: Sequence[int],
-    time: tuple[int, float] | None,
+    time: int | None,
     **fields: Any,
 ) -> RawTracks:
     """Return the tracks of a table with a row for each frame.
@@ -85,8 +83,9 @@ def tracks_of_table(
         Indices of the columns of x, y and z, by marker.
     chosen : sequence of int
         Indices of the markers to read; cells of others are not read.
-    time : (int, float) or None
-        Index of the column of times and factor to seconds, if there is one.
+    time : int or None
+        Index of the column of times [s], if there is one; otherwise the first column, if it is none
+        of a marker, has the numbers of the frames.
     **fields
         Further fields of `RawTracks`.
 
@@ -98,10 +97,12 @@ def tracks_of_table(
     cells = numeric_cells(
         table, [column for k in chosen for column in coordinate_columns[k]], blank_allowed=True
     )
+    is_numbered = time is None and coordinate_columns[0][0] > 0
     return RawTracks(
         labels=[labels[k] for k in chosen],
         coordinates=cells.reshape(-1, len(chosen), 3),
-        t_s=None if time is None else times_in_column(table, *time),
+        t_s=None if time is None else times_in_column(table, time),
+        frames=numeric_cells(table, [0], blank_allowed=False)[:, 0] if is_numbered else None,
         **fields,
     )
 
@@ -181,11 +182,13 @@ def tracks_of_frames(
     """
     chosen = choose(labels)
     table = table_of_rows(
-        [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")], frames
+        [*leading, *(f"{label} {axis}" for label in labels for axis in "XYZ")],
+        frames,
+        remedy=", separated by tabs",
     )
     header.require_count(count_key, len(frames), what="frames")
     places = [range(k, k + 3) for k in range(len(leading), len(table.columns), 3)]
-    time = (leading.index("Time"), 1.0) if "Time" in leading else None
+    time = leading.index("Time") if "Time" in leading else None
     fields |= {"rate_hz": header.number(rate_key), "rate_key": rate_key}
     return tracks_of_table(
         table, labels, coordinate_columns=places, chosen=chosen, time=time, **fields

@@ -38,8 +38,8 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     if missing := [key for key in _KEYS if key not in header.entries]:
         there = ", ".join(filter(None, keys.cells))
         message = (
-            f"the header lacks {', '.join(missing)}; found {there}; expected a complete TRC header: "
-            "export the file again"
+            f"the header lacks {', '.join(missing)}; found {there}; expected a complete TRC header, "
+            "separated by tabs: export the file again"
         )
         raise InputError(message, where=f"line {keys.line}")
     unit = length_unit_of_text(header.entries["Units"][0], f"line {values.line}")

@@ -6,7 +6,7 @@ a row of Frame, Sub Frame and axes, and a row of units. Cells are blank where a 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from itertools import zip_longest
 
 from ...errors import InputError
 from .raw_tracks import Header, LabelChooser, RawTracks, tracks_of_table
@@ -52,8 +52,7 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
             f"the units are {', '.join(sorted(stated))}; expected one unit of length",
             where=f"line {units.line}",
         )
-    places = _marker_columns(names, axes)
-    labels = list(places)
+    labels, places = _marker_columns(names, axes)
     blanks = [""] * width
     table = table_of_rows(
         [f"{axis} ({k})" for k, axis in enumerate(axes.cells)],
@@ -62,37 +61,35 @@ def read(text: str, choose: LabelChooser) -> RawTracks:
     chosen = choose(labels)
     others = dict.fromkeys(block for block in blocks if block != MARKERS)
     rate_hz = Header({"rate": (rate.cells[0], rate.line)}).number("rate")
-    raw = tracks_of_table(
+    return tracks_of_table(
         table,
         labels,
-        coordinate_columns=[places[label] for label in labels],
+        coordinate_columns=places,
         chosen=chosen,
-        time=None if rate_hz is None else (0, 1 / rate_hz),
+        time=None,
         unit=length_unit_of_text("".join(stated), f"line {units.line}"),
         unit_key=f"line {units.line}",
+        rate_hz=rate_hz,
         rate_key=f"line {rate.line}",
         notes=(f"not read: {', '.join(others)}",) if others else (),
     )
-    return raw if raw.t_s is None else replace(raw, t_s=raw.t_s - raw.t_s[0])
 
 
 def _is_beginning(row: Row) -> bool:
     return row.cells[0] in BLOCKS and not any(row.cells[1:])
 
 
-def _marker_columns(names: Row, axes: Row) -> dict[str, list[int]]:
-    """Return the columns of x, y and z by marker; a name stands above the first of the three."""
-    places: dict[str, list[int]] = {}
-    for k, name in enumerate(names.cells):
-        if not name:
+def _marker_columns(names: Row, axes: Row) -> tuple[list[str], list[list[int]]]:
+    """Return labels, and columns of x, y and z; a label, or none, stands above the first of them."""
+    labels, places = [], []
+    for k, (name, axis) in enumerate(zip_longest(names.cells, axes.cells, fillvalue="")):
+        if not name and axis != "X":
             continue
         if axes.cells[k : k + 3] != ["X", "Y", "Z"]:
             raise InputError(
                 f"below {name} are {', '.join(axes.cells[k : k + 3]) or 'no axes'}; expected X, Y, Z",
                 where=f"line {axes.line}",
             )
-        if name in places:
-            message = f"two markers are named '{name}'; expected names that differ"
-            raise InputError(message, where=f"line {names.line}")
-        places[name] = [k, k + 1, k + 2]
-    return places
+        labels.append(name)
+        places.append([k, k + 1, k + 2])
+    return labels, places
