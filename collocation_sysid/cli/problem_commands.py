@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +23,7 @@ from ..result.run_record import draw_run
 from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
+from ..runs.facts import facts, sentences
 from .command_options import OneMethod, OutputFolder, OutputOptions, ProblemOptions, command, option
 from .common import (
     EXIT_DOUBTFUL,
@@ -100,6 +102,7 @@ def solve(
     problem = source.read_problem(output.quiet)
     require_possible(folder)
     require_replaceable(folder)
+    problem = replace(problem, notes=(*problem.notes, *sentences(facts(problem))))
     no_output = None
     with ExitStack() as until_saved:
         with shown_progress(problem=problem, quiet=output.quiet, verbose=verbose) as progress:

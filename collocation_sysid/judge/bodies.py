@@ -13,8 +13,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ..common.array_types import Array
@@ -27,7 +25,6 @@ from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
 from ..statistics.budget.systematic_effects import Effect, ExperimentAtAnswer, section_effect
-from ..statistics.hypothesis import Hypothesis
 from .doubt import Correction, Doubt
 
 AXES = "xyz"
@@ -252,22 +249,3 @@ def with_body(experiment: Experiment, body: Body, **changes: object) -> Experime
         return replace(experiment, body=body, markers=unplaced, **changes)
     except InputError:
         return None
-
-
-def loose_parts(experiment: Experiment) -> Iterator[Hypothesis]:
-    """Yield that no grasp holds some parts of a mesh; nothing without grasps, or with tendons."""
-    cells = experiment.body.cells
-    count = len(experiment.body.nodes_m)
-    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
-    edges = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(count, count))
-    _, labels = connected_components(edges, directed=False)
-    parts, sizes = np.unique(labels[np.unique(cells)], return_counts=True)
-    grasped_labels = [labels[grasp.nodes] for grasp in experiment.body_grasps]
-    loose = (
-        ~np.isin(parts, np.concatenate(grasped_labels))
-        if grasped_labels
-        else np.zeros(len(parts), dtype=bool)
-    )
-    if loose.any() and not experiment.tendons:
-        data = {"parts": len(parts), "loose": int(loose.sum()), "nodes": int(sizes[loose].max())}
-        yield Hypothesis("mesh-parts", f"'{experiment.name}'", data=data, strength=float(count))

@@ -14,12 +14,7 @@ import numpy as np
 from ..common.array_types import Array, Index
 from ..common.time_dependence import at_times
 from ..errors import InputError
-from .gap_interpolation import (
-    LARGEST_GAP_INTERVALS,
-    SAME_TIME_INTERVALS,
-    interpolate_without_gaps,
-    is_gap,
-)
+from .gap_interpolation import LARGEST_GAP_INTERVALS, SAME_TIME_INTERVALS, interpolate_without_gaps
 from .marker_files import MarkerTable
 from .poses import PoseSequence
 from .sample_times import (
@@ -34,6 +29,8 @@ from .sample_times import (
 # Units of times, over a second, and relative difference of durations that are the same.
 UNITS_OF_TIMES = {1e3: "ms", 1e6: "us"}
 SAME_DURATION = 0.2
+# Delay of the first sample after the first pose, over the duration of the samples, that is noted.
+LARGEST_DELAY = 0.25
 # Fewest samples of a motion: an acceleration needs three.
 _FEWEST_SAMPLES = 3
 
@@ -92,6 +89,7 @@ def align(
         If the window is empty, the markers' frames have no common rate, the rate is not positive or
         leaves one sample, or a cut to the time of the poses leaves fewer than three samples.
     """
+    began_s, lasts_s = table.t_s[0], np.ptp(table.t_s)
     table = table if window_s is None else _cut_to_window(table, window_s)
     grasp_intervals_s = grasp_intervals_s or [(-np.inf, np.inf)] * len(poses)
     table, notes = _cut_to_poses(
@@ -121,6 +119,12 @@ def align(
     moved = []
     for k, sequence in enumerate(poses):
         name = "the poses" if len(poses) == 1 else f"the poses of grasp {k + 1}"
+        delay_s = began_s - sequence.t_s[0]
+        if len(sequence.t_s) > 1 and delay_s > LARGEST_DELAY * lasts_s:
+            notes.append(
+                f"the samples begin {delay_s:.6g} s after {name}: if both files were begun at the same "
+                "moment, subtract this from the times of the samples"
+            )
         matched = _poses_on_grid(sequence, t_s, grid=grid)
         if matched is None:
             matched = replace(sequence, t_s=unrounded_s(sequence.t_s))
@@ -237,16 +241,7 @@ def _interpolation_note(poses: PoseSequence, grid: Array) -> str:
     """Return the predicate of a note; the caller adds the subject."""
     how = "held" if poses.interpolation == "hold" else f"interpolated ({poses.interpolation})"
     at = f"{_rate_hz(grid):.6g} Hz {_span_text(grid)}" if len(grid) > 1 else _span_text(grid)
-    note = f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
-    in_grid = (poses.t_s[1:] > grid[0]) & (poses.t_s[:-1] < grid[-1])
-    gaps = np.flatnonzero(is_gap(poses.t_s) & in_grid)
-    if not len(gaps):
-        return note
-    longest = gaps[np.argmax(np.diff(poses.t_s)[gaps])]
-    return (
-        f"{note}, also across {len(gaps)} gap{'s' * int(len(gaps) > 1)} in them, the longest "
-        f"{_span_text(poses.t_s[longest : longest + 2])}"
-    )
+    return f", recorded at {_rate_hz(poses.t_s):.6g} Hz, were {how} at the markers' times, {at}"
 
 
 def _jump_notes(poses: PoseSequence, grid: Array) -> list[str]:

@@ -87,8 +87,9 @@ def _check_verdict(findings: CheckResult) -> Line:
         longer = findings.longer_edges
         edges = f" with edges {longer[0]:.2g} times as long" if longer else ""
         return Line(
-            "No mistake was found. Left out, because check would take longer than half a minute: "
-            f"{', '.join(findings.omitted)}. Use a coarser mesh{edges}, or check --full.",
+            f"{'' if findings.concerns else 'No mistake was found. '}Left out, because check would "
+            f"take longer than half a minute: {', '.join(findings.omitted)}. Use a coarser mesh{edges}, "
+            "or check --full.",
             "check",
         )
     if findings.causes:

@@ -111,7 +111,11 @@ def build_result(answer: SolvedProblem) -> Result:
             constraints=collocation.constraint_count,
             scheme=as_scheme(collocation.scheme).name,
         ),
-        notes=tuple(dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])),
+        notes=tuple(
+            note
+            for note in dict.fromkeys([*problem.notes, *solution.notes, *answer.all_notes])
+            if note not in answer.trust.reasons
+        ),
         history=tuple(solution.history),
         provenance=_provenance(problem),
     )

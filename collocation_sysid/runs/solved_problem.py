@@ -47,9 +47,9 @@ from ..statistics.linearised import DerivedModuli, LinearisedFit
 from ..statistics.profile_likelihood import Profile
 from ..statistics.residuals.diagnostics import MarkerDiagnosis
 from ..statistics.uncertainty import MarkerPlace, Uncertainty, marker_places
-from .check.body import grasp_extent_concerns, grasp_extent_notes
 from .check.modes import ModesCheck
 from .ensemble import draw_samples
+from .facts import facts
 from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed
@@ -226,6 +226,7 @@ class SolvedProblem:
         interruption it is doubtful, and contains concerns about the solution only if the error bars
         were computed.
         """
+        stated = [each for each in facts(self.problem) if isinstance(each, Concern)]
         effects = effect_concerns(self.effects, self.suspects)
         grade = effects[0].grade if effects else None
         if not (self.solution.collocation.nq or self.posterior is None or self.effects):
@@ -269,14 +270,14 @@ class SolvedProblem:
                     *of_fields,
                     *numerical,
                     *([] if effects else meshes),
-                    *grasp_extent_concerns(self.problem),
+                    *stated,
                 )
             )
         interrupted = Concern(
             "solve/interrupted", "doubtful", data={"left_out": self.omitted_checks}
         )
         return Assessment.from_concerns(
-            (interrupted, *(of_fit if self.uncertainty is not None else ()))
+            (interrupted, *stated, *(of_fit if self.uncertainty is not None else ()))
         )
 
     @cached_property
@@ -650,7 +651,6 @@ class SolvedProblem:
         notes = (
             *self.notes,
             *mesh_resolution_notes(self.problem, self.by_mesh),
-            *grasp_extent_notes(self.problem),
             *self.uncertainty.notes,
             *identifiability_sentences(self.uncertainty, self.combinations),
         )

@@ -15,7 +15,7 @@ from ..common.limits import TimeLimitReached, time_limit
 from ..common.step_counting import search_activity
 from ..common.validated_classes import validated
 from ..errors import InputError
-from ..features.measurements import lost_samples, present
+from ..features.measurements import present
 from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..methods.experiment_executors import ExperimentExecutor, connect_executor
@@ -31,6 +31,7 @@ from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
 from .branch_order import with_ascending_times
 from .check.cost import require_memory
+from .facts import facts, sentences
 from .forward_simulation import fit_misfits
 from .several_starts import (
     KnownMinimum,
@@ -146,6 +147,7 @@ def solve(
         problem = Problem.read(problem)
     for experiment in problem.experiments:
         experiment.require_measured_values()
+    known = sentences(facts(problem))
     solver = problem.solver(method)
     warm_start = None if start is None else WarmStart.from_object(start, problem)
     limit_s = solver.max_time_s if isinstance(solver, ReducedSpace) else float("inf")
@@ -173,7 +175,7 @@ def solve(
         solution = replace(solution, message=solution.message.rstrip(".") + f"{remedy}.")
     if solution.status in (Status.STALLED, Status.ITERATION_LIMIT):
         solution = replace(solution, message=f"{solution.message} {_end_of(solution)}")
-    return solution
+    return replace(solution, notes=(*known, *solution.notes))
 
 
 def _end_of(solution: Solution) -> str:
@@ -365,8 +367,6 @@ def _solve_once(
 
 def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart | None) -> Start:
     """Return the start of the search in the nonlinear program of a problem."""
-    for experiment in problem.experiments:
-        lost_samples(experiment)
     collocation = problem.collocation()
     for experiment in collocation.experiments:
         for feature in present(FEATURES, [experiment]):
@@ -397,9 +397,8 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
 
 def _feature_notes(solution: Solution) -> list[str]:
     parts = solution.parts
-    lost = [note for part in parts for note in lost_samples(part.transcription.experiment)]
     features = present(FEATURES, [part.transcription.experiment for part in parts])
-    return lost + [note for part in parts for feature in features for note in feature.notes(part)]
+    return [note for part in parts for feature in features for note in feature.notes(part)]
 
 
 def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:

@@ -39,7 +39,6 @@ from ..statistics.assessment import (
 )
 from ..statistics.concerns import Concern, Grade
 from ..statistics.plausibility import (
-    copied_measurements,
     density_concerns,
     material_hypothesis,
     size_and_density_hypotheses,
@@ -121,7 +120,6 @@ def solution_concerns(
             yield Concern("solve/no-error-bars", "doubtful")
         yield from unknowns
     yield from allowance_concerns(solution)
-    yield from (each.concern() for each in copied_measurements(fitted_experiments))
     yield from outlier_share_concerns(*_outlier_counts(solution))
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)

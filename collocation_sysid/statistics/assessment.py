@@ -58,8 +58,13 @@ from .uncertainty import ErrorBasis, Uncertainty
 
 Verdict = Literal["good", "check", "doubtful"]
 
-# Codes of concerns about bounds from which others may follow.
-FIRST = "information/default-bound", "information/flat", "information/liquid"
+# Codes of concerns about bounds, and about the start, from which others may follow.
+FIRST = (
+    "description/not-at-rest",
+    "information/default-bound",
+    "information/flat",
+    "information/liquid",
+)
 # Codes of hypotheses that stand for several, none of which is likely alone.
 OPEN_CAUSES = "description/several", "description/insufficient"
 # Share of the samples beyond Huber's threshold: "check".

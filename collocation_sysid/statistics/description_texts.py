@@ -50,9 +50,10 @@ MESSAGES = {
     "(x, y, z) from the right by {axes}",
     "markers-axes": "the markers fit with ({axes}) in place of (x, y, z): the axes in their file "
     "are exchanged or reversed; reorder the columns, or rotate the tracks",
-    "mesh-parts": "the mesh consists of {parts} unconnected parts, and no grasp holds {loose} of "
-    "them, the largest with {nodes} nodes: merge coincident nodes, or remove loose parts from "
-    "the mesh",
+    "not-at-rest": "point {point} of '{experiment}' moves by {by} ({sigmas:.2g} times {noise}) in "
+    'the first {still_s:.3g} s, in which the poses stand still, but with start = "equilibrium" the '
+    "body is at rest until a grasp moves: wait before the recording until the body is at rest, or "
+    "let window_s begin when it is",
     "specimen-true-stress": "stresses fit as true stresses (force over deformed area): set "
     'stress = "true", or divide the forces by the undeformed area',
     "specimen-compression": "strains and stresses fit as those of a compression test: set "

@@ -328,7 +328,7 @@ TRACK_FAULTS = {
     ),
     "poses constant": Fault(lambda e, rng: _with_poses(e, constant), ()),
     "simulation reset after NaN": Fault(restarting, ()),
-    "mesh in two parts": Fault(torn, ("mesh-parts",)),
+    "mesh in two parts": Fault(torn, ()),
 }
 
 

@@ -19,7 +19,7 @@ from collocation_sysid.model.forces import Forces
 from collocation_sysid.problem import Problem
 from collocation_sysid.program.modes.natural import natural_modes
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
-from collocation_sysid.runs.check.body import grasp_extent_concerns
+from collocation_sysid.runs.facts import facts
 
 LENGTH_M = 0.1
 END_M = 0.075  # of the gripper, which holds the part above
@@ -105,4 +105,4 @@ def test_the_body_of_a_scan_is_held_up_to_the_box_of_its_grasp(tmp_path, monkeyp
     free_m = np.delete(experiment.body.nodes.points_m, held.nodes, axis=0)
     assert experiment.body.nodes.points_m[held.nodes, 2].min() == 0.047
     assert free_m[:, 2].max() < 0.047
-    assert not grasp_extent_concerns(Problem.read(file))
+    assert not facts(Problem.read(file))

@@ -337,11 +337,18 @@ def test_poses_and_markers_that_share_too_little_are_refused(first_s, shared):
         align([moving_poses(first_s + t)], moving_table(t))
 
 
-def test_gaps_and_jumps_of_poses_are_reported():
+@pytest.mark.parametrize(("early_s", "count"), [(0.5, 1), (2.0, 1), (0.3, 1), (0.05, 0)])
+def test_poses_that_begin_long_before_the_markers_are_noted(early_s, count):
     t = 0.02 * np.arange(51)
-    gappy = moving_poses(np.delete(t, slice(20, 30)), "smooth")
-    (note,) = align([gappy], moving_table(t)).notes
-    assert note.endswith("also across 1 gap in them, the longest from 0.38 s to 0.6 s")
+    poses = moving_poses(0.02 * np.arange(round(-early_s / 0.02), 51))
+    notes = [note for note in align([poses], moving_table(t)).notes if "begin" in note]
+    assert len(notes) == count
+    for note in notes:
+        assert note.startswith(f"the samples begin {-poses.t_s[0]:.6g} s after the poses")
+
+
+def test_jumps_of_poses_are_reported():
+    t = 0.02 * np.arange(51)
     jumping = moving_poses(t, "smooth")
     jumping = replace(jumping, positions_m=jumping.positions_m + np.outer(t > 0.5, [0, 0, 1.0]))
     (note,) = align([jumping], moving_table(t)).notes

@@ -706,3 +706,16 @@ def test_what_libraries_print_about_a_damaged_definition_is_not_shown(tmp_path: 
     assert (ended.code, ended.out) == (2, "")
     assert "the log is damaged" in ended.err
     assert len(ended.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("count", "stamp_s"), [(40, 5.0), (3, 2.5), (12, 0.25)])
+def test_stamps_that_do_not_advance_are_refused(tmp_path: Path, count: int, stamp_s: float) -> None:
+    of = Messages()
+    frozen = [(t, *of.pose(stamp_s, (0, 0, t), STILL)[1:]) for t in T_S[:count]]
+    log = bag(tmp_path / "trial", frozen)
+    message = f"all {count} messages of the topic /gripper have the same stamp, but"
+    with pytest.raises(InputError, match=message):
+        read_poses(f"{log}#/gripper")
+    unset = [(t, *of.pose(-START_S, (0, 0, t), STILL)[1:]) for t in T_S[:count]]
+    poses = read_poses(f"{bag(tmp_path / 'unset', unset)}#/gripper")
+    np.testing.assert_allclose(poses.t_s, T_S[:count], atol=1e-9)

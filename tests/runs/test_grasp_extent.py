@@ -16,7 +16,7 @@ from collocation_sysid.model.parameters import Unknown
 from collocation_sysid.problem import Problem, UncertaintyOptions
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.body import grasp_extent_concerns, grasp_extent_notes, grasp_gaps
+from collocation_sysid.runs.facts import facts, grasp_gaps
 from collocation_sysid.statistics.budget.systematic_effects import Assumptions
 
 # A cube of 100 mm with layers of nodes every 20 mm along z.
@@ -56,7 +56,7 @@ def held_above(height_m: float, axes: str = "xyz", support: str = "", body: Body
     ],
 )
 def test_a_box_that_ends_beyond_its_nodes_is_reported(height_m, gap_mm):
-    concerns = grasp_extent_concerns(held_above(height_m))
+    concerns = facts(held_above(height_m))
     assert [each.code for each in concerns] == (["description/grasp-extent"] if gap_mm else [])
     for concern in concerns:
         assert concern.grade == "check"
@@ -84,17 +84,16 @@ def test_a_held_part_that_ends_raggedly_is_as_short_as_its_volume(rng, element):
 
 def test_planes_of_symmetry_and_platens_are_no_grippers():
     free_along_y = held_above(0.075, axes="xz", support="y")
-    assert grasp_extent_concerns(free_along_y) == []
+    assert facts(free_along_y) == []
 
 
 def test_the_extent_of_a_simulated_grasp_is_a_note():
     problem = held_above(0.075)
-    assert grasp_extent_notes(problem) == []
     simulated = replace(
         problem, uncertainty=UncertaintyOptions(assumptions=Assumptions(damping_law="none"))
     )
-    assert grasp_extent_concerns(simulated) == []
-    (note,) = grasp_extent_notes(simulated)
+    (note,) = facts(simulated)
+    assert isinstance(note, str)
     assert "ends 5 mm beyond" in note
 
 

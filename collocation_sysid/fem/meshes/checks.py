@@ -171,7 +171,8 @@ def clean_mesh(
             f"{len(reversed_elements)} of {len(oriented)} elements had a negative volume and were "
             "re-oriented, which is harmless."
         )
-    notes += _note_parts(used_points, oriented)
+    _, parts = connected_parts(used_points, oriented)
+    notes += (f"The mesh {parts}.",) if parts else ()
     return used_points, oriented, used, tuple(notes)
 
 
@@ -281,14 +282,18 @@ def _require_not_degenerate(points: np.ndarray, tetrahedra: np.ndarray) -> None:
         )
 
 
-def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
-    edges = unique_edges(tetrahedra)
+def connected_parts(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return the number (n,) of the connected part of each node, and what the mesh consists of, as
+    text; "" for one part.
+    """
     n = len(points)
-    graph = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
-    parts, label = connected_components(graph, directed=False)
-    if parts == 1:
-        return ()
-    sizes = ", ".join(str(size) for size in np.sort(np.bincount(label))[:-6:-1])
+    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
+    graph = coo_array((np.ones(len(first)), (first, cells[:, 1:].ravel())), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    parts, nodes = np.unique(label[np.unique(cells)], return_counts=True)
+    if len(parts) == 1:
+        return label, ""
+    sizes = ", ".join(str(size) for size in np.sort(nodes)[:-6:-1])
     twins = n - len(np.unique(points, axis=0))
     hint = (
         f"; {twins} of {n} nodes coincide with other nodes: merge these if the parts should be "
@@ -297,7 +302,8 @@ def _note_parts(points: np.ndarray, tetrahedra: np.ndarray) -> tuple[str, ...]:
         else ""
     )
     return (
-        f"The mesh consists of {parts} unconnected parts (the largest have {sizes} nodes){hint}.",
+        label,
+        f"consists of {len(parts)} unconnected parts (the largest have {sizes} nodes){hint}",
     )
 
 

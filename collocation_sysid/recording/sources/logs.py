@@ -124,9 +124,21 @@ class Log:
     def read(self, topic: str) -> tuple[Array, list[Any]]:
         """Return the times (S,) [s] of the messages of a topic, ascending, see `measurement_time_s`,
         and the messages in this order; of messages with the same time the first is kept.
+
+        Raises
+        ------
+        InputError
+            If all have the same time, but were recorded at different times.
         """
         messages = list(self.messages(topic))
         t_s = [measurement_time_s(each, at_ns, self.start_ns) for at_ns, each in messages]
+        if len({*t_s}) == 1 < len({at_ns for at_ns, _ in messages}):
+            raise InputError(
+                f"all {len(messages)} messages of the topic {topic} have the same stamp, but were "
+                "recorded at different times; expected stamps that advance: set all stamps of the "
+                "topic to zero, for which the times of recording are used, or convert it to a table "
+                "with these times"
+            )
         times, first = np.unique(t_s, return_index=True)
         return times, [messages[k][1] for k in first]
 

@@ -18,7 +18,7 @@ from ...common.array_types import Array
 from ...common.limits import TimeLimitReached, time_limit
 from ...common.serialisation import content
 from ...errors import SimulationError
-from ...features.measurements import lost_samples, present
+from ...features.measurements import present
 from ...features.registry import FEATURES
 from ...fem.schemes import as_scheme
 from ...methods.reduced_space import ReducedSpace
@@ -41,10 +41,11 @@ from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.combinations import Combination, with_something_to_state
 from ...statistics.concerns import Concern
 from ...statistics.hypothesis import Hypothesis, rank
-from ...statistics.plausibility import copied_measurements, size_and_density_hypotheses
+from ...statistics.plausibility import size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..expected_precision import expected_precision, views_note, with_measurements
+from ..facts import facts, sentences
 from .body import (
     BodyCheck,
     ElementShape,
@@ -52,7 +53,6 @@ from .body import (
     check_body,
     check_grasps,
     grasp_concerns,
-    grasp_extent_concerns,
     longest_edges,
     slenderness,
 )
@@ -253,7 +253,7 @@ def check_problem(
     """
     report_progress = report_progress or (lambda _: None)
     began_s = time.perf_counter()
-    lost = [note for each in problem.experiments for note in lost_samples(each)]
+    known = facts(problem)
     collocation = problem.collocation()
     notes = []
     if problem.parameters.names_without_guess:
@@ -326,7 +326,11 @@ def check_problem(
         combinations=combinations,
         omitted=tuple(omitted),
     )
-    concerns = (*_concerns(problem, findings, unstable=unstable), *at_guess)
+    concerns = (
+        *(each for each in known if isinstance(each, Concern)),
+        *_concerns(problem, findings, unstable=unstable),
+        *at_guess,
+    )
     notes += [*start_notes, *(each for m in findings.motions for each in mode_notes(m))]
     chosen_cost = findings.chosen_cost
     notes += cost_notes(chosen_cost, findings.costs) if chosen_cost else []
@@ -352,8 +356,10 @@ def check_problem(
         problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
     )
     notes += [] if rests_on is None else [rests_on.sentence]
-    known = [note for note in problem.notes if note not in findings.warnings]
-    return replace(findings, notes=(*known, *lost, *notes))
+    first = [*problem.notes, *sentences(known)]
+    return replace(
+        findings, notes=(*(note for note in first if note not in findings.warnings), *notes)
+    )
 
 
 def _longer_edges(problem: Problem, search_s: float | None) -> tuple[float, float] | None:
@@ -493,12 +499,11 @@ def _concerns(
     chosen = findings.chosen_cost
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
-        *(cause.concern() for cause in (*findings.causes, *copied_measurements(experiments))),
+        *(cause.concern() for cause in findings.causes),
         *static_concerns(experiments, parameters),
         *scale_concerns(experiments, parameters),
         *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),
         *(each for grasp_check in findings.holds for each in grasp_concerns(grasp_check)),
-        *grasp_extent_concerns(problem),
         *(each for motion in findings.motions for each in mode_concerns(motion)),
         *stability_concerns(unstable),
         *(
@@ -548,7 +553,6 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     InputError
         For a size or a density that no body can have.
     """
-    from ...judge.bodies import loose_parts
     from ...judge.modes import find_misspecifications_by_modes
     from ...judge.registry import SOURCES
 
@@ -562,7 +566,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     by_feature = (
         cause
         for e in problem.experiments
-        for found in (loose_parts, *(each.described for each in present(SOURCES, [e])))
-        for cause in found(e)
+        for source in present(SOURCES, [e])
+        for cause in source.described(e)
     )
     return (*odd, *rank((*by_feature, *doubtful)))

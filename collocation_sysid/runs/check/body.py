@@ -1,9 +1,4 @@
-"""Check of a body: size, mesh, suitability of its elements, and grasps.
-
-A box that ends between two layers of nodes holds only the nodes inside. If the fingers end where
-the box does, the modelled body is free over a longer part than the real one, and its stiffness is
-estimated too high: a cantilever's deflection grows with the third to fourth power of its length.
-"""
+"""Check of a body: size, mesh, suitability of its elements, and grasps."""
 
 from __future__ import annotations
 
@@ -17,12 +12,10 @@ from ...common.array_types import Array
 from ...errors import listed
 from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
-from ...fem.meshes.checks import boundary_of, edge_lengths, mean_ratios
+from ...fem.meshes.checks import edge_lengths, mean_ratios
 from ...fem.meshes.mesh import TetMesh
-from ...fem.meshes.selection import Box, rows_of_faces
 from ...fem.rods import RodMesh
 from ...fem.spatial_field import FieldResolution
-from ...problem import Problem
 from ...recording import Experiment, Grasp
 from ...statistics.concerns import Concern, concern_if
 from ...statistics.plausibility import density_concerns
@@ -447,94 +440,3 @@ def grasp_concerns(grasp_check: GraspCheck) -> list[Concern]:
     return concern_if(
         by_chance, False, code="description/grasp", experiment=grasp_check.experiment, **counts
     )
-
-
-# Distance between the end of the box and the outermost held nodes, as a share of the free length,
-# from which it is reported: it changes the stiffness in bending by 1.5 to 2 %.
-LARGEST_SHARE = 0.005
-# Extent of the held nodes along an axis, as a share of the body's, below which they are one layer,
-# which a box with some margin selects on purpose.
-LAYER_SHARE = 1e-6
-
-
-def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, float, float]]:
-    """Yield the gaps of a grasp that exceed `LARGEST_SHARE` of the free length: axis, distance [m] of
-    the end of the held part from the face of the box, and length [m] of the free part of the body
-    beyond it. The part ends where elements of which all corners are held end, on average.
-
-    None for grasps that are not selected by a box, that hold some axes only (platens and planes of
-    symmetry), or whose nodes are one layer along the axis, and for faces of the box beyond which
-    there is no body.
-    """
-    box = grasp.selection
-    if not isinstance(box, Box) or len(grasp.axes) < 3:
-        return
-    points_m = experiment.body.nodes.points_m
-    centres_m, areas_m2 = _ends_of_held(experiment.body.mesh, grasp)
-    for k, axis in enumerate("xyz"):
-        along_m = points_m[:, k]
-        held_m = along_m[grasp.nodes]
-        if np.ptp(held_m) <= LAYER_SHARE * np.ptp(along_m):
-            continue
-        for direction, face_m in ((1, box.high_m[k]), (-1, box.low_m[k])):
-            facing_m2 = (direction * areas_m2[:, k]).clip(0)
-            if facing_m2.any():
-                reach_m = direction * np.average(centres_m[:, k], weights=facing_m2)
-            else:
-                reach_m = (direction * held_m).max()
-            free_m = (direction * along_m).max() - reach_m
-            gap_m = direction * face_m - reach_m
-            if LARGEST_SHARE * free_m < gap_m < free_m:
-                yield axis, float(gap_m), float(free_m)
-
-
-def _ends_of_held(mesh: TetMesh | RodMesh, grasp: Grasp) -> tuple[Array, Array]:
-    """Return centres (F, 3) [m] and areas with normals (F, 3) [m²] of the faces between the elements
-    of which all corners are held, and others.
-    """
-    if isinstance(mesh, RodMesh):
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    is_held = np.isin(mesh.tetrahedra, grasp.nodes).all(axis=1)
-    faces, _ = boundary_of(mesh.tetrahedra[is_held])
-    triangles_m = mesh.points_m[faces[rows_of_faces(faces, mesh.surface) < 0]]
-    return triangles_m.mean(axis=1), _area_vectors(triangles_m)
-
-
-def grasp_extent_concerns(problem: Problem) -> list[Concern]:
-    """Return a "check" concern for each gap of a grasp, see `grasp_gaps`.
-
-    Empty if the recordings are declared to be simulated (`Problem.is_declared_simulated`), where the grasp
-    of the simulation is usually that of the model.
-    """
-    if problem.is_declared_simulated:
-        return []
-    return list(_gap_concerns(problem))
-
-
-def grasp_extent_notes(problem: Problem) -> list[str]:
-    """Return the same sentences as notes for recordings that are declared to be simulated;
-    otherwise an empty list.
-    """
-    if not problem.is_declared_simulated:
-        return []
-    return [concern.message for concern in _gap_concerns(problem)]
-
-
-def _gap_concerns(problem: Problem) -> Iterator[Concern]:
-    """Yield a concern for each gap of the grasps of the fitted recordings of meshed bodies."""
-    for experiment in problem.experiments:
-        if experiment.validation or experiment.specimen is not None:
-            continue
-        for grasp in experiment.body_grasps:
-            for axis, gap_m, free_m in grasp_gaps(experiment, grasp):
-                yield Concern(
-                    "description/grasp-extent",
-                    "check",
-                    data={
-                        "experiment": experiment.name,
-                        "axis": axis,
-                        "gap_mm": 1e3 * gap_m,
-                        "free_mm": 1e3 * free_m,
-                        "percent": 100 * gap_m / free_m,
-                    },
-                )
