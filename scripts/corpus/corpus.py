@@ -41,6 +41,7 @@ import collocation_sysid as cs
 Row = dict[str, Any]
 Table = dict[str, Row]
 PAGE = ROOT / "docs" / "studies" / "corpus.md"
+TEMPLATE = Path(__file__).with_name("page.md")
 # Topics and codes that state a misfit, or that something is not determined, without a cause.
 OPEN = re.compile(
     r"(noise|residuals|solve|roll-out|information|scheme|mesh|scale|prediction)/|"
@@ -395,7 +396,7 @@ def page(tables: Mapping[str, Table]) -> str:
         "mistakes: not good",
         "median CPU s",
     ]
-    return PAGE_TEXT.format(
+    return TEMPLATE.read_text(encoding="utf-8").format(
         code=row["code"],
         date=max(each["date"] for each in table.values()),
         summary=summary(columns),
@@ -429,42 +430,6 @@ def _cells(row: Row) -> list[str]:
     reason = f"{row['reason']}{' (wrong)' * is_wrong(row)}"
     return [row["name"], row["mistake"] or "–", row["verdict"], reason or "–", "; ".join(found)]
 
-
-PAGE_TEXT = """# The corpus
-
-**Question.** How often are answers right, verdicts right and causes right, and what do they cost?
-
-`python scripts corpus` solves recordings with known truth, in one process on one core, and
-`python scripts corpus --page` writes this page. They are recordings of other programs and of this one,
-shipped problems, and measured data, where the agreement of repeats stands in place of a truth. Half of
-them have a hidden mistake. *Inside* counts the combined 95 % intervals of faultless recordings that
-contain the truth. A first reason is *wrong* if it names a cause that is not that of the mistake; a reason
-that only states a misfit is not. Commit {code}, {date}.
-
-{summary}
-
-## Since 0.5.0
-
-Both versions were measured on one core of the same machine, while another program used the other core. What became worse, with its cause:
-
-- **Time of the scan of the stiffness.** On `foam_cylinder/recording.toml` 14 trials simulate 640 rows in place of 350
-  for 15, because the first part of a recording ends where a share of the motion has been seen, not of the samples, and
-  each trial makes four fits of poses and clocks (56, a quarter of the time of the scan). Both came with one change, by
-  which scans find recordings that begin at rest. A profile counts 1.79 million calls in place of 1.17 million, with
-  10 iterations in place of 12.
-- **The first solve of a process** costs two to three times the second in both versions (8.6 and 8.9 s, 3.3 and 4.4 s
-  here): code of expressions is generated and modules are loaded.
-
-## Kinds
-
-{kinds}
-
-## Recordings
-
-Values and half widths are over the truth; ** is an interval that does not contain it.
-
-{recordings}
-"""
 
 if __name__ == "__main__":
     main()
