@@ -231,28 +231,25 @@ class _Refits:
 
     def accepted(self, tested: Hypothesis) -> Hypothesis | None:
         """Return the hypothesis with its strength and what remains, if it decreases the discrepancy
-        by `BETTER`; None else. A size is estimated again at the refit.
+        by `BETTER`; None else. A size is estimated again at each refit.
         """
         stated = self.fit(None)
         remaining = self._remaining(tested)
         if stated is None or remaining is None:
             return None
         misfit = max(map(discrepancy, stated.parts))
-        row, refit = tested.doubt, self.known.get(tested.corrected)
-        if (
-            self.sweeps > 0
-            and 1.0 < remaining < misfit
-            and row is not None
-            and row.wide > 0
-            and refit is not None
-        ):
+        row = tested.doubt
+        while row and row.wide > 0 and self.sweeps > 0 and 1.0 < remaining < misfit:
+            if (refit := self.known[tested.corrected]) is None:
+                break
             again = TestedFit(self.whole, refit)
             same = [each for each in motion_rows(again) if each.key == row.key]
-            for _, step in again.linear_steps(same[:1]):
-                other = row.hypothesis(self.stated[0], tested.size + step)
-                left = other and self._remaining(other)
-                if other and left is not None and left < remaining:
-                    tested, remaining = other, left
+            steps = [step for _, step in again.linear_steps(same[:1])]
+            other = row.hypothesis(self.stated[0], tested.size + steps[0]) if steps else None
+            left = other and self._remaining(other)
+            if other is None or left is None or left >= remaining:
+                break
+            tested, remaining = other, left
         strength = misfit / max(remaining, LEAST_MISFIT)
         if strength > BETTER:
             return replace(tested, strength=strength, remaining=remaining)

@@ -162,15 +162,17 @@ class ModalComparison:
         """
         return self._misfit_with(self.response, declared)
 
-    def misfit_at_implied_places_m(self, declared: DeclaredMotion) -> float:
-        """Return the misfit of a corrected description as `misfit_m` does, with the markers at the
-        places on the body that this description implies [m].
+    def misfit_at_implied_places(self, declared: DeclaredMotion) -> float:
+        """Return the misfit of a description over the extent of its tracks, with the markers at the
+        places on the body that this description implies: tracks that shrink fit nothing better.
 
         A marker without a stated place is attached where its first sample is on the body as the
         grasp carries it; poses with a mistake attach it to a wrong place, and correct poses alone
         would not fit there.
         """
-        return self._misfit_with(self._response_at_implied_places(declared), declared)
+        misfit_m = self._misfit_with(self._response_at_implied_places(declared), declared)
+        tracks_m = declared.tracks_m
+        return misfit_m / float(np.sqrt(np.nanvar(tracks_m, axis=(0, 1)).sum()))
 
     def _misfit_with(self, response: ModalResponse, declared: DeclaredMotion) -> float:
         return float(self._misfits_m(declared, response.predict(declared)).min())
@@ -179,12 +181,10 @@ class ModalComparison:
         """Return the response with the markers without a stated place attached to the point of the
         body that is nearest to their first sample in the frame of the grasp.
 
-        The response is unchanged if all places are stated, or if the rotations are. With another
-        unit of length, the places have no meaning: tracks that shrink to a point fit anywhere.
+        The response is unchanged if all places are stated.
         """
         markers = self.experiment.markers
-        has_same_rotations = declared.rotations is self.declared.rotations
-        if has_same_rotations or markers.located.all():
+        if declared is self.declared or markers.located.all():
             return self.response
         body = self.experiment.body
         in_grasp_m = declared.to_grasp_frame(declared.tracks_m)
@@ -214,7 +214,7 @@ class ModalComparison:
         strength.
         """
         declared = self.declared
-        at_places = self.misfit_at_implied_places_m
+        at_places = self.misfit_at_implied_places
         yield from accepted(simple_rows(declared), declared, at_places)
         fitted = [*self._frame_rows(), *self._clock_rows()]
         yield from accepted(fitted, declared, self.misfit_m)
@@ -222,15 +222,14 @@ class ModalComparison:
         yield from self._other_axes()
 
     def _other_axes(self) -> Iterator[Hypothesis]:
-        predicted = self.response.predict(self.declared)
-
-        def remaining_misfit(tracks_m: Array) -> float:
-            turned = replace(self.declared, tracks_m=tracks_m)
-            return float(self._misfits_m(turned, predicted).min())
-
         tracks_m = self.declared.tracks_m
-        rows = _axes(f"'{self.declared.name}'", tracks_m)
-        yield from accepted(rows, tracks_m, remaining_misfit)
+
+        def remaining_misfit(turned_m: Array) -> float:
+            is_stated = turned_m is tracks_m
+            turned = self.declared if is_stated else replace(self.declared, tracks_m=turned_m)
+            return self.misfit_at_implied_places(turned)
+
+        yield from accepted(_axes(f"'{self.declared.name}'", tracks_m), tracks_m, remaining_misfit)
 
     def _misfits_m(self, declared: DeclaredMotion, predicted: Array) -> Array:
         """Return the misfit (S,) [m] of each prediction (S, T, M, 3): the root of the mean squared

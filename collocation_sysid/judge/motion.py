@@ -23,7 +23,7 @@ from .bodies import body_rows, mirrored_meshes
 from .doubt import Correction, Doubt, clock_data
 from .fit import Candidate, TestedFit
 from .modes import ModalComparison, other_gravity
-from .sensors import sensor_candidates
+from .sensors import sensor_candidates, unknown_tools
 
 # Deviation of a clock in the linear step [s].
 WIDE_LAG_S = 0.1
@@ -44,6 +44,7 @@ def motion_rows(fit: TestedFit) -> Iterator[Doubt]:
     if not fit.experiment.is_static:
         yield from _clock(fit)
     yield from _layers(fit)
+    yield from unknown_tools(fit)
     yield from body_rows(fit.part)
 
 

@@ -625,10 +625,11 @@ class Posterior:
         return tuple(sorted(found, key=lambda each: -abs(each.surprise)))
 
     def suspected(self, others: Effects, errors: ErrorModel) -> tuple[EffectEstimate, ...]:
-        """Return those of other effects with which the least loss decreases most (`AS_WELL`), with the
-        root of the decrease as surprise. Their priors have the mean zero and the deviations of the
-        columns; columns of one name count together. Those that cannot be negative and would be are left
-        out.
+        """Return those of other effects that explain the residuals best (`AS_WELL`), with the root of
+        twice the logarithm of their Bayes factor as surprise: the decrease of the least loss, less
+        what columns with so wide priors decrease by chance. Their priors have the mean zero and the
+        deviations of the columns; columns of one name count together. Those that cannot be negative
+        and would be are left out.
         """
         fit = self.considered.expected_in(self.fit)
         before = least_squares_of_fit(fit).loss(self.step)
@@ -638,7 +639,10 @@ class Posterior:
             wide, _ = replace(own, means=np.zeros(len(own.names))).added_to(fit, self.parameters)
             step = gauss_newton_step(wide)
             if step[len(fit.names) :].min() > 0 or not effect_row(name).is_one_sided:
-                gain = max(0.0, before - least_squares_of_fit(wide).loss(step))
+                squares = least_squares_of_fit(wide)
+                left = np.linalg.pinv(squares.information, hermitian=True)[len(fit.names) :]
+                chance = np.linalg.slogdet(left[:, len(fit.names) :]).logabsdet
+                gain = max(0.0, before - squares.loss(step) + float(chance))
                 count = fit.effect_count + len(own.names)
                 found.append((gain, name, replace(wide.after_step(step), effect_count=count)))
         most = max((gain for gain, *_ in found), default=0.0)

@@ -16,7 +16,8 @@ from ..recording.custom_sensor import CustomSensor
 from ..recording.experiment import Experiment
 from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement, root_mean
-from ..recording.nuisance import TOOL_CENTRE, TOOL_MASS
+from ..recording.nuisance import KINDS, TOOL_CENTRE, TOOL_MASS
+from ..statistics.budget.consider_analysis import changes_of_nuisances
 from ..statistics.scale_identifiability import relative_moduli
 from ..statistics.thresholds import BETTER, NOISE
 from .doubt import Correction, Doubt
@@ -30,6 +31,25 @@ SAME_SIZE = 3.0
 MOST_UNITS = 2
 # Most sweeps of a fit of all other measurements.
 MOST_SWEEPS = 40
+
+
+def unknown_tools(fit: TestedFit) -> Iterator[Doubt]:
+    """Yield the row of a mass between wrench sensors and the body that the description lacks."""
+    nuisance = fit.experiment.nuisance
+    if nuisance.tool_kg or not any(grasp.wrench for grasp in fit.experiment.grasps):
+        return
+
+    def correct(experiment: Experiment, size: Array) -> Correction:
+        tool_kg = float(size.max())
+        if tool_kg <= 0:
+            return None
+        prior = {TOOL_MASS.name: 3 * tool_kg, TOOL_CENTRE.name: TOOL_CENTRE.reference}
+        other = replace(experiment, nuisance=replace(experiment.nuisance, **prior))
+        return other, {"tool_g": 1e3 * tool_kg}
+
+    exact = dict.fromkeys((row.name for row in KINDS), None) | {TOOL_MASS.name: 1.0}
+    changes = changes_of_nuisances(fit.solution.collocation, fit.solution.z, exact).blocks
+    yield Doubt("sensor-tool", "kg", correct, changes=changes, mean=0.0, wide=1.0)
 
 
 def sensor_candidates(fit: TestedFit) -> Iterator[Candidate]:

@@ -149,6 +149,7 @@ PLACE = Deviation(
     changes=(),
     reach=UNLIMITED_REACH,
     step=_largest_place_step_m,
+    largest=0.03,
     label="place of {which}, {axis}",
     description="errors of the positions in reference_m without a reference_sigma_m; they rotate "
     "with the body",

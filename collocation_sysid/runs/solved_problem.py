@@ -231,7 +231,7 @@ class SolvedProblem:
         grade = effects[0].grade if effects else None
         if not (self.solution.collocation.nq or self.posterior is None or self.effects):
             grade = "doubtful"  # nothing but the stated constants explains a difference
-        of_fit = tuple(
+        of_fit = list(
             solution_concerns(
                 self.solution,
                 self.rollouts,
@@ -244,6 +244,10 @@ class SolvedProblem:
                 and "time_step" in self.posterior.considered.names,
             )
         )
+        # What is far from its prior hides another error if it cannot be so far, or leaves residuals.
+        leaves = any(e.code == "noise/larger" and e.grade == "doubtful" for e in of_fit)
+        hiding = "nuisance/" if leaves else "nuisance/large"
+        of_fit.sort(key=lambda each: each.code.startswith(hiding))
         if not self.solution.collocation.nq:
             effects = []
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
@@ -258,14 +262,18 @@ class SolvedProblem:
             known = [replace(each, grade=effects[0].grade) for each in meshes] if effects else []
             # What is farther from its prior than an effect may distort the effects.
             surprise = effects[0].data["surprise"] if effects else np.inf
-            farther = [each for each in of_fit if each.data.get("deviations", 0.0) > surprise]
+            farther = [
+                each
+                for each in of_fit
+                if each.data.get("deviations", 0.0) > surprise and not each.code.startswith(hiding)
+            ]
             return Assessment.from_concerns(
                 (
-                    *(each for each in causes if each.code not in OPEN_CAUSES),
+                    *(e for e in causes if e.code not in OPEN_CAUSES or e.grade == "doubtful"),
                     *known,
                     *farther,
                     *effects,
-                    *(each for each in causes if each.code in OPEN_CAUSES),
+                    *causes,
                     *(each for each in of_fit if each not in farther),
                     *of_fields,
                     *numerical,

@@ -147,7 +147,9 @@ TOPICS: dict[str, Topic] = {
         "all of them.",
         messages={
             "surprising": "the residuals need {effect}: {surprise:.1f} standard deviations"
-            "{alike}; {remedy}, and check what else the description lacks"
+            "{alike}; {remedy}, and check what else the description lacks",
+            "impossible": "the residuals look like those of {effect}, which is not possible: check "
+            "what the description lacks",
         },
     ),
     "information": Topic(

@@ -20,6 +20,10 @@ MESSAGES = {
     "film: divide t_s of the markers by {factor:g}",
     "clock": "the markers' clock is {when} by about {by_ms:.3g} ms relative to that of the "
     "poses: {do} t_s of the poses, or estimate it with nuisance.time_shift",
+    "end-mass": "a mass of about {mass_g:.2g} g hangs at the end and is not stated: weigh it, and state "
+    "it in [[experiment.mass]]",
+    "sensor-tool": "the force sensor carries about {tool_g:.2g} g besides the body, with which it was "
+    "not zeroed: estimate it with nuisance.tool, or zero the sensor with the gripper and its tool",
     "grasp-layer": "the fit is better if the grasp holds one layer of nodes {deep} than stated: "
     "compare the box of grasp.nodes with the ends of the fingers",
     "markers-exchanged": "the names of markers are exchanged: {names}; correct markers.labels or "

@@ -44,7 +44,7 @@ PAGE = ROOT / "docs" / "studies" / "corpus.md"
 TEMPLATE = Path(__file__).with_name("page.md")
 # Topics and codes that state a misfit, or that something is not determined, without a cause.
 OPEN = re.compile(
-    r"(noise|residuals|solve|roll-out|information|scheme|mesh|scale|prediction)/|"
+    r"(noise|residuals|solve|roll-out|information|scheme|mesh|scale|prediction)/|nuisance/large|effect/impossible|"
     r"description/(several|insufficient)|specimen/(persist|stress|stresses|none|outlier)$"
 )
 # A changed answer is more than this share of its standard uncertainty away.

@@ -42,6 +42,13 @@ class EffectEstimate:
     # Estimate of the data alone: they hardly change the posterior of what they hardly show.
     needed: float = np.nan
 
+    @property
+    def is_possible(self) -> bool:
+        """Whether what it describes can have the size that the data need."""
+        row = effect_row(self.name)
+        least = 0.0 if row.is_one_sided else -row.largest
+        return not self.deviation or least <= self.needed <= row.largest
+
     @classmethod
     def beyond(cls, name: str, gain: float, suffices: bool) -> EffectEstimate:
         """Return an effect beyond the budget that decreases χ² by `gain`; its size is not known, because
@@ -97,9 +104,10 @@ def effect_concerns(
     description; else empty.
 
     It names the most surprising effect, or that of `suspects` beyond the budget which suffices and is
-    more surprising, and others that look alike or explain the residuals as well (`AS_WELL`). The
-    probability that any of the effects is so surprising by chance (Bonferroni) is below `CHANCE`, or
-    below `RARE`, which is doubtful.
+    more surprising, and others that look alike or explain the residuals as well (`AS_WELL`). What
+    cannot be as large as the data need is named only as what the residuals look like. The probability
+    that any of the effects is so surprising by chance (Bonferroni) is below `CHANCE`, or below `RARE`,
+    which is doubtful.
     """
     named = [*effects, *(each for each in suspects if each.suffices)]
     if not named:
@@ -109,16 +117,18 @@ def effect_concerns(
     if abs(worst.surprise) <= limit:
         return []
     known = sorted((*suspects, *effects), key=lambda each: -abs(each.surprise))
-    instead = [each.name for each in known if each.surprise**2 > AS_WELL * worst.surprise**2]
-    row = effect_row(worst.name)
-    alike = [name for name in (*instead, *worst.alike) if effect_row(name) is not row]
+    as_well = [each for each in known if each.surprise**2 > AS_WELL * worst.surprise**2]
+    likely = [each for each in named if each in as_well or each in suspects]
+    first = worst if worst.is_possible else next((e for e in likely if e.is_possible), worst)
+    row = effect_row(first.name)
+    instead = (each.name for each in as_well if each.is_possible)
+    alike = [name for name in (*instead, *first.alike) if effect_row(name) is not row]
     others = [*dict.fromkeys(map(source_label, alike))][:MOST_NAMED]
     data = {
-        "effect": worst.describe(),
-        "surprise": abs(worst.surprise),
+        "effect": first.describe(),
+        "surprise": abs(first.surprise),
         "alike": f"; {listed(others)} would look the same" if others else "",
         "remedy": row.remedy,
     }
-    return [
-        Concern("effect/surprising", "doubtful" if abs(worst.surprise) > gross else "check", data)
-    ]
+    code = "effect/surprising" if first.is_possible else "effect/impossible"
+    return [Concern(code, "doubtful" if abs(worst.surprise) > gross else "check", data)]

@@ -37,6 +37,7 @@ from ...model.parameters import Parameters
 from ...program.collocation import ExperimentIterate
 from ...program.reactions.forces import forces_on_dofs, reaction_forces
 from ...recording.deviation import Deviation
+from ...recording.experiment import Experiment
 from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import (
     CELL_SIZE_M,
@@ -626,6 +627,58 @@ def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(at.weight_and_drag(mass_kg), mass_kg)
 
 
+def end_mass_effect(at: ExperimentAtAnswer, _: int) -> Effect:
+    """Return the effect per kilogram at the free end of a rod, see `free_end`."""
+    mass_kg = np.zeros(at.body.nodes_m.size)
+    mass_kg[3 * free_end(at.iterate.transcription.experiment)[:, None] + np.arange(3)] = 1 / 3
+    return Effect(at.weight_and_drag(mass_kg), mass_kg)
+
+
+def free_end(experiment: Experiment) -> Index:
+    """Return the three nodes of the end of a rod that is farther from what holds it."""
+    held = np.concatenate([grasp.nodes for grasp in experiment.body_grasps])
+    mesh = experiment.body.mesh
+    count = len(mesh.points_m)
+    return np.arange(3) if held.mean() > count / 2 else np.arange(count - 3, count)
+
+
+def _length(at: ExperimentAtAnswer, _: int) -> Effect | None:
+    """Return the effect of a rod that is longer by a share, with the places on it; None for another
+    body.
+    """
+    mesh = at.body.mesh
+    if not isinstance(mesh, RodMesh):
+        return None
+    centres_m = mesh.centres_of_sections_m
+    moved_m = np.zeros_like(at.body.nodes_m)
+    moved_m[: 3 * len(centres_m)] = np.repeat(centres_m - centres_m[0], 3, axis=0)
+    longer = shape_effect(at, moved_m)
+    assert longer.force_n is not None
+    weight_n = at.weight_and_drag(at.own_mass_kg)
+    return replace(longer, force_n=longer.force_n + weight_n, mass_kg=at.own_mass_kg)
+
+
+def _grip_turn(at: ExperimentAtAnswer, axis: int) -> Effect | None:
+    """Return the effect of a gripper that gives way about an axis of the world in proportion to the
+    torque of the body on it, by one radian at the largest torque; None for a bench.
+    """
+    experiment = at.iterate.transcription.experiment
+    if experiment.is_static:
+        return None
+    prescribed = at.iterate.equations.prescribed
+    displacement_m = np.zeros_like(prescribed.positions_m)
+    for grasp in experiment.body_grasps:
+        if len(grasp.axes) < len(_AXES):
+            continue
+        columns = np.searchsorted(prescribed.dofs, 3 * grasp.nodes[:, None] + np.arange(3))
+        places_m = np.nan_to_num(prescribed.positions_m[:, columns])
+        arms_m = places_m - places_m.mean(axis=1, keepdims=True)
+        torque_n_m = -np.cross(arms_m, at.grasp_force_n[:, columns]).sum(axis=1)[:, axis]
+        share = torque_n_m / (np.abs(torque_n_m).max() or 1.0)
+        displacement_m[:, columns] = np.cross(np.outer(share, np.eye(3)[axis])[:, None], arms_m)
+    return Effect(displacement_m=displacement_m) if displacement_m.any() else None
+
+
 def _grip(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect per metre of a massless layer of the body's material under grippers."""
     return at.effect_of_grips
@@ -741,7 +794,10 @@ def _effective_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return `_gauge_length` for grips: shoulders of a dogbone stretch less than the middle."""
     experiment = at.iterate.transcription.experiment
     deformation = experiment.specimen
-    if deformation is None or not deformation.is_displacement or deformation.lateral == "":
+    if deformation is None or deformation.lateral == "":
+        return None
+    # Strains beside a length and an area were computed from the displacement of the grips.
+    if not (deformation.is_displacement or deformation.area_over_length_m):
         return None
     is_pulled = specimen_strains(experiment)[0].max() > 0
     return _gauge_length(at, 0) if is_pulled else None
@@ -992,6 +1048,7 @@ ASSUMPTIONS = (
         considered=0.01,
         description="relative error of the size of the mesh",
         remedy="measure two lengths of the real body and scale the mesh to them",
+        largest=0.3,
         effect=_size,
         by_origin={"cast": 0.005, "printed": 0.005, "tissue": 0.02},
     ),
@@ -1034,6 +1091,7 @@ ASSUMPTIONS = (
         considered=0.01,
         description="relative error of the mass of the body, if the mass is not estimated",
         remedy="weigh the body",
+        largest=1.0,
         effect=_mass,
     ),
     Deviation(
@@ -1053,6 +1111,7 @@ ASSUMPTIONS = (
         description="relative difference of the density at one end of the body from that in "
         "its middle",
         remedy="weigh two halves of a specimen",
+        largest=1.0,
         effect=_density_gradient,
         axes="x y z",
         by_origin={"cast": 0.01, "printed": 0.02, "tissue": 0.02},
@@ -1064,6 +1123,7 @@ ASSUMPTIONS = (
         description="relative difference of the stiffness at one end of the body from that in "
         "its middle",
         remedy="press specimens from both ends of the body, or estimate a field of the stiffness",
+        largest=1.0,
         effect=_stiffness_gradient,
         axes="x y z",
         by_origin={"cast": 0.015, "foam": 0.1, "printed": 0.03, "tissue": 0.15},
@@ -1085,6 +1145,7 @@ ASSUMPTIONS = (
         considered=0.02,
         description="relative change of the stiffness from the beginning to the end of a recording",
         remedy="repeat the first recording at the end",
+        largest=1.0,
         effect=_drift,
         by_origin={"tissue": 0.05},
         of_specimens=True,
@@ -1107,6 +1168,7 @@ ASSUMPTIONS = (
         considered=1e-4,
         description="relative error of the rate of all clocks",
         remedy="compare all clocks with a reference clock",
+        largest=0.01,
         effect=_time_scale,
     ),
     Deviation(
@@ -1150,12 +1212,32 @@ ASSUMPTIONS = (
         redefines=(GAMMA_R.name, GAMMA_M.name),
     ),
     Deviation(
+        "length",
+        "1",
+        wide=0.05,
+        description="relative error of the length of a rod and of all places along it",
+        remedy="measure the length of the rod and the places of the markers along it",
+        effect=_length,
+    ),
+    Deviation(
+        "grip_turn_rad",
+        "rad",
+        wide=0.02,
+        description="turn by which a gripper gives way at the largest torque of the body, about each "
+        "axis of the world",
+        remedy="attach markers to the gripper beside the body and take the poses from them, or hold the "
+        "body by a stiffer gripper",
+        effect=_grip_turn,
+        axes="x y z",
+    ),
+    Deviation(
         "grip_layer_m",
         "m",
         is_one_sided=True,  # what gives way does not push
         considered=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
         remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
+        largest=0.005,
         effect=_grip,
     ),
     Deviation(
@@ -1166,6 +1248,7 @@ ASSUMPTIONS = (
         "grasped nodes",
         remedy="measure where the gripper ends on the body, and place the edge of the grasped nodes "
         "there",
+        largest=0.02,
         effect=_grasp_edge,
     ),
     Deviation(
@@ -1213,7 +1296,7 @@ ASSUMPTIONS = (
     Deviation(
         "effective_length",
         "1",
-        considered=0.05,
+        considered=0.1,
         description="relative error of length_m as the effective length of a specimen that is pulled "
         "by its grips, because the shoulders of a dogbone stretch less than its narrow part",
         remedy="measure the strain of the narrow part with marks or an extensometer, or state the "
@@ -1291,6 +1374,7 @@ ASSUMPTIONS = (
         considered=AIR_DENSITY_DEVIATION,
         description="relative error of the buoyancy, because of the density of the air",
         remedy="state the density of the air",
+        largest=1.0,
         effect=_buoyancy,
     ),
     Deviation(
@@ -1299,6 +1383,7 @@ ASSUMPTIONS = (
         considered=AIR_COEFFICIENT_DEVIATION,
         description="relative error of the added mass of the air",
         remedy="repeat the motion more slowly, or with a heavier specimen",
+        largest=3.0,
         effect=_added_mass,
     ),
     Deviation(
@@ -1307,6 +1392,7 @@ ASSUMPTIONS = (
         considered=AIR_COEFFICIENT_DEVIATION,
         description="relative error of the drag of the air",
         remedy="repeat the motion more slowly, or with a heavier specimen",
+        largest=10.0,
         effect=_air_drag,
     ),
 )
