@@ -207,7 +207,9 @@ def problem(seed: int, across: int = 2) -> cs.Problem:
 
 def main() -> None:
     require_no_arguments(__doc__)
-    tracks = {str(seed): recorded_m(draw(seed)).astype(np.float32) for seed in SEEDS}
+    tracks: dict[str, Any] = {
+        str(seed): recorded_m(draw(seed)).astype(np.float32) for seed in SEEDS
+    }
     np.savez_compressed(FILE, **tracks)
 
 

@@ -241,7 +241,7 @@ def counts(table: Table) -> dict[str, str]:
             if name in row["constants"] and is_inside(row["constants"][name]) is not None
         ]
         if found:
-            inside = sum(map(is_inside, found))
+            inside = sum(is_inside(each) is True for each in found)
             width = np.median([half_width(each) for each in found])
             head = f"{NAMES.get(name, name)} inside, median half width"
             lines[head] = f"{inside} of {len(found)}, {100 * width:.0f} %"

@@ -98,7 +98,7 @@ def other_solids() -> Iterator[Recording]:
         yield Recording(f"solid/markers/other {name}", make, truth, cause, causes, is_quick)
 
 
-CONSTANTS = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
+CONSTANTS: tuple[str, ...] = ("young_pa", "poisson", "gamma_r_s", "gamma_m_1_s")
 
 
 def _loaded(folder: Path, file: Path) -> cs.Problem:
