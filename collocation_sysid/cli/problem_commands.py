@@ -18,7 +18,7 @@ from ..errors import InputError, SimulationError
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import run
-from ..result.run_record import draw_run
+from ..result.run_record import draw_run, listed_result, write_run
 from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
@@ -100,6 +100,7 @@ def solve(
     problem = source.read_problem(output.quiet)
     require_possible(folder)
     require_replaceable(folder)
+    replaced = listed_result(folder)
     no_output = None
     with ExitStack() as until_saved:
         with shown_progress(problem=problem, quiet=output.quiet, verbose=verbose) as progress:
@@ -125,7 +126,7 @@ def solve(
         # Notes of the problem were shown before.
         with shown_progress("writing the run folder", quiet=output.quiet, verbose=verbose):
             try:
-                finished.save(folder, pictures=False)
+                write_run(finished, finished.result, folder, pictures=False, replaced=replaced)
             except InputError:
                 if output.as_json:
                     typer.echo(as_json(finished.result))
