@@ -341,9 +341,9 @@ def thread_state() -> Threads:
     except ImportError:
         count = os.cpu_count() or 1
         source = "cores of the machine"
-    except ValueError:
+    except ValueError as error:
         count = 1
-        source = f"{variable} = {override!r} is not a whole number"
+        source = str(error)
     return Threads(
         count=count, cores=os.cpu_count() or 1, source=source, memory_mb=machine_memory_mb()
     )

@@ -172,8 +172,9 @@ def main() -> None:
     os.environ["PYTHONSAFEPATH"] = "1"
     if isinstance(sys.stdout, io.TextIOWrapper):  # whose encoding may be ASCII
         sys.stdout.reconfigure(errors="backslashreplace")
-    # Trial steps of a search overflow, and are then shortened.
-    warnings.filterwarnings("ignore", category=RuntimeWarning)
+    # Warnings and logs of libraries are for programmers; trial steps of a search overflow anyway.
+    warnings.simplefilter("ignore")
+    logging.basicConfig(handlers=[logging.NullHandler()])
     try:
         _run_command()
     except KeyboardInterrupt:  # before or after the command itself
@@ -188,8 +189,6 @@ def _run_command() -> None:
         # matplotlib obeys the one in the working folder when it is imported.
         with chdir(Path(__file__).parent):
             import_module("matplotlib")
-    # That it builds its cache of fonts, or where, is no news to who solves a problem.
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         _require_memory()
         _root_command()(prog_name="collocation-sysid")

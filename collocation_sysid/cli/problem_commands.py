@@ -19,7 +19,7 @@ from ..errors import InputError, SimulationError
 from ..methods import require_method
 from ..methods.solution import Status
 from ..pipeline import run
-from ..result.run_record import draw_run
+from ..result.run_record import draw_run, listed_result, write_run
 from ..result.run_writers import require_replaceable
 from ..result.synthesis import Recipe, write_data
 from ..runs.check import check_problem, quick_check
@@ -103,6 +103,7 @@ def solve(
     require_possible(folder)
     require_replaceable(folder)
     problem = replace(problem, notes=(*problem.notes, *sentences(facts(problem))))
+    replaced = listed_result(folder)
     no_output = None
     with ExitStack() as until_saved:
         with shown_progress(problem=problem, quiet=output.quiet, verbose=verbose) as progress:
@@ -128,7 +129,7 @@ def solve(
         # Notes of the problem were shown before.
         with shown_progress("writing the run folder", quiet=output.quiet, verbose=verbose):
             try:
-                finished.save(folder, pictures=False)
+                write_run(finished, finished.result, folder, pictures=False, replaced=replaced)
             except InputError:
                 if output.as_json:
                     typer.echo(as_json(finished.result))

@@ -130,14 +130,14 @@ def float_converter(
     return converted
 
 
-def as_array(values: ArrayLike) -> Array:
+def as_array(values: ArrayLike, name: str = "an array") -> Array:
     """Return the values as an array of their own type, whose mask is kept; converter of fields that
     ``__post_init__`` checks.
     """
     try:
         return np.asanyarray(values)
     except ValueError as error:
-        raise InputError(f"an array has rows of different lengths ({error})") from error
+        raise InputError(f"{name} must hold numbers in rows of equal length") from error
 
 
 def as_array_or_none(values: ArrayLike | None) -> Array | None:
@@ -219,7 +219,7 @@ def read_only_nodes(values: ArrayLike, shape: tuple[int | None, ...], name: str)
         If the values are not whole numbers (of an integer type) from 0 upwards, or the shape
         differs; `name` is what the indices are, for the message.
     """
-    indices = np.asarray(values)
+    indices = as_array(values, name)
     if indices.size and not np.issubdtype(indices.dtype, np.integer):
         raise InputError(
             f"{name} must hold node indices, whole numbers from 0, not {indices.dtype}"
@@ -242,10 +242,12 @@ def _as_array(values: ArrayLike, name: str) -> np.ndarray:
     if hasattr(values, "magnitude") or (isinstance(values, np.ndarray) and hasattr(values, "unit")):
         raise InputError(f"{name} has a unit of its own; expected plain numbers in SI units")
     try:
-        array = np.asanyarray(values)
+        array = as_array(values, name)
         if array.dtype.kind == "O" and array.size and not _holds_truth_or_text(array):
             array = array.astype(np.float64)  # numbers and missing values of tables
         return array if array.size else np.asarray(array, dtype=np.float64)
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must hold numbers: {error}") from error
 

@@ -10,8 +10,8 @@ import re
 import secrets
 import stat
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -260,6 +260,33 @@ def replaced_file(path: str | Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             draft.unlink()
+
+
+def write_new_files(contents: Mapping[Path, str | Path]) -> list[Path]:
+    """Write files, texts or copies of other files, all of them or none, and return their paths.
+
+    Raises
+    ------
+    InputError
+        If a file exists, or cannot be written.
+    """
+    for file in contents:
+        require_possible(file.parent)
+        if file.exists():
+            raise InputError("this file exists already; choose another folder", file)
+    made = [each for file in contents for each in file.parents if not each.exists()]
+    try:
+        with ExitStack() as stack:  # all files appear at its end, or none
+            for file, content in contents.items():
+                draft = stack.enter_context(replaced_file(file))
+                raw = content.encode() if isinstance(content, str) else content.read_bytes()
+                draft.write_bytes(raw)
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # from the deepest folder on, unless others wrote into it
+                folder.rmdir()
+        raise
+    return [*contents]
 
 
 def write_text_file(path: str | Path, text: str) -> None:

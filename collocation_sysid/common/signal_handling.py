@@ -17,12 +17,14 @@ from .starting import leave_at_once
 
 # Name of a thread that is left in a library's code, which no signal reaches.
 ABANDONED_THREAD = "left behind"
-# Files in whose functions an exception may be lost: the importer, and the wrappers of CasADi, whose
-# conversions of arguments call functions of Python and clear their errors. A pool of threads that an
-# exception leaves while it starts one never ends that thread, for which the interpreter then waits.
+# Files in whose functions an exception may be lost: the importer, the wrappers of CasADi and the
+# transforms of matplotlib. Conversions of arguments in C++ call functions of Python and clear their
+# errors. A pool of threads that an exception leaves while it starts one never ends that thread, for
+# which the interpreter then waits.
 LOSING = (
     "<frozen importlib._bootstrap>",
     os.path.join("casadi", "casadi.py"),
+    os.path.join("matplotlib", "transforms.py"),
     os.path.join("concurrent", "futures", "thread.py"),
 )
 # Time after which a deferred signal tries again [s]: a person does not notice it.
@@ -30,11 +32,11 @@ RETRY_S = 0.05
 
 
 class Interrupts:
-    """Handler of signals that raises `KeyboardInterrupt`, but not within imports, functions of CasADi,
-    pools of threads and `deferred`.
+    """Handler of signals that raises `KeyboardInterrupt`, but not within functions of `LOSING` and
+    `deferred`.
 
-    Libraries convert an exception within their imports into an error of their own, and CasADi drops
-    one within its conversions. There the first signal is deferred until the import or the function
+    Libraries convert an exception within their imports into an error of their own, and others drop
+    one within their conversions. There the first signal is deferred until the import or the function
     has ended: it is sent again every `RETRY_S`. A second signal in this time raises at once. At the
     end of a `deferred` block `KeyboardInterrupt` is raised if a signal came meanwhile. The last signal
     is `number`.
@@ -47,7 +49,7 @@ class Interrupts:
         self.number = int(signal.SIGINT)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Defer the signal within an import, a function of CasADi or a `deferred` block."""
+        """Defer the signal within a function of `LOSING` or a `deferred` block."""
         self.number = number
         is_second = self._timer is not None and not self._tries_again
         self._tries_again = False

@@ -57,7 +57,7 @@ def read_text(path: Path, what: str, most: int | None = None) -> str:
         raise InputError(f"this is a folder; expected {what}", path) from None
     except UnicodeDecodeError:
         raise InputError(f"this is not a text file; expected {what}", path) from None
-    except (OSError, MemoryError) as error:
+    except (OSError, MemoryError, ValueError) as error:  # the last for a path that has a NUL byte
         raise InputError(f"the file cannot be read ({reason(error)})", path) from error
 
 
@@ -86,17 +86,15 @@ def parse_yaml(text: str) -> Any:
     """
     import yaml  # only logs and cameras have such files
 
-    # libyaml, the loader in C, ends the process at deep nesting with some versions of PyYAML.
-    loader = yaml.SafeLoader(text)
     try:
+        # libyaml, the loader in C, ends the process at deep nesting with some versions of PyYAML.
+        loader = yaml.SafeLoader(text)  # which refuses control characters
         root = loader.get_single_node()
         if _value_count(root, {}) > len(text):
             raise ValueError("aliases stand for more values than the text has characters")
         return None if root is None else loader.construct_document(root)
     except (yaml.YAMLError, *DAMAGE) as error:  # constructors of values raise anything
         raise ValueError(reason(error)) from error
-    finally:
-        loader.dispose()
 
 
 def _value_count(node: Any, known: dict[int, float]) -> float:

@@ -307,12 +307,16 @@ def form_of(annotation: Any, names: Mapping[str, Any]) -> Any:
 
 def _listed(value: Any) -> Any:
     """Return a single object as a list of one, and other containers than tables as a tuple."""
-    if isinstance(value, str) or not isinstance(value, Iterable):
+    if _is_single(value):
         return (value,)
     if isinstance(value, list | tuple):
         return tuple(value)
     is_list = not isinstance(value, Mapping | bytes) and np.ndim(cast(Any, value)) == 1
     return tuple(value) if is_list else value
+
+
+def _is_single(value: Any) -> bool:
+    return isinstance(value, str) or not isinstance(value, Iterable)
 
 
 def validate_as(annotation: Any, value: Any, name: str) -> Any:
@@ -348,11 +352,11 @@ def _part_at_fault(value: Any, fault: Mapping[str, Any]) -> tuple[str, Any]:
     """Return the place in a value that is at fault, see `Refusal`, and what was found there."""
     part = ""
     for each in fault["loc"]:
-        if isinstance(each, int) and np.ndim(cast(Any, value)):
-            part += f"[{each}]"
-        elif isinstance(value, Mapping) and each in value:
+        if isinstance(value, Mapping) and each in value:
             part += f".{each}"
             value = value[each]
+        elif isinstance(each, int) and not _is_single(value):
+            part += f"[{each}]"
     return part, fault["input"]
 
 

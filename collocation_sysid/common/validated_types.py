@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import Annotated, Any
 
@@ -56,7 +57,26 @@ def _require_ascending(shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _number_unless_array(value: Any, validated: ValidatorFunctionWrapHandler) -> Any:
-    return value if np.ndim(value) else validated(value)
+    with suppress(ValueError):  # for rows of different lengths
+        if np.ndim(value):
+            return value
+    return validated(value)
+
+
+def _require_file_name(name: str) -> str:
+    r"""Return a name unchanged if it can be part of a file name on every platform: printable, not
+    empty, no leading dot, and none of / \ : * ? " < > |; raise `ValueError` otherwise.
+    """
+    if (
+        not name.isprintable()
+        or name[:1] in ("", ".")
+        or any(mark in name for mark in '/\\:*?"<>|')
+    ):
+        raise ValueError(
+            f"found {name!r}; expected a valid file name: not empty, no leading dot, none of / \\ "
+            ': * ? " < > |'
+        )
+    return name
 
 
 _Usual = AfterValidator(_of_usual_size)
@@ -79,6 +99,7 @@ Flag = Annotated[bool, Field(strict=True), _Scalar]
 # Growing first parts of a whole.
 Shares = Annotated[tuple[Positive, ...], AfterValidator(_require_ascending)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
+FileName = Annotated[str, Field(strict=True), AfterValidator(_require_file_name)]
 
 _EXPECTED = {
     "float_type": "a number",

@@ -6,10 +6,9 @@ which a wheel contains beside them (`force-include` in pyproject.toml).
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
-from ..common.files import replaced_file, require_possible, write_text_file
+from ..common.files import write_new_files
 from ..common.validated_classes import validated
 from ..errors import InputError, hint_at
 from ..problem import Problem
@@ -102,37 +101,20 @@ def copy_dataset(name: str, folder: Path) -> list[Path]:
     Raises
     ------
     InputError
-        If there is no dataset of this name, one of the files exists, or the folder cannot be
-        created. If a file exists, nothing is copied.
+        If there is no dataset of this name, or one of the files exists or cannot be written;
+        nothing is copied then.
     """
     source = dataset_folder(name)
     problem_file = source / DATASETS[name]
     others = sorted(file for file in source.iterdir() if file.is_file() and file != problem_file)
     if name in THIRD_PARTY_LICENCES:
         others.append(_IN_PACKAGE / THIRD_PARTY_LICENCES[name])
-    require_possible(folder)
     url = schema_url()
-    copies = {file: folder / file.name for file in (problem_file, *others)}
-    schema = [] if url else [folder / SCHEMA_FILE]
-    for copy in (*copies.values(), *schema):
-        if copy.exists():
-            raise InputError(
-                "this file exists already; expected a folder without it: choose another folder",
-                copy,
-            )
-    for file, copy in copies.items():
-        _copy_file(file, copy, schema=url or SCHEMA_FILE)
-    for file in schema:
-        write_text_file(file, schema_text())
-    return [*copies.values(), *schema]
-
-
-def _copy_file(file: Path, copy: Path, schema: str) -> None:
-    """The schema that the first line of a TOML file names is replaced by `schema`."""
-    if file.suffix == ".toml":
-        text = file.read_text(encoding="utf-8")
-        if text.startswith(_SCHEMA_COMMENT):
-            write_text_file(copy, with_schema_reference(text, schema))
-            return
-    with replaced_file(copy) as draft:
-        shutil.copyfile(file, draft)
+    contents: dict[Path, str | Path] = {}
+    for file in (problem_file, *others):
+        text = file.read_text(encoding="utf-8") if file.suffix == ".toml" else ""
+        has_schema = text.startswith(_SCHEMA_COMMENT)
+        content = with_schema_reference(text, url or SCHEMA_FILE) if has_schema else file
+        contents[folder / file.name] = content
+    contents |= {} if url else {folder / SCHEMA_FILE: schema_text()}
+    return write_new_files(contents)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
 from ..common.validated_classes import validated
-from ..common.validated_types import Positive, Text
+from ..common.validated_types import FileName, Positive
 from ..errors import InputError, hint_at
 from .laws.constants import DENSITY, FIELD_COEFFICIENT, GAMMA_M, MASS, TAU, Constant
 from .laws.damping_admissibility import require_admissible_damping
@@ -67,7 +67,7 @@ class Region:
         If the name is empty or has other characters.
     """
 
-    name: Text
+    name: FileName
     cells: Selection | ArrayLike
     material: str | Energy | Material | None = None
     density_kg_m3: Positive | None = None

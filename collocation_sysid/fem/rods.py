@@ -23,7 +23,6 @@ the energy of the strain of both sections, with `SECTION_STIFFNESS`, which keeps
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 from typing import Literal
@@ -56,15 +55,15 @@ COLUMNS, STRAINS = ROD.columns, ROD.rest_values - 1
 RESULTANTS = STRAINS + 6  # with those of both sections
 
 
-@dataclass(frozen=True)
+@validated
 class CrossSection:
     """Cross-section of a rod, with directors d₁ and d₂ along its principal axes."""
 
-    area_m2: float
+    area_m2: Positive
     # Second moments of area (∫X₂², ∫X₁²) about d₁ and d₂ [m⁴].
-    moments_m4: tuple[float, float]
-    torsion_m4: float  # J of the torsional stiffness G J
-    extent_m: tuple[float, float]  # half widths along d₁ and d₂
+    moments_m4: tuple[Positive, Positive]
+    torsion_m4: Positive  # J of the torsional stiffness G J
+    extent_m: tuple[Positive, Positive]  # half widths along d₁ and d₂
 
     @classmethod
     @validated

@@ -681,7 +681,7 @@ def _variance(at: IntervalCoordinate, middle: float, ends: tuple[float, float]) 
     """
     centre = at.from_value(middle)
     low, high = map(at.from_value, ends)
-    if np.isclose(centre - low, high - centre, rtol=1e-6):
+    if np.isclose(centre - low, high - centre, rtol=1e-6, atol=0):
         return ((high - low) / 2 / NORMAL_95) ** 2
     return float(np.mean([((centre - low) / NORMAL_95) ** 2, ((high - centre) / NORMAL_95) ** 2]))
 

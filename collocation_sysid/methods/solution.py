@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..common.array_types import Array
+from ..common.validated_classes import validated
 from ..errors import InputError, SimulationError, hint_at
 from ..fem.kernels import map_experiments
 from ..program.collocation import Collocation, ExperimentIterate, Violation
@@ -302,6 +303,7 @@ class Solution:
         """Fitted experiments at the solution, in the order of `collocation.transcriptions`."""
         return self.collocation.iterates(self.z)
 
+    @validated
     def nuisance(self, name: str) -> float:
         """Return the value of a nuisance parameter of a recording in its unit.
 

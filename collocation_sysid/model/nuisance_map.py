@@ -749,14 +749,15 @@ def _require_same_prior(
     experiment, second = other
     row = second.row
     label = second.label
-    if not np.isclose(first.sigma, second.sigma, rtol=1e-9):
+    if not np.isclose(first.sigma, second.sigma, rtol=1e-9, atol=0):
         difference = f"'{leader.name}', where the {label} has the prior {first.sigma:g}"
         raise _sharing_error(
             experiment, row, result=difference, expected=f"the same prior as here, {second.sigma:g}"
         )
     if row == PLACE:
         places = [_declared_place(*one), _declared_place(*other)]
-        if not np.allclose(*places, rtol=0, atol=1e-9, equal_nan=True):
+        rounding_m = 1e-9 * np.nanmax(np.abs(places), initial=0.0)
+        if not np.allclose(*places, rtol=0, atol=rounding_m, equal_nan=True):
             difference = (
                 f"'{leader.name}', which states another {label.partition(',')[0]} on the body"
             )

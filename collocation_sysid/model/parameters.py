@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from ..common.array_types import Array
 from ..common.checked_arrays import float_array
 from ..common.validated_classes import validate_as, validated
-from ..common.validated_types import Boundless, Finite, Positive, Text
+from ..common.validated_types import Boundless, FileName, Finite, Positive, Text
 from ..errors import InputError, hint_at
 from ..fem.body import Body
 from ..fem.laws.constants import (
@@ -129,7 +129,7 @@ class Parameter:
         prior.
     """
 
-    name: Text
+    name: FileName
     guess: float | None
     lower: float = 0.0
     upper: float = np.inf

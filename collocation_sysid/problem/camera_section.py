@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from ..common.array_types import Array
 from ..common.schema_tables import Section, Unit, declared_in
-from ..common.validated_types import Finite, Positive, Text
+from ..common.validated_types import FileName, Finite, Positive, Text
 from ..errors import InputError, located
 from ..recording import Depth, DepthCamera, read_poses
 from ..recording.depth_camera import points_from_image, samples_with_outlines
 from ..recording.sources.depth_files import DepthFileContent, read_depth
 from ..recording.sources.units import METRES_PER_UNIT
 from ..recording.time_tables import is_within_experiment
-from .measurement_section import (
-    MeasurementSection,
-    RecordingFolder,
-    existing_file,
-    require_file_name,
-)
+from .measurement_section import MeasurementSection, RecordingFolder, existing_file
 
 
 class DepthCameraSection(Section, of=DepthCamera):
@@ -59,7 +54,7 @@ class DepthSection(MeasurementSection, of=Depth):
         Unit of the coordinates of clouds.
     """
 
-    name: Annotated[str, AfterValidator(require_file_name)] = "depth"
+    name: FileName = "depth"
     file: Text
     camera: DepthCameraSection = Field(default_factory=lambda: DepthCameraSection.model_construct())
     t_s: list[Finite] | None = None

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, create_model
+from pydantic import BeforeValidator, create_model
 
 from ..common.array_types import Array
 from ..common.files import require_regular
 from ..common.schema_tables import Section
+from ..common.validated_types import FileName
 from ..errors import InputError, hint_at, located
 from ..fem.body import Body
 from ..fem.rods import RodMesh
@@ -37,26 +38,10 @@ OWN_TABLES = {
 }
 
 
-def require_file_name(name: str) -> str:
-    r"""Return a name unchanged if it can be part of a file name on every platform: printable, not
-    empty, no leading dot, and none of / \ : * ? " < > |; raise `ValueError` otherwise.
-    """
-    if (
-        not name.isprintable()
-        or name[:1] in ("", ".")
-        or any(mark in name for mark in '/\\:*?"<>|')
-    ):
-        raise ValueError(
-            f"found {name!r}; expected a valid file name: not empty, no leading dot, none of / \\ "
-            ': * ? " < > |'
-        )
-    return name
-
-
 class NamedSection(Section):
     """Table with a name that is also part of file names."""
 
-    name: Annotated[str, AfterValidator(require_file_name)]
+    name: FileName
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
-from ..common.files import replaced_file, require_possible, write_text_file
-from ..errors import InputError
+from ..common.files import write_new_files
 from .editor_schema import SCHEMA_FILE, schema_text, schema_url, with_schema_reference
 
 # A folder for each kind, see scripts/data/make_templates.py.
@@ -38,29 +36,21 @@ def create_problem(folder: Path, kind: str | None = None) -> list[Path]:
     Raises
     ------
     InputError
-        If one of these files exists, or the folder cannot be created; nothing is written then.
+        If one of these files exists or cannot be written; nothing is written then.
     """
     file = folder / "problem.toml"
     template = TEMPLATES / (kind or "swing")
-    require_possible(folder)
     data = sorted(each for each in template.iterdir() if kind and each.name != file.name)
     url = schema_url()
-    schema = [] if url else [folder / SCHEMA_FILE]
-    for each in (file, *(folder / each.name for each in data), *schema):
-        if each.exists():
-            raise InputError("this file exists already; choose another folder", each)
     title = json.dumps(folder.resolve().name, ensure_ascii=False)  # quoted as TOML quotes
     text = (template / file.name).read_text(encoding="utf-8")
     if kind is None:
         text = _without_simulated_settings(text)
     text = with_schema_reference(text, url or SCHEMA_FILE)
-    write_text_file(file, text.replace('title = ""', f"title = {title}", 1))
-    for each in data:
-        with replaced_file(folder / each.name) as draft:
-            shutil.copyfile(each, draft)
-    for each in schema:
-        write_text_file(each, schema_text())
-    return [file, *(folder / each.name for each in data), *schema]
+    contents: dict[Path, str | Path] = {file: text.replace('title = ""', f"title = {title}", 1)}
+    contents |= {folder / each.name: each for each in data}
+    contents |= {} if url else {folder / SCHEMA_FILE: schema_text()}
+    return write_new_files(contents)
 
 
 def _without_simulated_settings(text: str) -> str:

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.array_types import Array, Index
-from ..common.checked_arrays import float_converter, read_only_floats
+from ..common.checked_arrays import float_array, float_converter, read_only_floats
 from ..common.declarations import declaration, key
 from ..common.schema_tables import ByForm, Vector
-from ..common.validated_types import Finite, Flag, NotNegative
+from ..common.validated_types import FileName, Finite, Flag, NotNegative
 from ..errors import InputError, listed
 from ..fem.node_force import AIR_KG_M3
 from .actuator import Actuator
@@ -72,8 +72,9 @@ Temperature = Annotated[list[tuple[Finite, Finite]] | Finite, ByForm(list)]
 
 def _temperature(value: ArrayLike) -> Array:
     """Return times [s] and temperature differences [K] as (k, 2), from a table or one number."""
-    table = [[0.0, value]] if np.ndim(value) == 0 else value
-    return float_converter((None, 2), "temperature_difference_k")(table)
+    name = "temperature_difference_k"
+    given = float_array(value, name)
+    return read_only_floats(given if given.ndim else [[0.0, given]], (None, 2), name)
 
 
 VACUUM = "none"
@@ -195,7 +196,7 @@ class Experiment:
     gravity_m_s2: Array = key(
         Vector, converter=float_converter((3,), "gravity_m_s2"), default=EARTH_M_S2
     )
-    name: str = "experiment"
+    name: str = key(accepted=FileName, default="experiment")
     _: KW_ONLY
     kind: Kind = key(Kind, default="dynamic")
     start: Start = key(Start, default="equilibrium")

@@ -32,7 +32,7 @@ PLANE_TOLERANCE = 1e-9
 def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
     if isinstance(faces, Selection):
         return faces
-    faces = np.array(faces)
+    faces = np.array(as_array(faces, "faces of a pressure"))
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise InputError(
             f"faces of a pressure are {faces.dtype} {faces.shape}; expected a selection or a "

@@ -457,15 +457,15 @@ def _saving(writer: AbstractMovieWriter, figure: Figure, file: Path, dpi: float)
     """Context in which frames are grabbed; after an exception the film is not finished, which would
     replace the exception by another.
     """
-    writer.setup(figure, str(file), dpi)
     try:
+        writer.setup(figure, str(file), dpi)
         yield
+        writer.finish()
     except BaseException:
         if (process := getattr(writer, "_proc", None)) is not None:
             process.kill()
             process.communicate()
         raise
-    writer.finish()
 
 
 def _points_to_show_m(replay: MotionRecord, surface_m: Array, samples: NDArray[np.bool_]) -> Array:

@@ -21,6 +21,7 @@ import numpy as np
 from ..common.array_types import Array
 from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
+from ..common.written_files import listed_hashes
 from ..errors import InputError
 from ..features.contact.feature import contact_fields
 from ..features.image_tracks.residual import ImageTrackResidual
@@ -49,6 +50,7 @@ def write_run(
     *,
     frames: bool = True,
     pictures: bool = True,
+    replaced: str | None = None,
 ) -> Path:
     """Write the folder of a run completely or not at all, then its pictures, and return the folder.
 
@@ -59,8 +61,8 @@ def write_run(
     arrays of an experiment for validation always have its name. `draw_run` adds the pictures after
     the folder is in its place, so that an error while drawing does not lose the result.
 
-    If the disk is full or fails, the run is kept in a folder for temporary files, or as much of it
-    as that has room for; the message names it.
+    If the disk is full or fails, or another process wrote to the folder meanwhile, the run is kept in
+    a folder for temporary files, or as much of it as that has room for; the message names it.
 
     Parameters
     ----------
@@ -70,6 +72,8 @@ def write_run(
         Made with its parents if missing; an earlier, unchanged run at this place is replaced.
     frames, pictures : bool
         Whether to write ParaView frames, and pictures.
+    replaced : str, optional
+        Hash of the result that may be replaced, see `listed_result`; by default that of any run.
 
     Raises
     ------
@@ -78,12 +82,12 @@ def write_run(
         picture cannot be written.
     """
     try:
-        _write_folder(solved, result, Path(folder), frames=frames)
+        _write_folder(solved, result, Path(folder), frames=frames, replaced=replaced)
     except OSError as error:
         full = InputError(f"this cannot be written: {error.strerror or error}", folder)
         raise _kept_elsewhere(solved, result, full, frames=frames) from error
     except InputError as error:
-        if isinstance(error.__cause__, OSError):
+        if replaced is not None or isinstance(error.__cause__, OSError):
             raise _kept_elsewhere(solved, result, error, frames=frames) from error
         raise
     if pictures:
@@ -104,7 +108,7 @@ def _kept_elsewhere(
                 shutil.rmtree(folder, ignore_errors=True)
                 raise
             what = "the run" if content is not _write_answer else f"its {RESULT_FILE} alone"
-            message = f"{error.message}; {what} is kept in {folder}: move it to another disk"
+            message = f"{error.message}; {what} is kept in {folder}: move it to another place"
             return InputError(message, error.source, where=error.where)
     return error
 
@@ -116,7 +120,14 @@ def _write_answer(solved: SolvedProblem, result: Result, place: Path) -> None:
         (place / "problem.toml").write_text(origin.text, encoding="utf-8")
 
 
-def _write_folder(solved: SolvedProblem, result: Result, folder: Path, frames: bool) -> None:
+def listed_result(folder: Path) -> str:
+    """Return the hash of the result in a folder by its list of files; empty if it has none."""
+    return listed_hashes(folder).get(RESULT_FILE, "")
+
+
+def _write_folder(
+    solved: SolvedProblem, result: Result, folder: Path, frames: bool, replaced: str | None = None
+) -> None:
     with replaced_folder(folder) as place:
         _write_answer(solved, result, place)
         if solved.refinement is not None and solved.refinement.levels:
@@ -126,6 +137,8 @@ def _write_folder(solved: SolvedProblem, result: Result, folder: Path, frames: b
         np.savez_compressed(place / "trajectory.npz", allow_pickle=False, **arrays)
         if frames:
             write_all_frames(solved, place)
+        if replaced not in (None, listed_result(folder)):
+            raise InputError("another run was written to this folder meanwhile", folder)
 
 
 def draw_run(

@@ -66,6 +66,9 @@ ADDED_TESTS = {
 LONGER = "longer "
 # Half width of an interval, as a factor, below which no other measurement is tried.
 NARROW = 1.25
+# Number of recorded motions, the longest ones, of which a repetition or a force sensor is tried:
+# with each, all recordings are linearised again.
+MOST_TRIED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,14 +335,16 @@ def added_measurements(
     For specimens these are other tests of the same strains with the same relative noise and errors
     of area and zero; beside a table of moduli they say nothing more. A body with a mesh, of which no
     force is measured, gets a force sensor at its grasp, with `noise` over the largest force, and a
-    recorded motion a second recording after which it is held as long again. A test that the law or
-    the body does not allow is left out.
+    recorded motion a second recording after which it is held as long again; of more than `MOST_TRIED`
+    motions, only the longest. A test that the law or the body does not allow is left out.
     """
     experiments = [each.experiment for each in collocation.transcriptions]
+    motions = [k for k, each in enumerate(experiments) if each.specimen is None]
+    tried = sorted(motions, key=lambda k: -len(experiments[k].t_s))[:MOST_TRIED]
     values = collocation.parameters.values(z[: collocation.nq])
     tests = {each.specimen.test for each in experiments if each.specimen is not None}
     for k, experiment in enumerate(experiments):
-        if experiment.specimen is None:
+        if k in tried:
             if not experiment.wrenches and experiment.grasps:
                 which = "" if len(experiments) == 1 else f" of '{experiment.name}'"
                 sensed = _with_force_sensor(collocation, z, k, noise)
@@ -354,7 +359,7 @@ def added_measurements(
                     f"another recording of '{experiment.name}', held as long again at its end",
                     [*experiments, longer],
                 )
-        elif len(experiment.body.parts) == 1 and not moduli_of(experiment):
+        elif experiment.specimen and len(experiment.body.parts) == 1 and not moduli_of(experiment):
             for test, phrase in ADDED_TESTS.items():
                 if test not in tests:
                     tests.add(test)

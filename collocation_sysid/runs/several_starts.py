@@ -115,7 +115,7 @@ def _is_at(line: Iteration, solution: Solution) -> bool:
         line.share == known.share
         and abs(line.loss - known.loss) <= SAME_LOSS
         and all(
-            np.isclose(value, known.parameters[name], rtol=SAME_PARAMETERS)
+            np.isclose(value, known.parameters[name], rtol=SAME_PARAMETERS, atol=0)
             for name, value in line.parameters.items()
         )
         for known in solution.history

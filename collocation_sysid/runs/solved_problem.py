@@ -7,12 +7,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from ..common.array_types import Array
 from ..common.validated_classes import validated
+from ..common.validated_types import AtLeastOne, Count
 from ..errors import InputError, hint_at
 from ..fem.laws.constants import unit_of
 from ..judge.posterior import BudgetLine, Posterior
@@ -54,6 +56,9 @@ from .forward_simulation import ForwardSimulation
 from .mesh_resolution import mesh_resolution_concerns, mesh_resolution_notes
 from .result_content import Elapsed
 from .verdict import expected_rms_m, modes_by_experiment, solution_concerns, unknown_concerns
+
+# Most draws of `SolvedProblem.samples`, which take an hour.
+MOST_DRAWS = 1_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,6 +325,7 @@ class SolvedProblem:
         """
         return expected_rms_m(self.solution, self.uncertainty)
 
+    @validated
     def interval(self, name: str) -> tuple[float, float]:
         """Return the combined 95 % interval (lower, upper) of a parameter or derived modulus in its
         SI unit, the one to publish.
@@ -334,6 +340,7 @@ class SolvedProblem:
         """
         return self._estimate(name).combined95 or (np.nan, np.nan)
 
+    @validated
     def std_error(self, name: str) -> float:
         """Return the combined standard uncertainty of a parameter or derived modulus, in its SI
         unit.
@@ -395,7 +402,7 @@ class SolvedProblem:
         return matrix if units == "relative" else matrix / np.outer(by_value, by_value)
 
     @validated
-    def samples(self, count: int, seed: int = 0) -> Any:
+    def samples(self, count: Annotated[AtLeastOne, Field(le=MOST_DRAWS)], seed: Count = 0) -> Any:
         """Return draws from the combined distribution of the parameters as a pandas DataFrame, one
         row each, for simulations with random constants.
 
@@ -408,17 +415,15 @@ class SolvedProblem:
         Parameters
         ----------
         count : int
-            Number of draws, at least 1.
+            Number of draws, from 1 to `MOST_DRAWS`.
         seed : int
-            Seed of the random numbers; the same seed gives the same draws.
+            Seed, at least 0, of the random numbers; the same seed gives the same draws.
 
         Raises
         ------
         InputError
-            Without error bars or pandas, for a count below 1, or if hardly any draw is admissible.
+            Without error bars or pandas, for another count, or if hardly any draw is admissible.
         """
-        if count < 1:
-            raise InputError(f"count: found {count}; expected at least 1")
         pandas = _optional_package("pandas", "a data frame")
         if self.uncertainty is None or self.posterior is None:
             raise InputError("the run has no error bars, and therefore no samples")

@@ -813,7 +813,7 @@ def test_an_output_that_cannot_be_written_is_explained(tiny, monkeypatch):
     assert outcome.code == 2
     assert outcome.err == (
         f"error: {tiny / 'run'}: this cannot be written: No space left on device; its result.json "
-        f"alone is kept in {kept}: move it to another disk\n"
+        f"alone is kept in {kept}: move it to another place\n"
     )
     assert not (tiny / "run").exists()
     assert not list(tiny.glob(".run*"))

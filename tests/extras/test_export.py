@@ -339,6 +339,30 @@ def test_usd_plays_the_motion_of_the_body_at_the_rate_of_the_recording(tmp_path)
     np.testing.assert_allclose(np.array(points.Get()), placed_m, atol=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("section", "is_round"),
+    [
+        (cs.CrossSection.rectangle(0.012, 0.002), False),
+        (cs.CrossSection.rectangle(2e-4, 1e-4), False),
+        (cs.CrossSection.rectangle(0.2, 0.19), False),
+        (cs.CrossSection.rectangle(1e-4, 1e-4), True),
+        (cs.CrossSection.round(3e-4), True),
+    ],
+)
+def test_usd_states_that_it_has_one_bending_stiffness_for_two(tmp_path, section, is_round):
+    pytest.importorskip("pxr")
+    line_m = [(0.0, 0.0, 0.0), (60 * max(section.extent_m), 0.0, 0.0)]
+    body = Body(cs.rod_mesh(line_m, section, 5), "rod", density_kg_m3=1200.0)
+    t_s = times(8)
+    tip = vertex_markers(body, [12, 13, 14], t_s)
+    held = Grasp([0, 1, 2], PoseSequence.fixed())
+    experiment = Experiment(body, t_s, held, tip, nuisance=IDEAL, kind="static")
+    theta = body.theta_from_values({**OTHERS, **MODULI})
+    cable = IdentifiedBody("a cable", "good", (), {}, body, theta, experiment, None)
+    limits = write_export(cable, "usd", tmp_path / "usd").limitations
+    assert any("the mean about both axes" in limit for limit in limits) is not is_round
+
+
 def test_usd_reports_tilted_gravity_and_missing_motion(tmp_path):
     body = held_bar("stable-neo-hookean")
     limits = write_export(body, "usd", tmp_path / "level").limitations

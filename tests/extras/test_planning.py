@@ -1571,6 +1571,7 @@ def path(*places: tuple[float, float, float]) -> dict:
         ),
         ({"avoid": {"clearance_m": 0.01}}, "the recording has no obstacles"),
         ({"end": {"window_s": 0.02}}, "window_s = 0.02, which is 1 samples"),
+        ({"end": {"window_s": 1e9}}, "window_s = 1e\\+09, which is .* samples"),
         (
             {"reference": [{"point": "tip", "t_s": [5.0], "position_m": [(0.0, 0.0, 0.0)]}]},
             "runs from 5 s to 5 s, but the plan from 0",

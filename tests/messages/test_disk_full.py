@@ -22,6 +22,7 @@ from collocation_sysid.result import run_record
 from collocation_sysid.result.replay import read_run
 from collocation_sysid.result.run_writers import replaced_folder
 from collocation_sysid.runs.result_content import Result
+from collocation_sysid.runs.solved_problem import SolvedProblem
 
 resource = pytest.importorskip("resource", reason="limits of POSIX")
 
@@ -89,6 +90,28 @@ def test_a_problem_is_begun_whole_or_not_at_all(tmp_path: Path):
     assert outcome.code == 2
     assert "problem.toml: this cannot be written" in outcome.err
     assert not list(tmp_path.rglob("*.toml"))
+
+
+@pytest.mark.parametrize(
+    ("words", "number"), [((), 1), (("--kind", "swing"), 3), (("--dataset", "kawabata_1981"), 5)]
+)
+def test_a_disk_that_is_full_at_a_later_file_leaves_no_part_of_a_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], number: int
+):
+    write, written = Path.write_bytes, []
+
+    def write_some(file: Path, content: bytes) -> int:
+        written.append(file)
+        if len(written) == number:
+            full_disk()
+        return write(file, content)
+
+    monkeypatch.setattr(Path, "write_bytes", write_some)
+    outcome = run_command("new", tmp_path / "above" / "mine", *words)
+    assert outcome.code == 2
+    assert "this cannot be written: No space left on device" in outcome.err
+    assert len(written) == number
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.long
@@ -209,3 +232,37 @@ def test_output_that_cannot_be_written_loses_no_run(tiny: Path, monkeypatch: pyt
     assert outcome.code == 2
     assert "No space left on device" in outcome.err
     assert Result.read(tiny / "run").status == "converged"
+
+
+@pytest.mark.parametrize(
+    ("has_earlier", "other", "reason"),
+    [
+        (False, "run", "another run was written to this folder meanwhile"),
+        (True, "run", "another run was written to this folder meanwhile"),
+        (True, "notes", "notes.txt in this folder was not written by this program"),
+    ],
+)
+def test_a_run_whose_folder_another_process_wrote_meanwhile_is_kept_elsewhere(
+    tiny: Path, monkeypatch: pytest.MonkeyPatch, has_earlier: bool, other: str, reason: str
+):
+    solve = problem_commands.run
+
+    def solve_meanwhile(*arguments: object, **options: object) -> SolvedProblem:
+        finished = solve(*arguments, **options)
+        if other == "run":
+            finished.save("run", frames=False, pictures=False)
+        else:
+            Path("run/notes.txt").write_text("mine")
+        return finished
+
+    if has_earlier:
+        method = settings("solver.method=reduced-space")
+        assert run_command("solve", "problem.toml", *method, "--out", "run", "-q").code == 0
+    monkeypatch.setattr(problem_commands, "run", solve_meanwhile)
+    outcome = solved_on_a_full_disk(tiny, monkeypatch, "-q")
+    (kept,) = (tiny / "spare").iterdir()
+    assert outcome.code == 2
+    assert reason in outcome.err
+    assert f"; the run is kept in {kept}: move it to another place" in outcome.err
+    assert (tiny / "run" / "frames").exists() is (other == "notes")
+    assert read_run(kept)[0].status == "converged"

@@ -47,7 +47,7 @@ NOT_CALLED = {
         "Trajectory",
     ),
     *("live.Frame", "live.LiveUpdate", "InputError", "SimulationError"),
-    *("Assumptions.exact", "DepthCamera.of_images", "CrossSection", "RodMesh"),
+    *("Assumptions.exact", "DepthCamera.of_images", "RodMesh"),
 }
 
 
@@ -76,6 +76,10 @@ def valid(name: str) -> dict[str, Any]:
         "Capsule": {"radius_m": 0.1, "ends_m": LINE_M},
         "Constant": {"name": "c_pa"},
         "Continuation": {},
+        "CrossSection": {
+            **{"area_m2": 1e-6, "moments_m4": (1e-13, 1e-13), "torsion_m4": 2e-13},
+            **{"extent_m": (1e-3, 1e-3)},
+        },
         "CrossSection.round": {"diameter_m": 0.01},
         "CrossSection.rectangle": {"width_m": 0.01, "height_m": 0.01},
         "Cuboid": {"corners_m": [(0, 0, 0), (1, 1, 1)]},
@@ -245,11 +249,12 @@ WRONG: dict[str, Any] = {
     },
     **{"object": object(), "shape": np.zeros((2, 2, 2)), "control": "a\x07b", "complex": 1j},
     **{"table": {"a": 1}, "code": len},
+    **{"ragged": [[0, 1, 2], [3, 4]], "ragged floats": [[0.5], [], 1.5]},
 }
 # Kinds that words of an annotation accept.
 KINDS = {
     "None": r"\bNone\b|Optional",
-    **dict.fromkeys(("text", "control"), r"\bstr\b|\bText\b|Noise"),
+    **dict.fromkeys(("text", "control"), r"\bstr\b|\bText\b|FileName|Noise"),
     "[]": r"Sequence|tuple|list|Array|Index|Shares",
     "{}": r"Mapping|Section|Assumptions|dict",
     "table": r"Mapping\[str, object\]",
@@ -318,6 +323,19 @@ def annotations(called: Any) -> dict[str, str]:
         for each in parameters
         if each.kind not in several
     }
+
+
+@pytest.mark.parametrize("name", ["../above", "a\x1b[31mb", "a/b", ".", "a\nb", "a\0b"])
+def test_names_that_cannot_be_those_of_files_are_refused(name: str) -> None:
+    calls = (
+        lambda: cs.Experiment(**{**valid("Experiment"), "name": name}),
+        lambda: cs.Constant(name),
+        lambda: cs.Parameter(name, 1.0, 0.1, 10.0),
+        lambda: cs.Region(name, [0]),
+    )
+    for call in calls:
+        with pytest.raises(cs.InputError, match="expected a valid file name"):
+            call()
 
 
 CALLABLES = dict(public_callables())

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 import tracemalloc
+import warnings
 import weakref
 import zipfile
 from collections.abc import Iterator
@@ -34,6 +35,9 @@ from kit.problem_files import (
     run_command,
     settings,
 )
+from matplotlib.figure import Figure
+from matplotlib.path import Path as Path2D
+from matplotlib.transforms import Affine2D
 
 from collocation_sysid import cli
 from collocation_sysid.common import files, limits
@@ -112,6 +116,20 @@ def test_a_library_that_cannot_be_loaded_is_one_line(
 
     monkeypatch.setattr(cli, "_root_command", lambda: command)
     assert f"too little memory ({type(failure).__name__}:" in refused("methods")
+
+
+@pytest.mark.parametrize("category", [UserWarning, FutureWarning, RuntimeWarning])
+def test_warnings_of_libraries_are_not_shown_before_an_error(
+    monkeypatch: pytest.MonkeyPatch, category: type[Warning]
+):
+    def command(**_: object) -> None:
+        warnings.warn_explicit("no data", category, "library.py", 1)
+        raise InputError("this is wrong")
+
+    monkeypatch.setattr(cli, "_root_command", lambda: command)
+    with warnings.catch_warnings(record=True) as shown:
+        assert refused("methods") == "error: this is wrong\n"
+    assert not shown
 
 
 # Files --------------------------------------------------------------------------------------------
@@ -611,12 +629,27 @@ def test_a_signal_within_a_weak_reference_callback_is_not_lost(capsys: pytest.Ca
     assert not capsys.readouterr().err
 
 
+def drawn(**style: str) -> None:
+    figure = Figure()
+    figure.add_subplot().plot([0, 1], **style)
+    figure.savefig(io.BytesIO())
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_a_signal_within_a_conversion_of_casadi_is_not_lost():
+@pytest.mark.parametrize(
+    ("conversion", "call"),
+    [
+        ("DM_from_array", lambda: ca.SX.sym("x") * np.array([2.0])),
+        ("__array__", drawn),
+        ("__array__", partial(drawn, marker="o", ls="")),
+        ("__array__", lambda: Path2D([(0, 0), (1, 0), (1, 1)]).contains_point((0, 0), Affine2D())),
+    ],
+)
+def test_a_signal_within_a_conversion_of_a_library_is_not_lost(conversion, call):
     sent = []
 
     def send_once(frame: FrameType, event: str, _: object) -> None:
-        if not sent and (event, frame.f_code.co_name) == ("call", "DM_from_array"):
+        if not sent and (event, frame.f_code.co_name) == ("call", conversion):
             sent.append(signal.SIGTERM)
             signal.raise_signal(signal.SIGTERM)
 
@@ -624,7 +657,7 @@ def test_a_signal_within_a_conversion_of_casadi_is_not_lost():
     try:
         with heeded(), pytest.raises(KeyboardInterrupt):  # noqa: PT012
             sys.setprofile(send_once)
-            _ = ca.SX.sym("x") * np.array([2.0])  # in which CasADi ignores exceptions
+            call()  # in which the library ignores exceptions, or converts them
             sys.setprofile(profiled)
             time.sleep(5)
     finally:

@@ -330,6 +330,9 @@ def test_a_calibration_may_have_aliases_and_comments(tmp_path: Path) -> None:
         (expanding("{{<<: [{0}, {0}]}}"), None, "aliases stand for more values"),
         ("K: &a [*a]", None, "aliases stand for more values"),
         ("K: " + "[" * 100_000, None, r"cam.dat: found neither YAML"),
+        ("K: a\0b", None, r"cam.dat: found neither YAML.*unacceptable character"),
+        ("K: 1\x07", None, r"cam.dat: found neither YAML.*unacceptable character"),
+        ("\ufffe: 1", None, r"cam.dat: found neither YAML.*unacceptable character"),
         ("<" + "<!--" * 200_000, None, r"cam.dat: found neither YAML"),
         (
             "<opencv_storage>" + "<!-- -->" * 100_000 + "<K>1 2 3</K></opencv_storage>",

@@ -56,8 +56,9 @@ def test_draws_are_admissible_repeatable_and_have_units(run):
     assert samples.attrs["units"]["c10_pa"] == "Pa"
     assert (samples["kappa_pa"] == 1e8).all()
     assert ((samples["poisson"] > 0) & (samples["poisson"] < 0.5)).all()
-    with pytest.raises(cs.InputError, match="expected at least 1"):
-        run.samples(0)
+    for count, expected in ((0, "at least 1"), (10**12, "at most 1e\\+06")):
+        with pytest.raises(cs.InputError, match=f"expected a number of {expected}"):
+            run.samples(count)
 
 
 def test_residuals_and_predictions_sum_to_the_measurements(run):

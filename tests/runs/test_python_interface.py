@@ -173,6 +173,9 @@ def test_a_run_reports_parameters_with_standard_uncertainties():
     assert len(solution) < 300
     with pytest.raises(cs.InputError, match=r"no parameter 'mu'; .* did you mean 'mu_pa'?"):
         run.interval("mu")
+    for call in (run.interval, run.std_error, run.nuisance):
+        with pytest.raises(cs.InputError, match="name is 5; expected text in quotes"):
+            call(5)
 
 
 def test_intervals_of_a_run_that_has_not_converged_are_nan():

@@ -251,3 +251,24 @@ def test_a_constant_that_is_open_for_another_reason_has_no_precision():
     run = cs.run(cs.Problem([pulled.experiment()], truth | unknown, uncertainty=options))
     assert not run.estimates["young_pa"].is_determined
     assert not run.vague_constants
+
+
+@pytest.mark.parametrize("sample_counts", [(9, 8, 7), (5, 9, 6, 8, 7), (3,) * 30 + (4, 4, 4, 4)])
+def test_of_many_recordings_only_the_longest_are_tried_again(monkeypatch, sample_counts):
+    recordings = [
+        SimpleNamespace(specimen=None, wrenches=(), grasps=(1,), t_s=range(count), name=f"{k}")
+        for k, count in enumerate(sample_counts)
+    ]
+    collocation = SimpleNamespace(
+        transcriptions=[SimpleNamespace(experiment=each) for each in recordings],
+        parameters=SimpleNamespace(values=lambda _: {}),
+        nq=0,
+    )
+    tried = []
+    monkeypatch.setattr(
+        expected_precision, "_with_force_sensor", lambda *words: tried.append(words[2])
+    )
+    monkeypatch.setattr(expected_precision, "_held_longer", lambda _: None)
+    assert not [*added_measurements(collocation, np.zeros(0))]
+    longest = sorted(sample_counts, reverse=True)[: expected_precision.MOST_TRIED]
+    assert sorted((sample_counts[k] for k in tried), reverse=True) == longest

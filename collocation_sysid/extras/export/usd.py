@@ -154,7 +154,7 @@ def _curve_limitations(body: IdentifiedBody) -> list[str]:
     law = body.body.parts[0].material
     assert isinstance(law, RodMaterial)
     about_1, about_2 = law.section.moments_m4
-    is_round = np.isclose(about_1, about_2)
+    is_round = np.isclose(about_1, about_2, atol=0)
     return [CURVE_NATURAL] * law.has_natural_curvature + [CURVE_ROUND] * (not is_round)
 
 

@@ -231,7 +231,10 @@ def _only_experiment(problem: Problem) -> Experiment:
     filmed = [each for each in experiment.readings if each.counts_pixels]
     holds_s = [(grasp.from_s, grasp.until_s) for grasp in experiment.grasps]
     loads = (experiment.point_mass_at_nodes_kg, experiment.declared_node_forces_n)
-    is_constant = all(np.allclose(each, each[:1]) for each in (f(experiment.t_s) for f in loads))
+    is_constant = all(
+        np.ptp(each, axis=0).max(initial=0.0) <= 1e-6 * np.abs(each).max(initial=0.0)
+        for each in (f(experiment.t_s) for f in loads)
+    )
     laws = [law_function(each.force, each.points.dofs) for each in experiment.body.placed_forces]
     is_constant &= not any(law.depends_on_first_datum for law in laws)
     unsupported = {

@@ -757,10 +757,10 @@ def _window_samples(task: Task, sample_s: float, lowest_hz: float) -> int:
         )
     window_s = 0.5 / lowest_hz if end.window_s is None else end.window_s
     samples = int(np.ceil(window_s / sample_s - 1e-9))
-    if end.window_s is not None and samples < FEWEST_AT_REST:
+    if samples > MOST_SAMPLES or (end.window_s is not None and samples < FEWEST_AT_REST):
         raise InputError(
-            f"found window_s = {end.window_s:g}, which is {samples} samples of {sample_s:g} s; "
-            f"expected at least {FEWEST_AT_REST}",
+            f"found window_s = {window_s:g}, which is {samples:g} samples of {sample_s:g} s; "
+            f"expected {FEWEST_AT_REST} to {MOST_SAMPLES}",
             None,
             where="end.window_s",
         )

@@ -185,7 +185,8 @@ class Outlines(CameraImages):
     def with_samples(self, t_s: ArrayLike, values: ArrayLike | None) -> Self:
         """Keep masks at times with a finite value; at other times than its own there is none."""
         times = np.asarray(t_s, dtype=float)
-        same = len(times) == len(self.sample_times_s) and np.allclose(times, self.sample_times_s)
+        own_s = self.sample_times_s
+        same = len(times) == len(own_s) and np.allclose(times, own_s, rtol=0, atol=1e-6)
         if not same or values is None:
             return replace(self, t_s=t_s, masks=None)
         kept = np.asarray(np.isfinite(np.asarray(values, dtype=float)).any(axis=1))

@@ -15,6 +15,8 @@ from functools import cache
 from itertools import pairwise, starmap
 from typing import Any, TypeVar
 
+from ...errors import InputError
+
 R = TypeVar("R")
 
 
@@ -27,10 +29,20 @@ _alone = threading.local()
 def available_threads() -> int:
     """Return ``COLLOCATION_SYSID_THREADS``, at least 1, or the number of cores that this process
     may use.
+
+    Raises
+    ------
+    InputError
+        If the environment variable is no whole number.
     """
-    override = os.environ.get("COLLOCATION_SYSID_THREADS")
+    variable = "COLLOCATION_SYSID_THREADS"
+    override = os.environ.get(variable)
     if override:
-        return max(1, int(override))
+        try:
+            return max(1, int(override))
+        except ValueError:
+            message = f"found {override!r}; expected a whole number"
+            raise InputError(message, "environment variable", where=variable) from None
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

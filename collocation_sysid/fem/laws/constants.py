@@ -15,7 +15,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from ...common.validated_classes import validated
-from ...common.validated_types import Finite, Positive, Text
+from ...common.validated_types import FileName, Finite, Positive
 from ...errors import InputError
 
 Scale = Literal["log", "linear"]
@@ -79,7 +79,7 @@ class Constant:
         a logarithmic constant is not positive.
     """
 
-    name: Text
+    name: FileName
     symbol: str = ""
     meaning: str = ""
     bounds: tuple[float, float] = (1e-6, 1e9)

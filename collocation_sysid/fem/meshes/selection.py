@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from ...common.checked_arrays import as_array
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive, Text
 from ...errors import InputError, hint_at, require_among
@@ -261,7 +262,7 @@ class Indices:
     indices: Sequence[int]
 
     def __post_init__(self) -> None:
-        indices = np.atleast_1d(np.asarray(self.indices))
+        indices = np.atleast_1d(as_array(self.indices, "indices"))
         if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "iu"):
             raise InputError(
                 f"indices must be a list of whole numbers from 0, not {self.indices!r}"

@@ -98,7 +98,7 @@ def tracks_picture(rows: Array, samples: Array) -> Figure:
     for number, (panel, k) in enumerate(zip(axes[0], images, strict=True)):
         for point in range(measured.shape[1]):
             panel.plot(*measured[: k + 1, point].T, color="0.75", lw=0.8, zorder=1)
-        contour = rows[np.isclose(rows[:, 0], t_s[k]), 2:]
+        contour = rows[rows[:, 0] == t_s[k], 2:]
         panel.plot(*contour.T, color=VERMILION, lw=0.8, zorder=2, label="fitted contour")
         panel.plot(*measured[k].T, "o", ms=2.5, color=BLACK, zorder=3, label="measured")
         known = np.isfinite(errors[k]).all(axis=1)
