@@ -30,6 +30,8 @@ from .doubt import Doubt, accepted, clock_data, exchanged_names
 
 # Accuracy of small strains and a few modes, over the size of the body.
 ROUGHLY = 0.005
+# Extent of tracks over the size of the body, below which they are those of a point.
+SMALLEST_EXTENT = 1e-6
 # Share of the samples that are used, the best ones; others may be exchanged labels or reflections.
 USED = 0.9
 # Clock lags that are tried [s].
@@ -171,8 +173,8 @@ class ModalComparison:
         would not fit there.
         """
         misfit_m = self._misfit_with(self._response_at_implied_places(declared), declared)
-        tracks_m = declared.tracks_m
-        return misfit_m / float(np.sqrt(np.nanvar(tracks_m, axis=(0, 1)).sum()))
+        extent_m = float(np.sqrt(np.nanvar(declared.tracks_m, axis=(0, 1)).sum()))
+        return misfit_m / max(extent_m, SMALLEST_EXTENT * self.response.size_m)
 
     def _misfit_with(self, response: ModalResponse, declared: DeclaredMotion) -> float:
         return float(self._misfits_m(declared, response.predict(declared)).min())

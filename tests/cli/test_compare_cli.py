@@ -19,7 +19,7 @@ from collocation_sysid.extras.studies import progress as display
 from collocation_sysid.extras.studies import run_execution
 
 KNOWN = [word for name, value in TRUTH.items() for word in ("--truth", f"{name}={value}")]
-METHODS = ("interior-point", "reduced-space")
+METHODS = ("interior-point initial=simulation", "reduced-space")
 # Answers with the guess, as a run that did not move; the second start never ends.
 STAND_IN = """
 import json, os, sys
@@ -119,7 +119,7 @@ def test_the_table_fits_a_terminal_and_the_picture_is_drawn(compared):
     assert max(len(line) for line in lines if "written to" not in line) <= 90
     assert drawn(compared.out) == {"methods"}
     text = (compared.out / "summary.md").read_text()
-    assert "| interior-point | 2/2 |" in text
+    assert "| interior-point initial=simulation | 2/2 |" in text
     assert "within 1 % of the truth" in text
 
 

@@ -8,6 +8,7 @@ import math
 import shutil
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
@@ -1615,6 +1616,45 @@ def test_references_of_a_file_leave_empty_cells_free(tmp_path: Path, head: str, 
 
 
 @pytest.mark.parametrize(
+    ("times", "values"),
+    [
+        ([0.0, 0.6, 1.4, 2.4], [(0, 0, 0), (0, 0, 0), (0.06, 0, 0), (0.06, 0, 0)]),
+        ([0.0, 0.1, 0.2, 2.4], [(0, 0, 0), (0, 0, 0.02), (0, 0, 0.02), (0, 0, -0.05)]),
+        ([0.2, 1.0, 1.2], [(0.01, 0, 0), (0.01, 0.03, 0), (0.01, 0.03, 0)]),
+    ],
+)
+def test_a_path_stays_between_its_waypoints_and_rests_where_they_repeat(times, values):
+    stated = task(reference=[{"point": "tip", "t_s": times, "position_m": values}])
+    t_s = np.linspace(0, 2.4, 241)
+    (found,) = sampled_references(stated, t_s, [np.zeros(3)], np.zeros((1, 3)))
+    assert found.from_lines_m < 1e-12
+    rows = np.array(values)
+    for k, (first_s, last_s) in enumerate(pairwise(times)):
+        part = found.position_m[(t_s > first_s - 1e-9) & (t_s < last_s + 1e-9)]
+        ends = rows[k : k + 2]
+        assert (part > ends.min(axis=0) - 1e-12).all()
+        assert (part < ends.max(axis=0) + 1e-12).all()
+        if (ends[0] == ends[1]).all():
+            np.testing.assert_allclose(part, ends[:1].repeat(len(part), axis=0), atol=1e-12)
+
+
+def test_the_distance_of_a_path_from_the_polygon_is_that_of_its_bulge():
+    """The path goes along y while x changes in one direction only."""
+    way = {"point": "tip", "t_s": [0.0, 0.4, 0.8], "position_m": [(0, 0, 0), (3, 4, 0), (6, 0, 0)]}
+    t_s = np.linspace(0, 0.8, 81)
+    curved, straight = (
+        sampled_references(
+            task(reference=[way | {"interpolation": kind}]), t_s, [np.zeros(3)], np.zeros((1, 3))
+        )[0]
+        for kind in ("smooth", "linear")
+    )
+    off = np.abs(0.6 * curved.position_m[:, 1] - 0.8 * curved.position_m[:, 0])[:41]
+    assert curved.from_lines_m == pytest.approx(off.max(), rel=1e-9)
+    assert curved.from_lines_m > 0.2
+    assert straight.from_lines_m < 1e-12
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("t_s,x_mm\n0,1\n1,2\n", "unknown column x_mm"),
@@ -1878,6 +1918,18 @@ def test_limits_are_no_remedy_for_a_reference_along_an_axis_that_is_not_free():
     plan = plan_motion(hung_bar(), task(hand={"free": ["y"], "intervals": 8}), LIMITS)
     (line,) = [text for text in map(str, plan_summary(plan)) if "misses its reference" in text]
     assert "no limit of the hand binds; expected a reference that the free coordinates" in line
+
+
+def test_a_path_that_is_missed_between_reached_waypoints_is_named():
+    """The largest error is 9.7 mm, at the waypoints 7.0 mm."""
+    way = {"point": "tip", "t_s": [0.0, 0.6], "position_m": [(0, 0, 0), (0.05, 0, 0)]}
+    hasty = task(duration_s=0.6, reference=[way | {"relative": True}], hand={"intervals": 8})
+    plan = plan_motion(hung_bar(), hasty, LIMITS)
+    for accepted_m, is_cause in ((0.008, True), (0.006, False)):
+        stated = hasty.model_copy(update={"largest_error_m": accepted_m})
+        judged = replace(plan, program=replace(plan.program, task=stated))
+        (line,) = [text for text in map(str, plan_summary(judged)) if "the largest error" in text]
+        assert ("the path between them is the cause" in line) is is_cause
 
 
 def test_a_plan_that_misses_its_band_exceeds_the_error():

@@ -110,7 +110,7 @@ def test_every_method_has_the_same_starts(tiny):
     assert [run.label for run in planned] == [
         f"{method}, start {start}"
         for start in range(3)
-        for method in ("interior-point", "reduced-space")
+        for method in ("interior-point initial=simulation", "reduced-space")
     ]
     for one, other in zip(planned[::2], planned[1::2], strict=True):
         assert one.guess == other.guess
@@ -126,6 +126,20 @@ def test_options_of_a_method_are_overrides(tiny):
     assert several.label == "penalty rho=1e4 inner=levenberg-marquardt, start 0"
     solver = Problem.read("problem.toml", several.overrides).solver("penalty")
     assert (solver.rho, solver.inner) == (1e4, "levenberg-marquardt")
+
+
+@pytest.mark.parametrize(
+    ("stated", "compared", "initial"),
+    [
+        ("interior-point", "interior-point initial=simulation", "simulation"),
+        ("interior-point warm_up=0", "interior-point warm_up=0 initial=simulation", "simulation"),
+        ("interior-point initial=reduced-space", None, "reduced-space"),
+    ],
+)
+def test_interior_point_does_not_start_at_the_answer_unless_stated(tiny, stated, compared, initial):
+    (run,) = plan_comparison(Problem.read("problem.toml"), [stated])
+    assert run.method == (compared or stated)
+    assert Problem.read("problem.toml", run.overrides).solver("interior-point").initial == initial
 
 
 def test_more_starts_are_further_ones(tiny):

@@ -104,9 +104,15 @@ BAR_SIZE = (480, 300)
 RATE_HZ = 60
 
 
-def film_bar(folder: Path, shift: Callable[[int], tuple[float, float]], count: int) -> np.ndarray:
-    """Images of a textured bar that moves in front of a plain wall, with noise, and a mask beside
-    the folder; returns the shifts (count, 2) in pixels.
+def film_bar(
+    folder: Path,
+    shift: Callable[[int], tuple[float, float]],
+    count: int,
+    wall: float | np.ndarray = 90.0,
+    noise: float = 1.0,
+) -> np.ndarray:
+    """Images of a textured bar that moves in front of a wall, with noise, and a mask beside the
+    folder; returns the shifts (count, 2) in pixels.
     """
     folder.mkdir()
     rng = np.random.default_rng(1)
@@ -119,7 +125,7 @@ def film_bar(folder: Path, shift: Callable[[int], tuple[float, float]], count: i
         turn = np.array([[1, 0, shift(k)[0]], [0, 1, shift(k)[1]]], dtype=np.float32)
         here = cv2.warpAffine(bar, turn, BAR_SIZE, flags=cv2.INTER_CUBIC)
         part = cv2.warpAffine(cover, turn, BAR_SIZE)
-        image = part * here + (1 - part) * 90 + rng.normal(size=shape)
+        image = part * here + (1 - part) * wall + noise * rng.normal(size=shape)
         cv2.imwrite(str(folder / f"{k}.png"), np.clip(image, 0, 255).astype(np.uint8))
     inner = cv2.erode((255 * cover).astype(np.uint8), np.ones((31, 31), np.uint8))
     cv2.imwrite(str(folder.parent / "mask.png"), inner)
@@ -214,7 +220,37 @@ def test_points_are_lost_rather_than_mistaken_where_the_surroundings_change(tmp_
         cv2.imwrite(str(file), blurred)
     ended = track(tmp_path / "film", tmp_path / "front.csv")
     assert ended.code == 1
-    assert "with a shorter exposure and more light, larger features on the body" in ended.out
+    assert "film before a plain background, with a shorter exposure and more light" in ended.out
+
+
+def clutter(size_px: float, contrast: float) -> np.ndarray:
+    """A wall with features larger than those of the bar."""
+    noise = np.random.default_rng(5).normal(size=(BAR_SIZE[1], BAR_SIZE[0]))
+    wall = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), size_px)
+    return np.clip(128 + contrast * wall / wall.std(), 0, 255)
+
+
+@pytest.mark.parametrize(
+    ("step", "size_px", "contrast"), [(0.5, 8, 60), (0.4, 12, 80), (0.6, 6, 50)]
+)
+def test_points_do_not_follow_the_background(tmp_path: Path, step, size_px, contrast) -> None:
+    wall = clutter(size_px, contrast)
+    shifts = film_bar(tmp_path / "film", lambda k: (50 * (1 - np.cos(step * k)), 0.0), 16, wall)
+    ended = track(tmp_path / "film", tmp_path / "front.csv", "--json")
+    said = json.loads(ended.out)
+    assert 2 * said["surviving"] > said["points"]
+    read = read_tracks(tmp_path / "front.csv")
+    errors = np.linalg.norm(read.pixels - read.pixels[0] - shifts[:, None], axis=2)
+    assert np.nanmax(errors) < 1.5
+
+
+@pytest.mark.parametrize("noise", [2.0, 8.0, 16.0])
+def test_the_table_has_the_standard_error_of_its_pixels(tmp_path: Path, noise: float) -> None:
+    shifts = film_bar(tmp_path / "film", lambda k: (2.0 * k, 0.5 * k), 6, noise=noise)
+    assert track(tmp_path / "film", tmp_path / "front.csv").code == 0
+    read = read_tracks(tmp_path / "front.csv")
+    errors = (read.pixels - read.pixels[0] - shifts[:, None])[1:]
+    assert read.sigma_px == pytest.approx(np.sqrt(np.nanmean(errors**2)), rel=0.5)
 
 
 @pytest.mark.parametrize(

@@ -362,7 +362,7 @@ def test_regions_that_overlap_are_refused_with_a_cell(slab):
 def test_names_that_cannot_be_distinguished_are_refused(slab):
     with pytest.raises(InputError, match="two regions are named 'core'"):
         Body(slab, density_kg_m3=1.0, regions=[Region("core", [0]), Region("core", [1])])
-    with pytest.raises(InputError, match="name is ''; expected a text that is not empty"):
+    with pytest.raises(InputError, match="name is ''; expected a valid file name"):
         Region("", [0])
     for name in ("a.b", "a b"):
         with pytest.raises(InputError, match=r"the region's name is .*expected letters, digits"):

@@ -100,6 +100,19 @@ def test_unlikely_pixels_are_missing(filmed: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("stated", "column", "used"),
+    [("", ",0.15", 0.15), ("sigma_px = 0.3\n", ",0.15", 0.3), ("", "", 1.0)],
+)
+def test_the_error_of_the_table_is_used_unless_stated(filmed: Path, stated, column, used) -> None:
+    replace_text(", side = [0.05, 0.0, 0.03], far = [0.01, 0.0, 0.06]", "")(filmed)
+    replace_text("sigma_px = 0.3\n", stated)(filmed)
+    head, *rows = WIDE.splitlines()
+    ends = [",sigma_px" if column else "", *[column] * len(rows)]
+    written(filmed, "".join(f"{row}{end}\n" for row, end in zip([head, *rows], ends, strict=True)))
+    assert tracks_of(filmed).sigma_px == used
+
+
+@pytest.mark.parametrize(
     ("old", "new", "text", "message"),
     [
         (

@@ -191,17 +191,6 @@ def test_the_front_page_shows_the_answer_that_the_readme_shows():
     assert [line for line in shown.splitlines() if line not in lines] == []
 
 
-def test_the_times_of_the_readme_are_those_of_the_comparison():
-    page = (ROOT / "docs" / "compared.md").read_text()
-    rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| ")]
-    times = {row[0].removeprefix("| "): row[1] for row in rows}
-    own = times["this project, reduced space"]
-    others = [time for name, time in times.items() if name.startswith("`mujoco.sysid`, ")]
-    fastest = min(time for time in others if re.fullmatch(r"[\d.]+", time))
-    readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"after {own} s of processor time, and with `mujoco.sysid` after {fastest} s" in readme
-
-
 def test_every_claim_beside_other_tools_has_a_test_or_a_script_that_is_there():
     page = (ROOT / "docs" / "compared.md").read_text()
     shown = re.findall(r"`((?:tests|scripts)/[\w/]+\.py)(?:::(\w+))?`", page)

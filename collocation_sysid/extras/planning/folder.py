@@ -275,9 +275,19 @@ def _missed_lines(plan: MotionPlan) -> list[Shown]:
         else f"duration_s = {enough_s:.3g} with the times of references in proportion, or "
     )
     limits = listed([each.name for each in plan.binding_limits if each.gain_per_percent > 0])
-    cause = f"limited by {limits}" if limits else "no limit of the hand binds"
-    possible = "a reference that the free coordinates, the end and the other references allow"
-    remedy = "wider limits" if limits else possible
+    exceeding = [
+        (each, error)
+        for each in plan.program.references
+        if (error := plan.tracking_error(each)).largest_m > error.accepted_m
+    ]
+    if limits:
+        cause, remedy = f"limited by {limits}", "wider limits"
+    elif exceeding and all(e.at_waypoints_m <= e.accepted_m for _, e in exceeding):
+        cause = "the waypoints are reached: the path between them is the cause"
+        remedy = 'more time between them, or interpolation = "none"'
+    else:
+        cause = "no limit of the hand binds"
+        remedy = "a reference that the free coordinates, the end and the other references allow"
     if plan.program.task.largest_error_m is not None:
         missed = [
             f"the largest error is {1e3 * plan.largest_error_m:.3g} mm, more than largest_error_m"
@@ -286,8 +296,7 @@ def _missed_lines(plan: MotionPlan) -> list[Shown]:
         missed = [
             f"{each.name} misses its reference by {1e3 * error.largest_m:.3g} mm, more than "
             f"{1e3 * error.accepted_m:.3g} mm: half of its way, or its band"
-            for each in plan.program.references
-            if (error := plan.tracking_error(each)).largest_m > error.accepted_m
+            for each, error in exceeding
         ]
     return [Line(f"{each}; {cause}; expected {longer}{remedy}", "check") for each in missed]
 
@@ -377,11 +386,12 @@ def plan_summary(plan: MotionPlan, folder: Path | None = None) -> list[Shown]:
                 f"{1e3 * error.rms_m:.3g}",
                 f"{1e3 * error.largest_m:.3g}",
                 "" if error.band_m is None else f"{1e3 * error.band_m:.3g}",
+                f"{round(1e3 * each.from_lines_m, 3):.3g}",
             )
         )
     shown: list[Shown] = [*notes, *_interval_lines(plan)]
     if rows:
-        heads = ("point", "RMS error [mm]", "largest [mm]", "95 % band ± [mm]")
+        heads = ("point", "RMS error [mm]", "largest [mm]", "95 % band ± [mm]", "from polygon [mm]")
         shown.append(Table("", heads, rows=tuple(rows)))
     if plan.residual_vibration_m is not None:
         shown.append(f"residual vibration: {1e3 * plan.residual_vibration_m:.3g} mm")

@@ -70,6 +70,7 @@ class TrackingError:
     # Root mean square and largest distance from the reference [m]; NaN if only velocities count.
     rms_m: float
     largest_m: float
+    at_waypoints_m: float  # largest distance at the stated times [m]
     # Largest distance with which the point follows its reference [m]: what the task states, or else
     # half of the way of the point (of the hand, if the point is held), and not more than the band,
     # but at least `Reference.sigma_m`; NaN if only velocities count.
@@ -303,22 +304,22 @@ class MotionPlan:
         """Return the predicted deviation of a point from its reference."""
         counted = np.isfinite(reference.position_m)
         if not counted.any():
-            return TrackingError(np.nan, np.nan, np.nan, None)
-        found = self.points_m[reference.name]
-        deviation = np.where(counted, found - reference.position_m, 0.0)
-        at = counted.any(axis=1)
-        distance = np.linalg.norm(deviation[at], axis=1)
-        rms, largest = float(np.sqrt(np.mean(distance**2))), float(distance.max())
-        way_m = _farthest(np.where(counted, reference.position_m - found[0], 0.0))
+            return TrackingError(np.nan, np.nan, np.nan, np.nan, None)
+        path_m = self.points_m[reference.name]
+        deviation = np.where(counted, path_m - reference.position_m, 0.0)
+        distance = np.linalg.norm(deviation, axis=1)
+        rms = float(np.sqrt(np.mean(distance[counted.any(axis=1)] ** 2)))
+        largest, at_waypoints = (float(d.max()) for d in (distance, distance[reference.waypoints]))
+        way_m = _farthest(np.where(counted, reference.position_m - path_m[0], 0.0))
         if way_m < reference.sigma_m:
             way_m = _farthest(self.motion.derivatives(self.t_s).value[:, :3])
         half_m = max(way_m / 2, reference.sigma_m)
         stated_m = self.program.task.largest_error_m
         if self.half_widths_m is None:
-            return TrackingError(rms, largest, stated_m or half_m, None)
+            return TrackingError(rms, largest, at_waypoints, stated_m or half_m, None)
         band_m = float(self.half_widths_m[reference.name][counted].max())
         accepted_m = stated_m or min(half_m, max(band_m, reference.sigma_m))
-        return TrackingError(rms, largest, accepted_m, band_m)
+        return TrackingError(rms, largest, at_waypoints, accepted_m, band_m)
 
     @cached_property
     def residual_vibration_m(self) -> float | None:

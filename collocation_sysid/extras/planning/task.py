@@ -14,8 +14,9 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, InstanceOf, model_validator
 from pydantic.json_schema import SkipJsonSchema
+from scipy.interpolate import PchipInterpolator
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...common.schema_tables import Section, Vector, require_one
 from ...common.text_files import HAND_WRITTEN_BYTES, parse_toml, read_text
 from ...common.validated_classes import validated
@@ -86,8 +87,8 @@ class ReferenceSection(Section):
     from_s, until_s : float
         First and last time at which the reference counts; all its times by default.
     interpolation : "smooth", "linear" or "none"
-        Between the times of the reference: a smooth curve, straight lines, or none, so that the
-        reference counts at its times alone.
+        Between the times of the reference: a smooth curve that does not leave the values before and
+        after, straight lines, or none, so that the reference counts at its times alone.
     sigma_m : float
         Deviation of a coordinate that is acceptable: deviations count in units of it.
     sigma_m_s : float
@@ -526,6 +527,8 @@ class Reference:
     # Units of the deviations.
     sigma_m: float
     sigma_m_s: float
+    waypoints: Index  # (m,): samples nearest to the stated times; all of a held point
+    from_lines_m: float  # largest distance of the path from the lines between the waypoints
 
 
 def point_names(task: Task) -> list[str]:
@@ -593,6 +596,7 @@ def sampled_references(
         position, velocity = (np.full((len(t_s), 3), np.nan) for _ in range(2))
         until_s = np.inf if each.until_s is None else each.until_s
         counts = (t_s >= each.from_s - 1e-9) & (t_s <= until_s + 1e-9)
+        waypoints, from_lines_m = np.arange(len(t_s)), 0.0
         if each.hold:
             position[counts] = first_m
         else:
@@ -609,6 +613,9 @@ def sampled_references(
             for rows, target in ((each.position_m, position), (each.velocity_m_s, velocity)):
                 if rows is not None:
                     target[:] = _interpolated(np.array(rows), times, t_s, each.interpolation)
+            waypoints = _nearest(times, t_s)
+            if each.position_m and len(times) > 1:
+                from_lines_m = _distance_m(position, np.array(each.position_m), times, t_s)
             if each.relative:
                 position += first_m
             position[~counts] = velocity[~counts] = np.nan
@@ -620,7 +627,16 @@ def sampled_references(
                 where=f"reference {number}",
             )
         references.append(
-            Reference(name, place_m, position, velocity, each.sigma_m, each.sigma_m_s)
+            Reference(
+                name,
+                place_m,
+                position,
+                velocity,
+                each.sigma_m,
+                each.sigma_m_s,
+                waypoints,
+                from_lines_m,
+            )
         )
     return references
 
@@ -664,15 +680,19 @@ def _interpolated(values: Array, times: Array, t_s: Array, kind: str) -> Array:
     """
     result = np.full((len(t_s), 3), np.nan)
     if kind == "none" or len(times) == 1:
-        nearest = np.abs(t_s[:, None] - times).argmin(axis=0)
-        result[nearest] = values
+        result[_nearest(times, t_s)] = values
         return result
     inside = np.flatnonzero((t_s >= times[0] - 1e-9) & (t_s <= times[-1] + 1e-9))
     for axis in range(3):
         known = np.isfinite(values[:, axis])
         if not known.any():
             continue
-        result[inside, axis] = _curve(times[known], values[known, axis], t_s[inside], kind)
+        at, stated, x = times[known], values[known, axis], t_s[inside]
+        result[inside, axis] = (
+            PchipInterpolator(at, stated)(x)
+            if kind == "smooth" and len(at) > 1
+            else np.interp(x, at, stated)
+        )
         # A coordinate is free between two times of which one has no value.
         left = np.clip(np.searchsorted(times, t_s[inside] + 1e-9) - 1, 0, len(times) - 1)
         right = np.minimum(left + (t_s[inside] > times[left] + 1e-9), len(times) - 1)
@@ -680,9 +700,14 @@ def _interpolated(values: Array, times: Array, t_s: Array, kind: str) -> Array:
     return result
 
 
-def _curve(times: Array, values: Array, t_s: Array, kind: str) -> Array:
-    from scipy.interpolate import CubicSpline
+def _nearest(times: Array, t_s: Array) -> Index:
+    return np.abs(t_s[:, None] - times).argmin(axis=0)
 
-    if kind == "linear" or len(times) < 4:
-        return np.interp(t_s, times, values)
-    return np.asarray(CubicSpline(times, values)(t_s))
+
+def _distance_m(path_m: Array, waypoints_m: Array, times: Array, t_s: Array) -> float:
+    """Return the largest distance of a path (T, 3) from the lines between its waypoints (m, 3)."""
+    after = np.clip(np.searchsorted(times, t_s), 1, len(times) - 1)
+    begins_m = waypoints_m[after - 1]
+    off_m, way_m = np.nan_to_num(path_m - begins_m), np.nan_to_num(waypoints_m[after] - begins_m)
+    share = np.sum(off_m * way_m, axis=1) / np.maximum(np.sum(way_m**2, axis=1), 1e-300)
+    return float(np.linalg.norm(off_m - np.clip(share, 0, 1)[:, None] * way_m, axis=1).max())

@@ -26,10 +26,10 @@ METHOD_STUDY = "compare-methods"
 MODEL_STUDY = "compare-models"
 STUDY_TITLES = {METHOD_STUDY: "Comparison of methods", MODEL_STUDY: "Comparison of models"}
 # Methods that are compared by default: that of the paper, those of the literature, and those that the
-# package recommends; interior point without a solution by reduced space as its start.
+# package recommends.
 COMPARED_METHODS = (
     "penalty schedule=constant,penalty,penalty inner=levenberg-marquardt,augmented-lagrangian,shooting,"
-    "casadi:sqpmethod,interior-point initial=simulation,reduced-space"
+    "casadi:sqpmethod,interior-point,reduced-space"
 )
 # Largest number of starts: more would be a mistake.
 MOST_STARTS = 10_000
@@ -136,7 +136,8 @@ def plan_comparison(
     allow_code: bool = False,
 ) -> list[PlannedRun]:
     """Return a run of every method from every start; all methods have the same starts and time
-    grid. `methods` are those of `parse_methods`.
+    grid. `methods` are those of `parse_methods`; unless an option states it otherwise, interior
+    point starts from a simulation too, not at the answer of reduced space.
 
     An automatic number of substeps is replaced by the problem's first one, so that the methods do
     not choose their own. Runs are ordered by start, then by method.
@@ -171,13 +172,19 @@ def plan_comparison(
     planned = []
     for start in range(starts.starts):
         start_overrides = [*overrides, *starts.overrides(problem, truth or {}, start=start)]
-        for method in methods:
+        for method in dict.fromkeys(map(_from_guess, methods)):
             name, *options = method.split()
             own = [*start_overrides, *(f"solver.{name}.{option}" for option in options)]
             file, _ = read_problem_file(problem.path, own)
             details = {"start": start, "allow_code": allow_code}
             planned.append(_planned_run(problem.path, file, method, own, **details))
     return planned
+
+
+def _from_guess(method: str) -> str:
+    """At the answer of reduced space IPOPT makes no iteration: there would be nothing to compare."""
+    is_warm = method.startswith("interior-point") and " initial=" not in method
+    return method + " initial=simulation" * is_warm
 
 
 def plan_models(

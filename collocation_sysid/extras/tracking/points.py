@@ -4,7 +4,8 @@ Corners and stated points are followed by the pyramidal method of Lucas and Kana
 backwards: the likelihood of a sample decreases with the distance by which the way back misses the
 point, and a point that misses by more than a limit is lost. In order that errors of single steps do
 not add up, the surroundings of each point are then aligned with the first image by an affine
-transform (enhanced correlation coefficient); while they do not agree, samples are missing.
+transform (enhanced correlation coefficient). A point that the background leads astray is sought where
+its neighbours carry it; while its surroundings do not agree, samples are missing.
 """
 
 from __future__ import annotations
@@ -12,18 +13,19 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...common.array_types import Array
+from ...common.array_types import Array, Index
 from ...errors import InputError
 from .video import Image, grey, opencv
 
 # Window of the method [pixels], levels of its pyramid, and iterations of each level.
 WINDOW_PX = 21
-LEVELS = 3
+LEVELS, FEW_LEVELS = 3, 1
 ITERATIONS = 40
 # Distance of the way back at which the likelihood has fallen to 1/e [pixels].
 HALF_TRUST_PX = 0.5
@@ -35,6 +37,9 @@ LEAST_DISTANCE_PX = 12
 HALF_PATCH_PX = 15
 LEAST_CORRELATION = 0.85
 FARTHEST_PX = 4.0
+# Neighbours whose affine motion carries a point: most, with the point itself, fewest, one more than
+# determine the motion, and their largest distance, as the body bends [pixels].
+MOST_NEIGHBOURS, FEWEST_NEIGHBOURS, REACH_PX = 7, 4, 150.0
 
 
 class Loss(NamedTuple):
@@ -58,6 +63,21 @@ class Tracks:
     likelihood: Array  # (S, N)
     losses: Sequence[Loss] = ()
 
+    @cached_property
+    def sigma_px(self) -> float:
+        """Standard error of a coordinate: root mean square deviation of the points from the affine
+        motion of their neighbours; 0 without neighbours.
+        """
+        start, squares = self.pixels[0], []
+        for shifts in self.pixels[1:] - start:
+            known = np.flatnonzero(np.isfinite(shifts).all(axis=1))
+            for k in known.tolist():
+                near, weights = _neighbours(start, k, known)
+                if len(near):
+                    errors = shifts[k] - weights @ shifts[near]
+                    squares.append(errors**2 / (1 + weights @ weights))
+        return float(np.sqrt(np.mean(squares or 0.0)))
+
     @classmethod
     def of(
         cls, names: Sequence[str], times: Sequence[float], pixels: Array, trust: Array, size: Array
@@ -80,6 +100,18 @@ class Tracks:
             at_s = float(t_s[last + 1])
             losses.append(Loss(names[int(k)], last + 2, at_s, (u, v), step_px, bool(has_left)))
         return cls(names, t_s, pixels, trust, sorted(losses, key=lambda each: each.image))
+
+
+def _neighbours(start: Array, k: int, known: Index) -> tuple[Index, Array]:
+    """Return known neighbours of the point k, none if they are too few, and weights with which their
+    shifts make that of their affine motion at k.
+    """
+    offsets = (start[known] - start[k]) / REACH_PX
+    distances = np.linalg.norm(offsets, axis=1)
+    near = [i for i in np.argsort(distances)[:MOST_NEIGHBOURS] if 0 < distances[i] < 1]
+    near *= len(near) >= FEWEST_NEIGHBOURS  # else none
+    basis = np.column_stack([offsets[near], np.ones(len(near))])
+    return known[near], np.linalg.pinv(basis)[2]
 
 
 def require_size(image: Image, video: Path) -> None:
@@ -129,14 +161,11 @@ def follow(
     images: Iterable[tuple[float, Image]], names: Sequence[str], start: Array, lost_px: float
 ) -> Tracks:
     """Follow points (N, 2) of the first image through all images."""
-    cv2 = opencv()
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-4)
-    options = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": LEVELS, "criteria": stop}
     times, pixels, likelihood = [], [], []
     size = np.zeros(2)
     before: Image | None = None
     patches: list[_Patch] = []
-    now = start.astype(np.float32)
+    now, step = start.astype(float), np.zeros(start.shape)
     alive = np.ones(len(start), dtype=bool)
     for t_s, image in images:
         plain = grey(image)
@@ -147,18 +176,27 @@ def follow(
                 f"image {len(times) + 1} has another size; expected one size of all images"
             )
         if before is not None:
-            ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, plain, now[:, None], None, **options)
-            back, returned, _ = cv2.calcOpticalFlowPyrLK(plain, before, ahead, None, **options)
-            missed = np.linalg.norm(back[:, 0] - now, axis=1)
-            inside = ((ahead[:, 0] >= 0) & (ahead[:, 0] < size)).all(axis=1)
-            alive &= (found[:, 0] == 1) & (returned[:, 0] == 1) & (missed <= lost_px) & inside
-            trust = np.exp(-missed / HALF_TRUST_PX)
-            now = np.where(alive[:, None], ahead[:, 0], now).astype(np.float32)
-            agrees = alive.copy()
-            for k in np.flatnonzero(alive):
-                place = patches[k].aligned(plain, now[k])
-                agrees[k] = place is not None
-                now[k] = now[k] if place is None else place
+            last, agrees = now.copy(), np.zeros(len(start), dtype=bool)
+            searched, alive = alive, agrees.copy()
+            # Coarse levels contain the background: first without them, from the step before.
+            for guess, levels in ((last + step, FEW_LEVELS), (last, LEVELS)):
+                ahead, missed = _searched(before, plain, last, guess, levels)
+                inside = ((ahead >= 0) & (ahead < size)).all(axis=1)
+                for k in np.flatnonzero(searched & ~agrees & inside & (missed <= lost_px)):
+                    place = patches[k].aligned(plain, ahead[k])
+                    if place is None and alive[k]:
+                        continue
+                    now[k] = ahead[k] if place is None else place
+                    alive[k], agrees[k] = True, place is not None
+                    trust[k] = np.exp(-missed[k] / HALF_TRUST_PX)
+            known = np.flatnonzero(agrees)
+            for k in np.flatnonzero(~agrees).tolist():
+                near, weights = _neighbours(start, k, known)
+                carried = start[k] + weights @ (now - start)[near]
+                place = patches[k].aligned(plain, carried) if len(near) else None
+                if place is not None and place is not carried:  # not compared beyond the image
+                    now[k], alive[k], agrees[k], trust[k] = place, True, True, 1.0
+            step = now - last
         else:
             if ((start < 0) | (start > size - 1)).any():
                 raise InputError(
@@ -170,6 +208,25 @@ def follow(
         likelihood.append(np.where(agrees, trust, 0.0))
         before = plain
     return Tracks.of(names, times, np.array(pixels), np.array(likelihood), size)
+
+
+def _searched(
+    before: Image, image: Image, now: Array, guess: Array, levels: int
+) -> tuple[Array, Array]:
+    """Return where points (N, 2) of the image before are, and by how much the way back misses them;
+    infinite where none is found.
+    """
+    cv2 = opencv()
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 1e-4)
+    flags, window = cv2.OPTFLOW_USE_INITIAL_FLOW, (WINDOW_PX, WINDOW_PX)
+    options = {"winSize": window, "maxLevel": levels, "criteria": stop, "flags": flags}
+    points, near = (each[:, None].astype(np.float32) for each in (now, guess))
+    ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, image, points, near.copy(), **options)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(
+        image, before, ahead, ahead - near + points, **options
+    )
+    missed = np.where(found & returned, np.linalg.norm(back - points, axis=2), np.inf)
+    return ahead[:, 0].astype(float), missed[:, 0]
 
 
 class _Patch:
@@ -244,15 +301,15 @@ def _crossing(corners: Array) -> Array:
 
 
 def write_table(tracks: Tracks, file: Path) -> None:
-    """Write the pixels as a wide table; missing samples are empty cells."""
+    """Write the pixels as a wide table with their standard error; missing samples are empty cells."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         columns = [f"{name}_{c}" for name in tracks.names for c in ("u", "v", "likelihood")]
-        writer.writerow(["t_s", *columns])
+        writer.writerow(["t_s", *columns, "sigma_px"])
         for t_s, pixels, trust in zip(tracks.t_s, tracks.pixels, tracks.likelihood, strict=True):
             cells: list[str] = []
             for (u, v), likelihood in zip(pixels, trust, strict=True):
                 known = np.isfinite(u)
                 cells += [f"{u:.4f}", f"{v:.4f}"] if known else ["", ""]
                 cells.append(f"{likelihood:.4f}")
-            writer.writerow([f"{t_s:.6f}", *cells])
+            writer.writerow([f"{t_s:.6f}", *cells, f"{tracks.sigma_px:.3f}"])

@@ -62,8 +62,8 @@ class TrackVerdict:
             )
         if changed:
             found.append(
-                f"{changed} changed or moved suddenly: move slower, with a shorter exposure and more "
-                "light, larger features on the body, or use another tracker"
+                f"{changed} changed or moved suddenly: film before a plain background, with a shorter "
+                "exposure and more light, move slower, or use another tracker"
             )
         return found
 
@@ -76,6 +76,8 @@ class TrackVerdict:
             f"{self.surviving} of {len(tracks.names)} points survive to the last of {len(tracks.t_s)} "
             f"images ({tracks.t_s[-1]:.4g} s); {seen:.0%} of the samples"
         )
+        if tracks.sigma_px:
+            yield f"sigma_px = {tracks.sigma_px:.3f}, in the table: deviation from the motion of neighbours"
         if tracks.losses:
             rows = tuple(
                 (

@@ -2,7 +2,7 @@
 
 | program | file | content |
 |---|---|---|
-| any | .csv, wide | `t_s` (`t_ms`, …) or `frame`; `NAME_u`, `NAME_v`, perhaps `NAME_likelihood` by point |
+| any | .csv, wide | `t_s` (`t_ms`, …) or `frame`; `NAME_u`, `NAME_v`, perhaps `NAME_likelihood`, `sigma_px` |
 | any | .csv, long | `t_s` or `frame`, `point`, `u`, `v` and perhaps `likelihood` |
 | SLEAP | analysis .csv | `track`, `frame_idx`; `NODE.x`, `NODE.y`, `NODE.score` of each node |
 | DeepLabCut | .csv, .h5 | rows scorer, (individuals,) bodyparts, coords; frame, then x, y, likelihood |
@@ -77,6 +77,7 @@ class TrackFile:
     likelihood: Array | None
     t_s: Array | None  # (S,) or None: times [s]; None if the file states none
     frames: Array  # (S,): numbers of the images
+    sigma_px: float = 0.0  # standard error of a coordinate, in a wide table; 0 if unknown
 
     def confident(self, least: float) -> Array:
         """Return the pixels (S, N, 2), NaN where the likelihood is below `least`."""
@@ -180,7 +181,8 @@ def _wide_table(grid: Table, names: list[str], t_s: Array | None, frames: Array)
                 likelihood[:, k] = _numbers(grid, [scores[k]])[:, 0]
     pixels = pixels.reshape(len(pixels), -1, 2)
     if "track" not in grid.columns:
-        return TrackFile(tuple(names), pixels, likelihood, t_s, frames)
+        sigma_px = float(_numbers(grid, ["sigma_px"]).max()) if "sigma_px" in grid.columns else 0.0
+        return TrackFile(tuple(names), pixels, likelihood, t_s, frames, sigma_px)
     # A table of SLEAP has one row for each animal in an image.
     animals, numbers, pixels, likelihood = _by_label(
         grid, grid.columns.index("track"), "track {!r}", frames, pixels, likelihood

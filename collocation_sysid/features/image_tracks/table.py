@@ -168,6 +168,9 @@ class ImageTracksSection(MeasurementSection, of=ImageTracks):
                 )
             return self._tracks(camera, names, t_s, None, where, arguments, stated_m)
         content, at_s = self._read_file(folder, where)
+        if content.sigma_px > 0 and "sigma_px" not in self.model_fields_set:
+            arguments["sigma_px"] = content.sigma_px
+            folder.add_note(f"{self.file}: sigma_px = {content.sigma_px:g}, that of its table")
         names = self._names(content, where)
         columns = [content.names.index(name) for name in names]
         pixels = content.confident(self.least_likelihood)[:, columns]
