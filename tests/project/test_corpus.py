@@ -25,7 +25,7 @@ def contents():
     [
         ("solid/markers/all effects", "good", ""),
         ("solid/markers/gravity", "doubtful", "description/gravity"),
-        ("contact/poked 1", "good", ""),
+        ("contact/dragged 1", "good", ""),
     ],
 )
 def test_a_recording_has_its_answer_verdict_and_first_reason(contents, name, verdict, reason):
