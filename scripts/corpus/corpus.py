@@ -82,6 +82,8 @@ def main() -> None:
                 file.write(json.dumps(row) + "\n")
         table[recording.name] = row
         print(line(row), flush=True)
+    for row in table.values():
+        compare_repeats(row, table)
     print("\n" + summary({"now": table}))
     if options.against:
         before = {n: row for n, row in read(options.against).items() if n in table}
