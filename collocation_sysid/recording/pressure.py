@@ -38,7 +38,7 @@ def _checked_faces(faces: Selection | ArrayLike) -> Selection | Index:
             f"faces of a pressure are {faces.dtype} {faces.shape}; expected a selection or a "
             "(F, 3) array of node indices from 0"
         )
-    return faces
+    return faces.astype(np.int64)
 
 
 _TABLE = Key(
