@@ -794,10 +794,7 @@ def _effective_length(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return `_gauge_length` for grips: shoulders of a dogbone stretch less than the middle."""
     experiment = at.iterate.transcription.experiment
     deformation = experiment.specimen
-    if deformation is None or deformation.lateral == "":
-        return None
-    # Strains beside a length and an area were computed from the displacement of the grips.
-    if not (deformation.is_displacement or deformation.area_over_length_m):
+    if deformation is None or not deformation.is_displacement or deformation.lateral == "":
         return None
     is_pulled = specimen_strains(experiment)[0].max() > 0
     return _gauge_length(at, 0) if is_pulled else None
