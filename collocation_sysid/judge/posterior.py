@@ -313,6 +313,15 @@ class Posterior:
         places = slice(len(self.start), self._of_effects[0] if self.effects.names else None)
         return (self.fit.prior_residual + self.fit.prior_jacobian * self.step)[places]
 
+    @property
+    def expected_phi(self) -> Array:
+        """Standard deviations (nphi,) that `phi` has for a true description."""
+        places = slice(len(self.start), len(self.start) + len(self.phi))
+        own = np.diag(self.covariance)[places]
+        # The residuals may show more noise than stated, or correlated noise.
+        more = np.diag(self.uncertainty.nuisance_covariance)[: len(own)] - own
+        return np.sqrt(np.maximum(1 - own, UNSEEN) + np.maximum(more, 0.0))
+
     @cached_property
     def _information(self) -> Array:
         return least_squares_of_fit(self.fit).information

@@ -14,7 +14,6 @@ from ..common.time_dependence import at_times, values_over_time
 from ..errors import InputError, listed, located
 from ..fem.body import Body
 from ..recording import Experiment, Specimen
-from ..recording.homogeneous_deformation import shape_factor
 from ..recording.specimen_averages import RESOLUTION, with_averaged_rows
 from ..recording.specimen_checks import (
     loading_rows,
@@ -82,9 +81,6 @@ class SpecimenReader:
             self._add_note(f"{section.file}: {which} not read: {', '.join(table.unread)}")
         specimen = self._specimen(table)
         deformation = replace(specimen.find_deformation(), columns=table.columns)
-        if section.length_m and section.area_m2:  # also beside a column of strains
-            shape = shape_factor(section.length_m, section.area_m2)
-            deformation = replace(deformation, shape_factor=shape)
         with located(file):
             require_plausible_specimen(
                 specimen, is_stretch=not {"stretch", "volume_ratio"}.isdisjoint(table.columns)
@@ -103,12 +99,12 @@ class SpecimenReader:
                 "the compliance of the test bench is not part of the budget: state area_m2, the "
                 "undeformed area of the specimen, unless an extensometer measured the displacement"
             )
-        if table.is_displacement and deformation.lateral and specimen.strain.max() > 0:
+        if deformation.is_displacement and deformation.lateral and specimen.strain.max() > 0:
             self._add_note(
                 f"length_m = {section.length_m:g} is the length that is stretched: between the grips "
                 "of a strip, but of a dogbone the effective length of its narrow part, because the "
-                "shoulders hardly stretch (10 % less is common). The entry effective_length of "
-                '[uncertainty.assumptions] contains 5 %; state "none" for an extensometer or a strip'
+                "shoulders hardly stretch (10 to 30 % less is common). The entry effective_length of "
+                '[uncertainty.assumptions] contains 15 %; state "none" for an extensometer or a strip'
             )
         self._note_unknown_past(specimen)
         fitted = specimen
@@ -169,7 +165,7 @@ class SpecimenReader:
             arguments["sigma_pa"] = self._sigma_pa()
         if arguments["lateral_sigma"] is None:
             arguments["lateral_sigma"] = section.lateral_sigma
-        if table.is_displacement and section.area_m2 is not None:
+        if section.length_m and section.area_m2:  # also of strains, which may be those of the grips
             arguments |= {"length_m": section.length_m, "area_m2": section.area_m2}
         return Specimen(
             section.test,

@@ -28,6 +28,7 @@ from ..problem import Problem
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.markers import Markers
+from ..recording.specimen_files import specimen_strains
 from ..statistics.concerns import Concern
 from ..statistics.plausibility import copied_measurements
 
@@ -38,6 +39,8 @@ Fact = Concern | str
 MOVING_SIGMAS = 6.0
 LEAST_EARLY_SIGMAS = 1.5
 FEWEST_AT_REST = 8
+# Share of the largest strain and load up to which they stand still.
+LEAST_RISE = 0.02
 # Displacement of the grasps over the size of the body up to which images do not show it.
 UNSEEN = 1e-4
 # Median deviation of steps from the usual one, as a share of it, up to which samples are evenly
@@ -136,6 +139,28 @@ def motion_at_rest(experiment: Experiment) -> Iterator[Fact]:
             )
 
 
+def late_load(experiment: Experiment) -> tuple[Fact, ...]:
+    """Refuse a load of a specimen with memory that rises while the strain stands still at its first
+    maximum, by more than noise: stresses relax.
+    """
+    if experiment.specimen is None or not experiment.body.has_memory:
+        return ()
+    size = abs(specimen_strains(experiment)[0])
+    load_pa = abs(experiment.readings[0].measured_values[:, 0])
+    first, last = int(size.argmax()), int(np.nanargmax(load_pa))
+    noise_pa = experiment.readings[0].value_sigmas.max()
+    is_held = last > first and np.ptp(size[first : last + 1]) < LEAST_RISE * size.max()
+    rise_pa = load_pa[last] - load_pa[first]
+    if is_held and rise_pa > max(MOVING_SIGMAS * noise_pa, LEAST_RISE * load_pa[last]):
+        late_s = experiment.t_s[last] - experiment.t_s[first]
+        raise InputError(
+            f"experiment '{experiment.name}': the load rises by {rise_pa / load_pa[last]:.0%} of its "
+            f"largest value while the strain is held, for {late_s:.3g} s, but stresses relax: correct the "
+            "delay of the load, or the times at which the strain was reached"
+        )
+    return ()
+
+
 def _still_until_s(experiment: Experiment, limit_m: float) -> float:
     """Return the first time at which a grasp or an obstacle would move a corner of the body by more
     than a limit, or begins or ends to act [s]; the end of the recording if none does.
@@ -216,7 +241,7 @@ def grasp_extent(experiment: Experiment) -> Iterator[Concern]:
             )
 
 
-FACTS = (loose_parts, lost_samples, motion_at_rest, gaps)
+FACTS = (loose_parts, late_load, lost_samples, motion_at_rest, gaps)
 
 
 def facts(problem: Problem) -> list[Fact]:

@@ -210,7 +210,7 @@ class SolvedProblem:
         return not (
             fit_concerns(self.uncertainty)
             or effect_concerns(self.effects)
-            or unknown_concerns(self.solution, self.posterior.phi)
+            or unknown_concerns(self.solution, self.posterior)
         )
 
     @cached_property
@@ -242,7 +242,7 @@ class SolvedProblem:
                 self.rollouts,
                 motions=self.modes_by_experiment.values(),
                 uncertainty=self.uncertainty,
-                phi=self.posterior and self.posterior.phi,
+                posterior=self.posterior,
                 surprise=grade,
                 is_step_known=self.posterior is not None
                 and self.is_consistent

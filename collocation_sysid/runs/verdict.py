@@ -12,6 +12,7 @@ from ..features.measurements import present
 from ..features.registry import FEATURES
 from ..features.specimens.concerns import as_specimen_concerns
 from ..fem.schemes import as_scheme
+from ..judge.posterior import Posterior
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import misfit_of
@@ -59,7 +60,7 @@ def solution_concerns(
     rollouts: Mapping[str, ForwardSimulation | str],
     motions: Iterable[ModesCheck],
     uncertainty: Uncertainty | None,
-    phi: Array | None = None,
+    posterior: Posterior | None = None,
     surprise: Grade | None = None,
     is_step_known: bool = False,
 ) -> Iterator[Concern]:
@@ -78,9 +79,9 @@ def solution_concerns(
     uncertainty : Uncertainty or None
         Statistical uncertainty; None without error bars, which is a concern of its own if there
         are parameters.
-    phi : (nphi,) array, optional
-        Nuisance parameters of all experiments, in units of their priors, in the posterior with all
-        effects; by default those of the solution.
+    posterior : Posterior, optional
+        Posterior with all effects, whose nuisance parameters are judged; by default those of the
+        solution.
     surprise : {"check", "doubtful"} or None
         Grade of the effects that the residuals need; None if they need none. Without free constants
         the stated ones may as well be wrong, so that the prediction is as grave.
@@ -104,7 +105,7 @@ def solution_concerns(
     transcriptions = solution.collocation.transcriptions
     fitted_experiments = [each.experiment for each in transcriptions]
     collocation = solution.collocation
-    unknowns = unknown_concerns(solution, phi)
+    unknowns = unknown_concerns(solution, posterior)
     if not solution.collocation.nq:
         yield from _prediction_concerns(solution, rollouts, surprise)
     if uncertainty is not None:
@@ -152,18 +153,27 @@ def solution_concerns(
             )
 
 
-def unknown_concerns(solution: Solution, phi: Array | None) -> list[Concern]:
-    """Return the concerns about nuisance parameters (nphi,), by default those of the solution."""
+def unknown_concerns(solution: Solution, posterior: Posterior | None) -> list[Concern]:
+    """Return the concerns about nuisance parameters, by default those of the solution."""
     collocation = solution.collocation
-    at = collocation.parameters_from(solution.z)[collocation.nq :] if phi is None else phi
+    if posterior is None:
+        phi = collocation.parameters_from(solution.z)[collocation.nq :]
+        expected = np.ones_like(phi)
+    else:
+        phi, expected = posterior.phi, posterior.expected_phi
+    places = {
+        each: each.nuisance_indices.indices - collocation.nq for each in collocation.transcriptions
+    }
     return [
         concern
-        for each in collocation.transcriptions
-        for concern in _nuisance_concerns(each, at[each.nuisance_indices.indices - collocation.nq])
+        for each, at in places.items()
+        for concern in _nuisance_concerns(each, phi[at], expected[at])
     ]
 
 
-def _nuisance_concerns(transcription: Transcription, phi: Array) -> Iterator[Concern]:
+def _nuisance_concerns(
+    transcription: Transcription, phi: Array, expected: Array
+) -> Iterator[Concern]:
     nuisance = transcription.nuisance
     experiment = transcription.experiment
     low, high = nuisance.bounds(transcription.association.clock_samples)
@@ -174,6 +184,7 @@ def _nuisance_concerns(transcription: Transcription, phi: Array) -> Iterator[Con
         phi,
         low=low,
         high=high,
+        expected=expected,
         is_specimen=experiment.specimen is not None,
         rows=[entry.row for entry in nuisance.entries],
         scales=nuisance.scales.tolist(),

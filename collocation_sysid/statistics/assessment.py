@@ -372,6 +372,7 @@ def nuisance_concerns(
     low: Iterable[float],
     high: Iterable[float],
     *,
+    expected: Iterable[float] = (),
     is_specimen: bool = False,
     rows: Sequence[Deviation] = (),
     scales: Sequence[float] = (),
@@ -385,6 +386,9 @@ def nuisance_concerns(
         Estimates φ in standard deviations of their priors.
     low, high : iterables of float
         Limits of the estimates, likewise.
+    expected : iterable of float, optional
+        Standard deviations that φ have for a true description, at most 1 unless the residuals show
+        more noise than stated: data that hardly see a parameter leave it near zero.
     is_specimen : bool
         Whether they are those of a specimen, whose page explains them.
     rows : sequence of Deviation
@@ -397,9 +401,11 @@ def nuisance_concerns(
     At a limit (within 0.001 standard deviations) the concern is "doubtful". Else, as for effects of
     the budget, it is "check" beyond the deviation that is exceeded with the probability `CHANCE` by
     any of the n parameters (Bonferroni), 2.6 standard deviations for one parameter and 3.5 for 20,
-    and "doubtful" beyond that of the probability `RARE`, 3.9 and 4.6. Limits may be infinite.
+    and "doubtful" beyond that of the probability `RARE`, 3.9 and 4.6, or of these standard
+    deviations that are expected. Limits may be infinite.
     """
     items = [*zip(names, deviations, low, high, strict=True)]
+    sizes = [*expected] or [1.0] * len(items)
     limit, gross = (largest_deviation(len(items), p) for p in (CHANCE, RARE))
     concerns: list[Concern] = []
     far: dict[str, tuple[float, Concern]] = {}
@@ -410,18 +416,19 @@ def nuisance_concerns(
             limited, True, code="specimen/limit" if is_specimen else "nuisance/limit", name=name
         )
         vector = name.rpartition(", ")[0] or name
-        if limited or deviation <= max(limit, far.get(vector, (0.0,))[0]):
+        is_gross = deviation > gross * min(1.0, sizes[k])
+        if limited or deviation <= max(0.0 if is_gross else limit, far.get(vector, (0.0,))[0]):
             continue
         data: dict[str, object] = {"name": name, "deviations": deviation}
         code = "specimen/far" if is_specimen else "nuisance/far"
         if is_specimen:
-            data["advice"] = HIDING if deviation > gross else WIDENING
+            data["advice"] = HIDING if is_gross else WIDENING
         elif rows:
             size, unit = in_readable_unit(deviation * scales[k], rows[k].unit)
             where = STATED_IN.get(rows[k].of, "[experiment.nuisance]")
             data |= {"size": f"{size:.2g}{unit}", "where": where}
             code = "nuisance/large" if deviation * scales[k] > rows[k].largest else "nuisance/sized"
-        far[vector] = deviation, Concern(code, "doubtful" if deviation > gross else "check", data)
+        far[vector] = deviation, Concern(code, "doubtful" if is_gross else "check", data)
     concerns += (concern for _, concern in far.values())
     return concerns
 

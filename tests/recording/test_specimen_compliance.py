@@ -17,7 +17,7 @@ COMPLIANCE_M_N = 5e-6
 CONSTANTS = {"poisson": 0.4, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0}
 # Systematic effects of specimens apart from the compliance.
 OTHERS = dict.fromkeys(
-    ("anisotropy", "stiffness_drift", "poisson", "gauge_length", "effective_length"), "none"
+    ("anisotropy", "load_drift", "poisson", "gauge_length", "effective_length"), "none"
 )
 STRAIN = np.linspace(0.02, 0.4, 12)
 KEYS = {"sigma_pa": 100.0, "strain_zero": 0.0, "area_error": 0.0}

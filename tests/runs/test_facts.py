@@ -179,3 +179,27 @@ def test_waypoints_are_no_gaps(rng):
     wrench = Wrench(t_s, np.zeros((len(t_s), 6)), 0.1, 0.01)
     kept = replace(experiment, grasps=[replace(experiment.grasps[0], wrench=wrench)])
     assert [*gaps(kept)] == []
+
+
+def relaxation(load_late_s: float = 0.0, slack: float = 0.0) -> cs.Problem:
+    """A strip with memory whose load is recorded late, or that is loose at first."""
+    t_s = np.linspace(0, 5, 101)
+    strain = 0.1 * np.minimum(t_s / 0.5, 1)
+    there_s = np.clip(t_s - load_late_s, 0, None)
+    pulled = np.maximum(0.1 * np.minimum(there_s / 0.5, 1) - slack, 0)
+    stress_pa = 2e5 * pulled * (1 + 0.5 * np.exp(-there_s))
+    noise_pa = 20 * np.random.default_rng(1).normal(size=len(t_s))
+    specimen = cs.Specimen("uniaxial", strain, stress_pa + noise_pa, 20.0, t_s=t_s)
+    unknown = {"young_pa": cs.Unknown(), "poisson": 0.45, "a.share": 0.3, "a.tau_s": 1.0}
+    return cs.Problem([specimen.experiment(name="relax", prony=("a",))], unknown)
+
+
+@pytest.mark.parametrize("late_s", [0.1, 0.2, 0.4])
+def test_a_load_that_rises_while_the_strain_is_held_is_refused(late_s):
+    with pytest.raises(InputError, match=f"while the strain is held, for {late_s:.3g} s"):
+        facts(relaxation(late_s))
+
+
+def test_a_load_in_time_and_a_loose_strip_are_not_refused():
+    assert not facts(relaxation())
+    assert not facts(relaxation(slack=0.03))

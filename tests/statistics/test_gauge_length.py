@@ -79,3 +79,26 @@ def test_the_row_belongs_to_specimens_by_default_and_not_to_bodies():
     budget = cs.run(problem, seek_causes=False).result.budget["young_pa"]
     assert "gauge_length" not in budget
     assert "body_scale" in budget
+
+
+@pytest.mark.parametrize(
+    ("stated", "is_counted"), [("length_m = 0.03\narea_m2 = 1e-4\n", True), ("", False)]
+)
+def test_strains_beside_a_length_and_an_area_may_be_those_of_the_grips(
+    tmp_path, stated, is_counted
+):
+    """A dogbone of which 24 of the 30 mm between the grips take part, with a column of strains."""
+    strain = np.linspace(0.01, 0.3, 12)
+    true = cs.Specimen("uniaxial", strain / 0.8, 0 * strain, **KEYS).experiment(name="pull")
+    (stress_pa,) = cs.simulate(true, {**CONSTANTS, "young_pa": YOUNG_PA}).custom_sensor_values
+    rows = np.column_stack([strain, stress_pa[:, 0]])
+    np.savetxt(tmp_path / "pull.csv", rows, delimiter=",", header="strain (1),stress (Pa)", comments="")
+    (tmp_path / "problem.toml").write_text(
+        f"[object]\nmaterial = 'neo-hookean'\n[parameters]\nyoung_pa = {{}}\npoisson = {CONSTANTS['poisson']}\n[[experiment]]\n"
+        'name = "pull"\nkind = "specimen"\ntest = "uniaxial"\nfile = "pull.csv"\n'
+        f"sigma_pa = 100.0\n{stated}"
+    )
+    run = cs.run(cs.Problem.read(tmp_path / "problem.toml"), seek_causes=False)
+    assert ("effective_length" in run.result.budget["young_pa"]) == is_counted
+    low, high = run.estimates["young_pa"].combined95
+    assert (low <= YOUNG_PA <= high) == is_counted

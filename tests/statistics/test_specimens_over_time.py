@@ -72,7 +72,7 @@ def test_the_interval_contains_the_relaxation_time_of_a_drifting_load():
     (stress_pa,) = cs.simulate(held, CONSTANTS | {"a.tau_s": 30.0}).custom_sensor_values
     drifting = stress_pa * (1 - DRIFT * t_s[:, None] / t_s[-1])
     recorded = with_readings(held, [drifting])
-    low, high = interval(recorded, 30.0, stiffness_drift=DRIFT)
+    low, high = interval(recorded, 30.0, load_drift=DRIFT)
     assert low < 30.0 < high
     assert interval(recorded, 30.0)[0] > 30.0
 
@@ -83,7 +83,7 @@ def test_tables_of_moduli_have_no_clock():
     table = cs.Specimen.relaxation(t_s, modulus_pa, 1e3).experiment(prony=("a",))
     exact = interval(table, 0.3)
     assert exact[0] < 0.3 < exact[1]
-    assert interval(table, 0.3, specimen_delay_s=DELAY_S, stiffness_drift=DRIFT) == exact
+    assert interval(table, 0.3, specimen_delay_s=DELAY_S, load_drift=DRIFT) == exact
 
 
 def test_a_single_sample_has_no_pace():

@@ -239,6 +239,14 @@ def test_nuisance_parameters_far_from_their_prior():
         assert found.grade == "doubtful"
 
 
+def test_a_parameter_that_the_data_hardly_see_is_compared_with_what_they_leave_of_its_prior():
+    """A tilt of three and a half deviations, of which the data see half of the variance."""
+    walls = [-np.inf], [np.inf]
+    assert nuisance_concerns(["tilt"], [3.5], *walls)[0].grade == "check"
+    assert nuisance_concerns(["tilt"], [3.5], *walls, expected=[0.7])[0].grade == "doubtful"
+    assert not nuisance_concerns(["tilt"], [2.5], *walls, expected=[0.7])
+
+
 def off(sigmas: float, count: int = 1000) -> InstrumentMisfit:
     return InstrumentMisfit("stress", "its sigma", sigmas, sigmas, count)
 
