@@ -250,9 +250,12 @@ class SolvedProblem:
             )
         )
         # What is far from its prior hides another error if it cannot be so far, or leaves residuals.
-        leaves = any(e.code == "noise/larger" and e.grade == "doubtful" for e in of_fit)
-        hiding = "nuisance/" if leaves else "nuisance/large"
-        of_fit.sort(key=lambda each: each.code.startswith(hiding))
+        leaves = any(
+            e.code == "nuisance/large" or (e.code == "noise/larger" and e.grade == "doubtful")
+            for e in of_fit
+        )
+        hiding = ("nuisance/",) if leaves else ()
+        of_fit.sort(key=lambda e: (e.code.startswith(hiding), e.code != "nuisance/large"))
         if not self.solution.collocation.nq:
             effects = []
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}

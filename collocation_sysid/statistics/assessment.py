@@ -117,8 +117,10 @@ class Assessment:
         follow from them. Of several concerns with the same message the first is kept, whatever its
         grade and code.
         """
-        by_message = {concern.message: concern for concern in reversed([*concerns])}
-        gravest = sorted(reversed(by_message.values()), key=lambda each: each.grade == "check")
+        by_message: dict[str, Concern] = {}
+        for concern in concerns:
+            by_message.setdefault(concern.message, concern)
+        gravest = sorted(by_message.values(), key=lambda each: each.grade == "check")
         first = [replace(e, grade=gravest[0].grade) for e in gravest if e.code in FIRST]
         return cls((*first, *(each for each in gravest if each.code not in FIRST)))
 

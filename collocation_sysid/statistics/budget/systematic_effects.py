@@ -1074,6 +1074,7 @@ ASSUMPTIONS = (
         description="displacement of the surface of the body from that of the mesh along its "
         "normal, relative to the thickness",
         remedy="measure the thickness of the real body at several places",
+        largest=0.5,
         effect=_surface,
         axes=_MODES,
         by_origin={"scan": 0.01},
