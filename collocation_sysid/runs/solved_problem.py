@@ -266,8 +266,11 @@ class SolvedProblem:
             if any(each.suffices for each in self.suspects):
                 causes = [each for each in causes if each.code != "description/insufficient"]
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
-            # Effects are judged with this mesh, so that a coarse one is as grave.
-            known = [replace(each, grade=effects[0].grade) for each in meshes] if effects else []
+            # Effects are judged with this mesh, so that a coarse one is as grave, and explain nothing
+            # where residuals remain.
+            remaining = [e for e in of_fit if e.code.startswith(("residuals/", "noise/larger"))]
+            graver = [*meshes, *remaining] if effects else []
+            known = [replace(each, grade=effects[0].grade) for each in graver]
             # What is farther from its prior than an effect may distort the effects.
             surprise = effects[0].data["surprise"] if effects else np.inf
             farther = [

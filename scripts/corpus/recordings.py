@@ -344,7 +344,7 @@ SPECIMEN_LAWS = {
 SPECIMEN_MISTAKES = {
     "ogden_slack": (
         "strip loose over the first 3 % of strain",
-        ("strain zero", "strain_zero", "slack"),
+        ("strain zero", "strain_zero", "slack", "initial slope"),
     ),
     "yeoh_machine": ("compliance of the machine 8 µm/N", ("machine", "compliance")),
     "yeoh_dogbone": ("30 mm stated, 24 mm take part", ("length",)),
