@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -32,65 +32,42 @@ if TYPE_CHECKING:
     from ..program.transcription import Transcription
     from .experiment_executors import ExperimentExecutor
 
-# Largest infeasibility of a trial over the length of its step.
-CONTRACTION = 0.5
-# Largest infeasibility of a trial over an edge of the mesh: the strain that it causes is then
-# small enough for Newton's next step to remove it. One of both limits is sufficient.
-SMALL_STRAIN = 0.1
-# Smallest share of the predicted decrease that a trial must reach.
-DECREASE = 1e-3
-# With impacts, the largest infeasibility of a trial over an edge of the mesh; other trials are
-# simulated. Where a body strikes or slips, forces change within a small part of any step.
-SMALL_IMPACT_STRAIN = 1e-4
-# The same for slender bodies without impacts: forces along them that are wrong by their weight are
-# perhaps compression, with which the linearised motion grows without limit.
-SLENDER_STRAIN = 5e-2
-# Steps longer than so many times the one that is expected to leave as much are simulated at once.
-LONGEST_SWEPT = 2.0
-# Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors. With
-# impacts, whose simulations repeat a loss to about 1e-8, the rejection of such a full step ends the
-# search as converged, otherwise only if shorter steps are rejected, too: the stress of a nearly
-# incompressible body at small strain has few digits.
-INSIGNIFICANT = 1e-6
-# So does, with impacts, a rejection where a full step is below this share of each standard error:
-# ripples of the loss, about one of χ², are larger than what such a step can gain.
-NEAR = 0.3
-# And a rejection without impacts, where it is below so many times the share of a step that is
-# insignificant by itself, 0.1 by default: points on the surface of a mesh leave their faces within
-# such a step, so that further steps creep along the edges.
-SETTLED = 100.0
-# Infeasibility over the body's size that is due to rounding.
-FEASIBLE = 1e-12
-# Infeasibility over the body's size at which a search ends if steps no longer change the
-# parameters and the infeasibility no longer decreases.
-NEARLY_FEASIBLE = 1e-8
-# Infeasibility over the body's size above which a point is made feasible after a first rejection.
-INFEASIBLE = 1e-6
+# Infeasibility of a trial over an edge of the mesh above which it is simulated: the strain that it
+# causes is then small enough for Newton's next step to remove it. The bound of a funnel (Gould &
+# Toint, Math. Program. 122, 2010), which only shrinks.
+FUNNEL = 0.1
+# Shares of the predicted decrease (Conn, Gould & Toint, Trust-Region Methods, 2000, section 6.1): the
+# smallest of an accepted trial, that below which the trust region shrinks, and that above which it
+# grows.
+DECREASE, POOR, GOOD = 1e-3, 0.25, 0.75
 # Length of the next trial over that of a rejected step.
 SHRINK = 0.25
-# Shortest step: shorter ones end the search as stalled.
+# Steps longer than so many times the one that is expected to stay in the funnel are simulated at once.
+LONGEST_SWEPT = 2.0
+# Shortest step, at which a search ends.
 SMALLEST_TRUST = 1e-10
-# The last step is accepted without another sweep if its error, estimated from the rate at which
-# steps become shorter, is below this share of the tolerance.
-SAFETY = 0.3
-# So is one within so many times the tolerance of standard errors: 1e-3 by default, and at most. Losses
-# below 1, of data without noise, are to be known to that share.
-SIGNIFICANCE = 1e5
-# Largest residual of the equations of motion after that step, in the scaling of the NLP.
-FEASIBLE_FORCE = 1e-10
 # Largest step of the logarithm of a parameter, and of nuisance parameters.
 WIDEST = 4.0
 # Largest trust region with linear parameters, whose units may be far below what the data allow.
 WIDEST_LINEAR = 1e6
 # Largest trust region with unlabelled points, whose correspondences are valid only nearby.
 SEEING = 0.25
-# With unlabelled points, a rejected step shorter than this ends the search.
-LEAST_DETERMINED_SHARE = 1e-3
-# Smallest share of the correspondences that a step must keep.
-LEAST_VISIBLE_SHARE = 0.97
-# Largest increase of the mean loss of a measured number by a new association.
-EQUAL_MISFIT_RATIO = 1.01
-# Largest step from which the curvature at the solution is learned.
+# Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors.
+INSIGNIFICANT = 1e-6
+# Share of the standard errors within which a smooth loss agrees with its quadratic model: a trial that
+# disagrees by more than a full step can gain there shows the noise of the loss (contact that opens and
+# closes, points that change to other faces, rounding; Sun & Nocedal, Math. Program. 202, 2023).
+NOISY = 0.3
+# So is one within so many times the tolerance of standard errors: 1e-3 by default, and at most. Losses
+# below 1, of data without noise, are to be known to that share.
+SIGNIFICANCE = 1e5
+# Relative error of the loss by rounding.
+ROUND_OFF = 1e-12
+# Infeasibility over the body's size of an answer: its loss is accurate to a higher order.
+FEASIBLE = 1e-6
+# Largest residual of the equations of motion after the last step, in the scaling of the NLP.
+FEASIBLE_FORCE = 1e-10
+# Largest step within which the loss is about quadratic, so that the curvature is learned from it.
 LOCAL = 0.1
 # Relative accuracy of the solutions of the time steps after long steps of the parameters, in sweeps
 # of large bodies.
@@ -104,12 +81,8 @@ SECOND_ORDER_SHARE = 0.1
 ACCURACY_SHARE = 0.01
 # Relative accuracy over the tolerance above which the point of a sweep is not the result.
 FINAL_ACCURACY_SHARE = 0.1
-# Largest number of new associations of the measurements.
-REREADINGS = 40
 # Larger than any loss.
 UNLIMITED = 1e100
-
-
 # The search on each share of a recording but the last ends when the next step is predicted to decrease
 # the loss by less than this fraction.
 RUNG_DECREASE = 0.05
@@ -129,9 +102,8 @@ class SearchOptions(MethodOptions):
     ----------
     tolerance : float
         The search ends when a step changes the logarithm of no parameter by more than this value.
-        It ends also when a step is predicted to be within 1e-3 standard errors, or within less with
-        a tolerance below the default, and when a step is rejected where the shared parameters are
-        within 0.1 standard errors.
+        It ends also when a step is predicted to be within 1e-3 standard errors, or at the noise of
+        the loss within 0.3 of them; within less with a tolerance below the default.
     least_decrease : float
         The search ends also when the next step, unless the trust region shortens it, is predicted
         to decrease the loss by less than this fraction times the largest change of a parameter's
@@ -176,17 +148,22 @@ def _oscillates(transcription: Transcription) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _ReassociatedTrial:
-    """Trial whose correspondences have been found again at its own estimates."""
+class SearchState:
+    """State of a search on one horizon."""
 
-    trial: Iterate  # trial with the association of the point before it
-    collocation: Collocation  # problem with the association at the trial
-    reassociated: Iterate  # trial with that association
+    point: Iterate  # best iterate
+    curvature: Array  # (np, np): part of the Hessian that Gauss–Newton neglects
+    trust: float  # longest step, relative to `ReducedSearch.reach`
+    funnel_m: float  # largest infeasibility of a trial that is not simulated
+    # Step of the parameters whose sweep is expected to leave as much infeasibility.
+    swept: float = np.inf
+    rejections: int = 0  # in a row
+    noise: float = 0.0  # actual less predicted decrease of the trial that was rejected last
+    is_rough: bool = False  # whether the sweep was too inaccurate for a result
 
 
 class ReducedSearch:
-    """State of a reduced-space search: best parameters and trajectories, trust region, number of
-    sweeps.
+    """Search with the reduced-space method: best parameters and trajectories, number of sweeps.
 
     Attributes
     ----------
@@ -199,8 +176,6 @@ class ReducedSearch:
         Best iterate, which was accepted last; None before the first.
     sweeps : int
         Number of sweeps and simulations so far.
-    trust : float
-        Longest step, relative to `reach`.
     reach : (np,) array
         Change of each parameter that counts as a step of one.
     largest_step : (np,) array
@@ -211,26 +186,14 @@ class ReducedSearch:
         Whether an experiment has measurements with correspondences, as those of cameras have.
     has_unlabelled : bool
         Whether such measurements do not state which points of the body they are.
-    has_impacts : bool
-        Whether a body may strike an obstacle: the trajectory is then not smooth in the parameters.
-    largest_strain : float or None
-        Largest infeasibility of a trial over an edge of the mesh, above which it is simulated; None
-        if trials are never simulated.
     is_associated : bool
         Whether cameras of unknown position have been associated with trajectories of
         sufficient length.
     ended_by_association : bool
         Whether the last `minimise` ended because new correspondences changed the loss by more than
         short steps did, while a full step was longer than a standard error of a parameter.
-    feasible_length : float
-        Step of the parameters whose sweep is expected to leave as much infeasibility as
-        `largest_strain` allows.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
-    most_measurements : int
-        Largest number of measurements that were associated.
-    reassociations : int
-        Number of new associations so far.
     refines_solutions : bool
         Whether sweeps can be done with less accuracy: those of large bodies, whose solutions are
         refined.
@@ -265,19 +228,10 @@ class ReducedSearch:
         ]
         self.has_correspondences = bool(correspondences)
         self.has_unlabelled = not all(each.is_labelled for each in correspondences)
-        self.has_impacts = any(
-            not transcription.experiment.is_static and transcription.experiment.obstacles
-            for transcription in collocation.transcriptions
-        )
-        is_slender = any(each.body.is_slender for each in collocation.transcriptions)
-        self.largest_strain = (
-            SMALL_IMPACT_STRAIN if self.has_impacts else SLENDER_STRAIN if is_slender else None
-        )
         linear = [item.scale == "linear" for item in collocation.parameters.free]
         linear = np.flatnonzero(linear)
         widest = WIDEST_LINEAR if len(linear) else WIDEST
         self.largest_trust = SEEING if self.has_unlabelled else widest
-        self.trust = min(options.trust, self.largest_trust)
         self.indefinite_steps = 0
         self.refines_solutions = not all(
             Factoriser.cached(
@@ -288,11 +242,8 @@ class ReducedSearch:
             for transcription in collocation.transcriptions
         )
         self.lower, self.upper = collocation.parameter_bounds
-        self.reassociations = 0
-        self.most_measurements = 0
         self.is_associated = True
         self.ended_by_association = False
-        self.feasible_length = np.inf
         self.reach = collocation.reach_p
         self.largest_step = WIDEST * self.reach
         self.largest_step[linear] = WIDEST_LINEAR
@@ -307,7 +258,6 @@ class ReducedSearch:
                 for part in collocation.iterates(start)
             ]
         self.point: Iterate | None = None
-        self.reassociated_trial: _ReassociatedTrial | None = None
         nodes = [transcription.body.nodes_m for transcription in collocation.transcriptions]
         self.edge_m = min(transcription.length_m for transcription in collocation.transcriptions)
         self.size_m = max(float(np.ptp(points, axis=0).max()) for points in nodes)
@@ -434,122 +384,121 @@ class ReducedSearch:
         """
         assert self.trajectories is not None
         self.ended_by_association = False
-        self.feasible_length = np.inf
-        tolerance = self.options.tolerance
-        least_decrease = min(INSIGNIFICANT, (SIGNIFICANCE * tolerance) ** 2)
-        self.trust = min(self.options.trust, self.largest_trust)
-        point = self._accept(
-            horizon,
-            horizon.evaluate(
-                self.p, self.trajectories, known_iterate=self.point, accuracy=accuracy
-            ),
+        known = self.point
+        start = horizon.evaluate(self.p, self.trajectories, known_iterate=known, accuracy=accuracy)
+        point = self._accept(horizon, start)
+        state = SearchState(
+            point,
+            np.zeros((len(point.p), len(point.p))),
+            trust=min(self.options.trust, self.largest_trust),
+            funnel_m=FUNNEL * self.edge_m,
+            is_rough=not self._is_final_accuracy(accuracy),
         )
-        rejections = 0
-        curvature = np.zeros((len(point.p), len(point.p)))
-        previous = np.inf
-        # Points of little accuracy are not the result.
-        is_rough = not self._is_final_accuracy(accuracy)
-        while True:
-            step = self._next_step(point, curvature, self.trust)
-            length = self._step_length(step)
-            # A step that the trust region shortens contains no information on the remaining
-            # distance.
-            is_full_step = length < 0.99 * self.trust and not is_rough
-            is_short = is_full_step and length <= tolerance
-            if is_short and point.feasibility_m <= FEASIBLE * self.size_m:
-                return Status.CONVERGED
-            decrease = point.loss - point.predicted_loss(step)
-            is_insignificant = is_full_step and decrease <= least_decrease * min(1.0, point.loss)
-            # The first step tells nothing of the rate of convergence.
-            rate = min(1.0, length / previous) if 0.0 < previous < np.inf else 1.0
-            if is_last and (
-                is_insignificant or (is_full_step and length * rate <= SAFETY * tolerance)
-            ):
-                final_positions = horizon.extrapolate(point, step)
-                reached = horizon.feasibilities(point.p + step, final_positions)
-                if self._are_feasible(reached):
-                    self._record(
-                        point.p + step,
-                        final_positions,
-                        loss=point.predicted_loss(step),
-                        reached=reached,
-                    )
-                    return Status.CONVERGED
-            predicted_share = 1.0 - point.predicted_loss(step) / max(point.loss, 1e-300)
-            if not is_last and predicted_share < RUNG_DECREASE:
-                return Status.CONVERGED
-            # With curvature that Gauss–Newton neglects its own loss may be predicted to grow.
-            is_small = 0.0 <= predicted_share < self.options.least_decrease * min(1.0, length)
-            if is_full_step and is_small:
-                return Status.CONVERGED
-            if self.sweeps >= self.options.max_iterations:
-                return Status.ITERATION_LIMIT
-            trial = self._try(horizon, point, step=step)
-            is_better = trial is not None and self._judge(point, step, trial=trial)
-            if (
-                trial is not None
-                and is_better
-                and self._is_better_reassociated(horizon, point, trial=trial)
-            ):
-                if is_last and length <= LOCAL:
-                    curvature = self._update_curvature(curvature, point, after=trial)
-                point = self._accept(horizon, trial)
-                rejections = 0
-                previous = length
-                is_rough = not self._is_final_accuracy(self._accuracy_after(length))
-                continue
-            is_insignificant = (
-                self.has_impacts
-                and is_full_step
-                and point.loss - point.predicted_loss(step) <= INSIGNIFICANT
+        while (status := self._outcome(horizon, state, is_last)) is None:
+            state = self._advance(horizon, state, is_last)
+        return status
+
+    def _outcome(self, horizon: Horizon, state: SearchState, is_last: bool) -> Status | None:
+        """Return the status if the search ends at a state, by the first reason that holds."""
+        point, tolerance = state.point, self.options.tolerance
+        step = self._next_step(point, state.curvature, state.trust)
+        length = self._step_length(step)
+        # A step that the trust region shortens contains no information on the remaining distance.
+        is_full = length < 0.99 * state.trust and not state.is_rough
+        decrease = self._predicted(state, step)
+        share = decrease / max(point.loss, 1e-300)
+        level = min(1.0, point.loss)  # data without noise are fitted more closely than their errors
+        insignificant = min(INSIGNIFICANT, (SIGNIFICANCE * tolerance) ** 2) * level
+        is_small = is_full and (decrease <= insignificant or length <= tolerance)
+        if is_last and is_small and self._ends(horizon, point, step):
+            return Status.CONVERGED
+        if not is_last and share < RUNG_DECREASE:
+            return Status.CONVERGED
+        if is_full and share < self.options.least_decrease * min(1.0, length):
+            return Status.CONVERGED
+        if state.rejections:
+            farthest = self._full_step(point, state.curvature)
+            remaining = self._predicted(state, farthest)
+            noisy = NOISY * float(np.sqrt(insignificant / INSIGNIFICANT))
+            is_local = self._step_length(farthest) <= LOCAL and self._is_near(
+                point, farthest, noisy
             )
-            settled = SETTLED * float(np.sqrt(least_decrease * min(1.0, point.loss)))
-            share = NEAR if self.has_impacts else settled
-            is_within_noise = self._is_near(point, self._full_step(point, curvature), share)
-            if is_within_noise and not self.has_impacts:
-                # Steps of the parameters would disturb the equations of motion again.
-                point = self._make_feasible(horizon, point)
-                if not self._is_feasible(point, INFEASIBLE):
-                    point = self._make_feasible(horizon, point)
-            if ((is_short or is_insignificant) and self._is_feasible(point, NEARLY_FEASIBLE)) or (
-                is_within_noise and self._is_feasible(point, INFEASIBLE)
-            ):
-                return Status.CONVERGED  # rounding, kinks, or ripples keep it from getting better
-            if self.has_unlabelled and length <= LEAST_DETERMINED_SHARE:
-                # The association changes the loss by more than such a step.
-                # The intervals contain the minima that other correspondences have so near.
-                is_near = self._is_near(point, self._full_step(point, curvature), 1.0)
-                self.ended_by_association = not is_near
-                return Status.CONVERGED
-            if length <= max(SMALLEST_TRUST, 0.1 * tolerance):
-                if rejections or self._is_feasible(point, NEARLY_FEASIBLE):
-                    return self._status_without_progress(point, curvature)
-                # The loss of an infeasible point may be too low, also at bounds.
-                point = self._make_feasible(horizon, point)
-                rejections = 1
-                continue
-            self.trust = SHRINK * length
-            if rejections and self.has_impacts:
-                # Points touch and part within short steps: χ² is smooth only within shorter ones,
-                # which need no simulation.
-                self.trust = min(self.trust, self.feasible_length)
-            rejections += 1
-            if rejections == 1 and point.feasibility_m > INFEASIBLE * self.size_m:
-                point = self._make_feasible(horizon, point)
+            is_noise = is_local and remaining <= state.noise
+            is_rounding = is_small or remaining <= max(insignificant, ROUND_OFF * point.loss)
+            if is_noise or is_rounding or state.trust <= SMALLEST_TRUST:
+                point = self._settled(horizon, point)
+                is_feasible = point.feasibility_m <= FEASIBLE * self.size_m
+                is_near = is_noise or is_rounding or self._is_near(point, farthest, 1.0)
+                self.ended_by_association = self.has_unlabelled and not is_near
+                is_answer = is_feasible and (is_near or self.has_unlabelled)
+                return Status.CONVERGED if is_answer else Status.STALLED
+        if self.sweeps >= self.options.max_iterations:
+            return Status.ITERATION_LIMIT
+        return None
 
-    def _status_without_progress(self, point: Iterate, curvature: Array) -> Status:
-        """Return convergence if even a full step would not decrease the loss significantly."""
-        full_step = self._full_step(point, curvature)
-        if self.has_impacts and self._is_near(point, full_step, 1.0):
-            is_converged = self._is_feasible(point, INFEASIBLE)
-        else:
-            remaining = point.loss - point.predicted_loss(full_step)
-            is_converged = self._is_feasible(point, NEARLY_FEASIBLE) and remaining <= INSIGNIFICANT
-        return Status.CONVERGED if is_converged else Status.STALLED
+    @staticmethod
+    def _predicted(state: SearchState, step: Array) -> float:
+        """Return the decrease of the loss by a step (np,) in the model whose minimiser it is."""
+        model = with_curvature(state.point.fit, state.curvature)
+        return model.loss(np.zeros_like(step)) - model.loss(step)
 
-    def _is_feasible(self, point: Iterate, limit: float) -> bool:
-        """Return whether the infeasibility of a point is at most a share of the body's size."""
-        return point.feasibility_m <= limit * self.size_m
+    def _ends(self, horizon: Horizon, point: Iterate, step: Array) -> bool:
+        """Whether a last step satisfies the equations of motion without a sweep; it is recorded."""
+        positions = horizon.extrapolate(point, step)
+        reached = horizon.feasibilities(point.p + step, positions)
+        are_feasible = self._are_feasible(reached)
+        if are_feasible:
+            loss = point.predicted_loss(step)
+            self._record(point.p + step, positions, loss=loss, reached=reached)
+        return are_feasible
+
+    def _settled(self, horizon: Horizon, point: Iterate) -> Iterate:
+        """Return a point that is feasible: steps of the parameters would disturb it again."""
+        for _ in range(2):
+            if point.feasibility_m > FEASIBLE * self.size_m:
+                point = self._make_feasible(horizon, point)
+        return point
+
+    def _advance(self, horizon: Horizon, state: SearchState, is_last: bool) -> SearchState:
+        """Return the state after a trial, which is accepted or not."""
+        point = state.point
+        step = self._next_step(point, state.curvature, state.trust)
+        length = self._step_length(step)
+        trial, swept = self._try(horizon, state, step)
+        state = replace(state, swept=swept)
+        predicted = self._predicted(state, step)
+        actual = -np.inf if trial is None else point.loss - trial.loss
+        rounding = ROUND_OFF * point.loss + 1e-20
+        if trial is not None and actual >= DECREASE * predicted - rounding:
+            trust = state.trust
+            if actual > GOOD * predicted and length > 0.9 * trust:
+                trust = min(2.0 * trust, self.largest_trust)
+            elif actual < POOR * predicted - rounding:
+                trust = max(0.5 * length, SMALLEST_TRUST)
+            curvature = state.curvature
+            if is_last and length <= LOCAL:
+                curvature = self._update_curvature(curvature, point, after=trial)
+            return replace(
+                state,
+                point=self._accept(horizon, trial),
+                curvature=curvature,
+                trust=trust,
+                rejections=0,
+                is_rough=not self._is_final_accuracy(self._accuracy_after(length)),
+            )
+        if trial is not None:
+            least_m = FEASIBLE * self.size_m
+            funnel_m = max(least_m, min(state.funnel_m, SHRINK * trial.feasibility_m))
+            state = replace(state, funnel_m=funnel_m)
+        if not state.rejections and point.feasibility_m > FEASIBLE * self.size_m:
+            point = self._make_feasible(horizon, point)
+        return replace(
+            state,
+            point=point,
+            trust=SHRINK * length,
+            rejections=state.rejections + 1,
+            noise=abs(actual - predicted),
+        )
 
     def _is_near(self, point: Iterate, step: Array, share: float) -> bool:
         """Whether a step changes each shared parameter by a share of its standard error."""
@@ -580,25 +529,28 @@ class ReducedSearch:
         high = np.maximum(high, 0.0) + 1e-15
         return with_curvature(point.fit, curvature).minimiser(low, high)
 
-    def _try(self, horizon: Horizon, point: Iterate, step: Array) -> Iterate | None:
-        """Return the point after a step, perhaps simulated; None if that fails."""
+    def _try(
+        self, horizon: Horizon, state: SearchState, step: Array
+    ) -> tuple[Iterate | None, float]:
+        """Return the point after a step, simulated if a sweep leaves the funnel, None if that fails;
+        and the step that is expected to stay in the funnel.
+        """
+        point, swept = state.point, state.swept
         p = np.clip(point.p + step, self.lower, self.upper)
         length = self._step_length(step)
         trial = None
-        if length <= LONGEST_SWEPT * self.feasible_length:
+        if length <= LONGEST_SWEPT * swept:
             self.sweeps += 1
             with suppress(SimulationError):
                 accuracy = self._accuracy_after(length)
                 trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
-        if self.largest_strain is not None:
-            limit_m = self.largest_strain * self.edge_m
-            if trial is not None and not trial.feasibility_m <= limit_m:
-                # Infeasibility is of second order in the step.
-                share = np.sqrt(limit_m / np.fmin(trial.feasibility_m, self.edge_m))
-                self.feasible_length = share * length if length else self.feasible_length
-                trial = None
-            trial = trial or self._simulated(horizon, p, point)
-        return trial if trial is not None and trial.is_finite else None
+        if trial is not None and not trial.feasibility_m <= state.funnel_m:
+            # Infeasibility is of second order in the step.
+            share = np.sqrt(state.funnel_m / np.fmin(trial.feasibility_m, self.edge_m))
+            swept = share * length if length else swept
+            trial = None
+        trial = trial or self._simulated(horizon, p, point)
+        return (trial if trial is not None and trial.is_finite else None), swept
 
     def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:
         """Return the point with a simulated trajectory, one sweep; None if that fails."""
@@ -636,31 +588,15 @@ class ReducedSearch:
             or accuracy <= FINAL_ACCURACY_SHARE * tolerance
         )
 
-    def _judge(self, point: Iterate, step: Array, trial: Iterate) -> bool:
-        """Whether loss and infeasibility are acceptable; the trust region is adapted."""
-        predicted = point.loss - point.predicted_loss(step)
-        actual = point.loss - trial.loss
-        if trial.feasibility_m > max(
-            CONTRACTION * max(report.position_change_m for report in trial.reports),
-            SMALL_STRAIN * self.edge_m,
-        ):
-            return False
-        noise = 1e-12 * point.loss + 1e-20
-        if actual < DECREASE * predicted - noise:
-            return False
-        length = self._step_length(step)
-        if actual > 0.75 * predicted and length > 0.9 * self.trust:
-            self.trust = min(2.0 * self.trust, self.largest_trust)
-        elif actual < 0.25 * predicted - noise:
-            self.trust = max(0.5 * length, SMALLEST_TRUST)
-        return True
-
     def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the point after its feasibility step, or simulated if that is not halved."""
         # The loss of the projected trajectory is accurate to a higher order, so that trials are no
         # longer compared with a loss that is too low.
-        refined = self._try(horizon, point, step=np.zeros(len(point.p)))
-        if refined is None or refined.feasibility_m > CONTRACTION * point.feasibility_m:
+        self.sweeps += 1
+        refined = None
+        with suppress(SimulationError):
+            refined = horizon.evaluate_step(point.p, point, step=np.zeros(len(point.p)))
+        if refined is None or not refined.feasibility_m <= 0.5 * point.feasibility_m:
             return self._resimulated(horizon, point)
         return self._accept(horizon, refined)
 
@@ -703,48 +639,14 @@ class ReducedSearch:
         self.p = p
 
     def _reassociate(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Return the point with measurements associated anew, at most `REREADINGS` times."""
-        # The association that `_is_better_reassociated` made last for this trial is used.
-        stored = self.reassociated_trial
-        if stored is not None and stored.trial is point:
-            collocation = stored.collocation
-            p = stored.reassociated.p
-        else:
-            stored = None
-            counts = [
-                transcription.rows_to_follow for transcription in self.collocation.transcriptions
-            ]
-            rows = horizon.first_rows(point.trajectories, counts)
-            collocation, p = self.collocation.follow_estimates(point.p, rows)
-        if collocation is self.collocation or self.reassociations >= REREADINGS:
+        """Return the point with measurements associated anew."""
+        counts = [transcription.rows_to_follow for transcription in self.collocation.transcriptions]
+        rows = horizon.first_rows(point.trajectories, counts)
+        collocation, p = self.collocation.follow_estimates(point.p, rows)
+        if collocation is self.collocation:
             return point
-        self.reassociations += 1
         self._set_collocation(horizon, collocation, p=p)
-        if stored is not None:
-            return stored.reassociated
         return horizon.reassociate(p, point)
-
-    def _is_better_reassociated(self, horizon: Horizon, point: Iterate, trial: Iterate) -> bool:
-        """Return whether a trial is still acceptable with correspondences at its estimates."""
-        # A point may then belong to another part of the surface, or to none.
-        before = self.collocation
-        if not self.has_unlabelled:
-            return True
-        if self.reassociations >= REREADINGS:
-            return False
-        self.most_measurements = max(self.most_measurements, before.associated_count)
-        after = self._reassociate(horizon, trial)
-        if self.collocation is not before:
-            self.reassociations -= 1  # it counts when the trial is accepted
-        self.reassociated_trial = _ReassociatedTrial(trial, self.collocation, reassociated=after)
-        associated = self.collocation.associated_count
-        each = after.loss / max(1, self.collocation.measurement_count)
-        before_each = point.loss / max(1, before.measurement_count)
-        self._set_collocation(horizon, before, p=point.p)
-        return (
-            associated >= LEAST_VISIBLE_SHARE * self.most_measurements
-            and each <= EQUAL_MISFIT_RATIO * before_each
-        )
 
     def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Make a point the best so far: associate its measurements, store and record it."""

@@ -10,9 +10,9 @@ least-squares problem in the few parameters,
 
 with the measurement residuals r, and S_p and S their changes due to p and Z.
 
-A trial is accepted if the loss of its projected trajectory (r + S_p there) has decreased, and if
-its remaining infeasibility, measured by the length of p in metres, is small relative to the step.
-Static rows of a trial are first solved for the equilibrium if one is near.
+A trial is accepted if the loss of its projected trajectory (r + S_p there) has decreased. Its
+infeasibility, measured by the length of p in metres, stays within a funnel: trials outside are
+simulated. Static rows of a trial are first solved for the equilibrium if one is near.
 
 This converges if trajectories can be simulated. Horizons of increasing length (by default a
 quarter, half and all of the recording) extend the convergence to cases where only the start can be

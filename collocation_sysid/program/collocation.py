@@ -230,18 +230,6 @@ class Collocation:
         )
 
     @property
-    def associated_count(self) -> int:
-        """Number of scalar measurements that belong to the body at the present
-        estimates: those that are compared, and the points of cameras that are left out because of a
-        crease.
-        """
-        return self.measurement_count + sum(
-            residual.uncompared_count
-            for transcription in self.transcriptions
-            for residual in transcription.residuals
-        )
-
-    @property
     def loss_scale(self) -> float:
         """Factor of the loss in the objective: one over the number of measurements, or 1 without
         any.

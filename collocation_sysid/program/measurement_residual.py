@@ -344,13 +344,6 @@ class MeasurementResidual(ABC):
         """Loss of measurements that the fit excludes, as far as it is known; 0 for most kinds."""
         return 0.0
 
-    @property
-    def uncompared_count(self) -> int:
-        """Number of scalar measurements that belong to the body at the present estimates but are
-        not compared; 0 for most kinds.
-        """
-        return 0
-
     def rough_residuals(self, x: Array, phi: Array) -> Array | None:
         """Return residuals for ranking first guesses, or None if the ordinary residuals are
         suitable, as here.

@@ -221,8 +221,12 @@ def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
             raise SimulationError("it fails", 0.0)
         return tried(self, q, before, step, **options)
 
-    tried = Horizon.evaluate_step
+    def not_simulated(self: Horizon, p, x=None, guess=None):
+        return simulated(self, p, x) if guess is None else ([], SimulationError("it fails", 0.0))
+
+    tried, simulated = Horizon.evaluate_step, Horizon.simulate
     monkeypatch.setattr(Horizon, "evaluate_step", first_only)
+    monkeypatch.setattr(Horizon, "simulate", not_simulated)
     solution = ReducedSpace()(cube())
     assert solution.status is Status.STALLED
     np.testing.assert_allclose(solution.theta, as_theta(GUESS), rtol=1e-12)

@@ -92,9 +92,12 @@ def test_strains_beside_a_length_and_an_area_may_be_those_of_the_grips(
     true = cs.Specimen("uniaxial", strain / 0.8, 0 * strain, **KEYS).experiment(name="pull")
     (stress_pa,) = cs.simulate(true, {**CONSTANTS, "young_pa": YOUNG_PA}).custom_sensor_values
     rows = np.column_stack([strain, stress_pa[:, 0]])
-    np.savetxt(tmp_path / "pull.csv", rows, delimiter=",", header="strain (1),stress (Pa)", comments="")
+    np.savetxt(
+        tmp_path / "pull.csv", rows, delimiter=",", header="strain (1),stress (Pa)", comments=""
+    )
     (tmp_path / "problem.toml").write_text(
-        f"[object]\nmaterial = 'neo-hookean'\n[parameters]\nyoung_pa = {{}}\npoisson = {CONSTANTS['poisson']}\n[[experiment]]\n"
+        "[object]\nmaterial = 'neo-hookean'\n[parameters]\nyoung_pa = {}\n"
+        f"poisson = {CONSTANTS['poisson']}\n[[experiment]]\n"
         'name = "pull"\nkind = "specimen"\ntest = "uniaxial"\nfile = "pull.csv"\n'
         f"sigma_pa = 100.0\n{stated}"
     )

@@ -139,11 +139,6 @@ class ImageTrackResidual(CameraImagesResidual):
         rest_m = self.observable.association.prior_places_m
         return self.position_sigmas_m(rest_m, self.correspondences.translations, self.sigmas)
 
-    @property
-    def uncompared_count(self) -> int:
-        places = self.correspondences
-        return 2 * int(np.sum(self.sensor.is_seen & places.is_placed & ~places.is_visible))
-
     # Correspondences --------------------------------------------------------------------------
 
     def reassociated(self, x: Array, phi: Array) -> TrackedPlaces:

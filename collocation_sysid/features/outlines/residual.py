@@ -233,11 +233,6 @@ class OutlinesResidual(CameraImagesResidual):
         return ca.vertcat(ca.dot(outward, pixel - edge) - ca.sum1(own[count:]), 0, 0)
 
     @property
-    def uncompared_count(self) -> int:
-        """Number of points that the outline could have, and does not have in its present shape."""
-        return int(np.sum(~self.correspondences.weights.any(axis=2)))
-
-    @property
     def observable_sigmas(self) -> Array:
         nodes_m = self.experiment.body.nodes_m
         sigmas = np.full(len(nodes_m), self.sensor.sigma_px)

@@ -54,11 +54,6 @@ class OutlineResidual(DepthResidual):
         )
 
     @property
-    def uncompared_count(self) -> int:
-        """Zero: the points of the image are counted by the camera's own model."""
-        return 0
-
-    @property
     def correspondences_in_use(self) -> Outline:
         return self.correspondences.outline
 

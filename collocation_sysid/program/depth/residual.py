@@ -255,11 +255,6 @@ class DepthResidual(CorrespondenceResidual):
         return np.concatenate([*away_m, np.zeros(0)]) / pairs.camera.depth.sigma_m
 
     @property
-    def uncompared_count(self) -> int:
-        """Number of points on the body that are left out because they are beside a crease."""
-        return self.correspondences.excluded_counts["crease"]
-
-    @property
     def excluded_loss(self) -> float:
         """Loss of the points beyond the gate of the present correspondences, each counted as if its
         distance were the stated gate.
