@@ -42,14 +42,8 @@ FUNNEL = 0.1
 DECREASE, POOR, GOOD = 1e-3, 0.25, 0.75
 # Length of the next trial over that of a rejected step.
 SHRINK = 0.25
-# Steps longer than so many times the one that is expected to stay in the funnel are simulated at once.
-LONGEST_SWEPT = 2.0
 # Shortest step, at which a search ends.
 SMALLEST_TRUST = 1e-10
-# Largest step of the logarithm of a parameter, and of nuisance parameters.
-WIDEST = 4.0
-# Largest trust region with linear parameters, whose units may be far below what the data allow.
-WIDEST_LINEAR = 1e6
 # Largest trust region with unlabelled points, whose correspondences are valid only nearby.
 SEEING = 0.25
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors.
@@ -178,8 +172,6 @@ class ReducedSearch:
         Number of sweeps and simulations so far.
     reach : (np,) array
         Change of each parameter that counts as a step of one.
-    largest_step : (np,) array
-        Largest change of each parameter in one step.
     lower, upper : (np,) array
         Bounds of the parameters.
     has_correspondences : bool
@@ -228,10 +220,7 @@ class ReducedSearch:
         ]
         self.has_correspondences = bool(correspondences)
         self.has_unlabelled = not all(each.is_labelled for each in correspondences)
-        linear = [item.scale == "linear" for item in collocation.parameters.free]
-        linear = np.flatnonzero(linear)
-        widest = WIDEST_LINEAR if len(linear) else WIDEST
-        self.largest_trust = SEEING if self.has_unlabelled else widest
+        self.largest_trust = SEEING if self.has_unlabelled else np.inf
         self.indefinite_steps = 0
         self.refines_solutions = not all(
             Factoriser.cached(
@@ -245,8 +234,6 @@ class ReducedSearch:
         self.is_associated = True
         self.ended_by_association = False
         self.reach = collocation.reach_p
-        self.largest_step = WIDEST * self.reach
-        self.largest_step[linear] = WIDEST_LINEAR
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
         self.workers = workers
@@ -521,7 +508,7 @@ class ReducedSearch:
 
     def _next_step(self, point: Iterate, curvature: Array, trust: float) -> Array:
         """Return the step that minimises the quadratic model within bounds and trust region."""
-        largest = np.minimum(trust * self.reach, self.largest_step)
+        largest = trust * self.reach
         low = np.maximum(self.lower - point.p, -largest)
         high = np.minimum(self.upper - point.p, largest)
         # Rounding may leave a parameter on its bound by a hair.
@@ -539,7 +526,7 @@ class ReducedSearch:
         p = np.clip(point.p + step, self.lower, self.upper)
         length = self._step_length(step)
         trial = None
-        if length <= LONGEST_SWEPT * swept:
+        if length <= swept:
             self.sweeps += 1
             with suppress(SimulationError):
                 accuracy = self._accuracy_after(length)
