@@ -198,22 +198,22 @@ TOPICS: dict[str, Topic] = {
     "nuisance": Topic(
         "Nuisance parameters of a recording",
         "motion_capture",
-        remedy="An error of the laws, the mesh or a clock can hide in such a value: compare laws with "
-        "compare-models, and check mesh, places, clocks and gravity first. Widen a prior only if nothing "
-        "else explains the value and a measurement confirms it.",
+        remedy="An error of mesh, places, clocks, sensors or laws can hide in such a value: check these "
+        "first, and compare laws with compare-models. Widen a prior only if nothing else explains the "
+        "value and a measurement confirms it.",
         messages={
-            "limit": "{name} ended at the largest value allowed: compare laws with compare-models, "
-            "and check mesh, places and clocks, whose errors it can hide",
+            "limit": "{name} ended at the largest value allowed: check mesh, places, clocks and "
+            "sensors, and compare laws with compare-models, whose errors it can hide",
             "far": "{name} is {deviations:.1f} standard deviations of its prior away from zero: "
-            "compare laws with compare-models, and check mesh, places and clocks, whose errors it "
-            "can hide",
+            "check mesh, places, clocks and sensors, and compare laws with compare-models, whose "
+            "errors it can hide",
             "sized": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
-            "({size}): compare laws with compare-models, and check mesh, places and clocks, whose "
-            "errors it can hide; if nothing else explains this value, measure it, and widen its "
-            "prior in {where} if it is confirmed",
+            "({size}): check mesh, places, clocks and sensors, and compare laws with compare-models, "
+            "whose errors it can hide; if nothing else explains this value, measure it, and widen "
+            "its prior in {where} if it is confirmed",
             "large": "{name} is {deviations:.1f} standard deviations of its prior away from zero "
-            "({size}), more than such an error can be: it hides another error. Compare laws with "
-            "compare-models, and check mesh, places and clocks; do not widen its prior",
+            "({size}), more than such an error can be: it hides another error. Check mesh, places, "
+            "clocks and sensors, and compare laws with compare-models; do not widen its prior",
         },
     ),
     "specimen": Topic(

@@ -188,7 +188,7 @@ def test_symbols_name_constants(word: str, names: list[str]):
 def test_labels_are_explained_by_the_command():
     shown = " ".join(run_command("explain", "grip layer", "E").out.split())
     assert "grip_layer_m" in shown
-    assert "glue the body to a stiff plate" in shown
+    assert "hold the body more stiffly" in shown
     assert "young_pa" in shown
 
 

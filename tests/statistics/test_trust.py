@@ -85,7 +85,7 @@ def test_a_concern_keeps_its_code_and_its_numbers_in_files():
     stored = json.loads(as_json(found))
     (reason,) = stored["reasons"]
     assert reason.startswith(
-        "time is 4.0 standard deviations of its prior away from zero: compare laws with"
+        "time is 4.0 standard deviations of its prior away from zero: check mesh, places"
     )
     (concern,) = stored["concerns"]
     assert concern["code"] == "nuisance/far"

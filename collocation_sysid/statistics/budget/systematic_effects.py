@@ -1250,7 +1250,7 @@ ASSUMPTIONS = (
         is_one_sided=True,  # what gives way does not push
         considered=2e-4,
         description="compliance of grip and skin, as the thickness of a layer of the body's material",
-        remedy="glue the body to a stiff plate, or attach markers to the body beside the grip",
+        remedy="hold the body more stiffly, or attach markers to it beside the grip",
         largest=0.005,
         effect=_grip,
     ),
