@@ -250,12 +250,9 @@ class SolvedProblem:
             )
         )
         # What is far from its prior hides another error if it cannot be so far, or leaves residuals.
-        leaves = any(
-            e.code == "nuisance/large" or (e.code == "noise/larger" and e.grade == "doubtful")
-            for e in of_fit
-        )
-        hiding = ("nuisance/",) if leaves else ()
-        of_fit.sort(key=lambda e: (e.code.startswith(hiding), e.code != "nuisance/large"))
+        leaves = any(e.code == "noise/larger" and e.grade == "doubtful" for e in of_fit)
+        hiding = "nuisance/" if leaves else "nuisance/large"
+        of_fit.sort(key=lambda each: each.code.startswith(hiding))
         if not self.solution.collocation.nq:
             effects = []
         uncertainties = {name: each.combined_std_error for name, each in self.estimates.items()}
@@ -266,11 +263,12 @@ class SolvedProblem:
             if any(each.suffices for each in self.suspects):
                 causes = [each for each in causes if each.code != "description/insufficient"]
             meshes = mesh_resolution_concerns(self.problem, self.refinement, self.by_mesh)
-            # Effects are judged with this mesh, so that a coarse one is as grave, and explain nothing
-            # where residuals remain.
-            remaining = [e for e in of_fit if e.code.startswith(("residuals/", "noise/larger"))]
-            graver = [*meshes, *remaining] if effects else []
-            known = [replace(each, grade=effects[0].grade) for each in graver]
+            # Effects are judged with this mesh, so that a coarse one is as grave, and those of the budget
+            # explain nothing where residuals remain.
+            known = [*meshes] if effects else []
+            if effects and not effects[0].data["suffices"]:
+                known += [e for e in of_fit if e.code in ("residuals/shared", "noise/larger")]
+            known = [replace(each, grade=effects[0].grade) for each in known]
             # What is farther from its prior than an effect may distort the effects.
             surprise = effects[0].data["surprise"] if effects else np.inf
             farther = [

@@ -264,8 +264,8 @@ def test_a_dropout_is_a_cloud_without_points():
         replace(depth, clouds=[seen[:0], seen[:0]])
 
 
-@pytest.mark.parametrize(("guess_pa", "is_best"), [(1e5, False), (1.5e5, True)])
-def test_a_search_that_ended_at_a_jump_of_the_loss_is_reported(guess_pa, is_best):
+@pytest.mark.parametrize("guess_pa", [1e5, 1.5e5])
+def test_a_far_camera_is_found_from_any_guess(guess_pa):
     """Few points from a camera whose stated pose is far off have several minima."""
     pose = moved(np.array([0.15, -0.09, 0.06]), np.array([0.012, 0.006, -0.009]))
     image = image_m() + NOISE_M * np.random.default_rng(2).normal(size=SHAPE)
@@ -275,9 +275,4 @@ def test_a_search_that_ended_at_a_jump_of_the_loss_is_reported(guess_pa, is_best
     unknown = TRUTH | {"young_pa": cs.Unknown(guess_pa)}
     run = cs.run(cs.Problem([hanging((depth,))], unknown), seek_causes=False)
     assert run.solution.status.converged
-    notes = [each for each in run.solution.notes if "the loss jumps" in each]
-    assert len(notes) == (0 if is_best else 1)
-    error = run.solution.parameters["young_pa"] / TRUTH["young_pa"] - 1
-    assert (abs(error) < 0.01) == is_best
-    # The worse minimum is not rated as a good answer.
-    assert is_best or run.trust.verdict != "good"
+    assert abs(run.solution.parameters["young_pa"] / TRUTH["young_pa"] - 1) < 0.01

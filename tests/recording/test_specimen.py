@@ -266,15 +266,16 @@ def test_a_second_stress_that_is_constant_is_not_used(tmp_path, value):
 
 
 @pytest.mark.parametrize(
-    ("header", "factors", "is_noted"),
+    ("header", "factors", "size", "is_noted"),
     [
-        ("extension (mm),stress (Pa)", (20.0, 1.0), True),
-        ("strain (-),stress (Pa)", (1.0, 1.0), False),
+        ("extension (mm),stress (Pa)", (20.0, 1.0), "length_m = 0.02\narea_m2 = 4e-4\n", True),
+        ("strain (-),stress (Pa)", (1.0, 1.0), "length_m = 0.02\narea_m2 = 4e-4\n", True),
+        ("strain (-),stress (Pa)", (1.0, 1.0), "", False),
     ],
 )
-def test_a_length_between_grips_is_noted(tmp_path, header, factors, is_noted):
+def test_a_length_between_grips_is_noted(tmp_path, header, factors, size, is_noted):
     rows = np.column_stack([STRAIN, simulated("uniaxial", STRAIN)["stress"]]) * factors
-    text = PROBLEM + "length_m = 0.02\narea_m2 = 4e-4\n"
+    text = PROBLEM + size
     problem = cs.Problem.read(written(tmp_path, text, header, rows))
     assert any("of a dogbone the effective length" in note for note in problem.notes) == is_noted
 

@@ -117,6 +117,6 @@ def test_the_size_counts_beside_a_column_of_strains(tmp_path):
     )
     (tmp_path / "problem.toml").write_text(PROBLEM)
     (press,) = cs.Problem.read(tmp_path / "problem.toml").experiments
-    assert press.specimen.area_over_length_m == 0.0
+    assert press.specimen.area_over_length_m == pytest.approx(4.5e-4 / 0.008)
     assert press.specimen.shape_factor == pytest.approx(shape_factor(0.008, 4.5e-4))
     assert shape_factor(LENGTH_M, AREA_M2) == pytest.approx(RADIUS_M / (2 * LENGTH_M))

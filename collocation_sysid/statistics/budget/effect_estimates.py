@@ -127,6 +127,7 @@ def effect_concerns(
     data = {
         "effect": first.describe(),
         "surprise": abs(first.surprise),
+        "suffices": first.suffices,
         "alike": f"; {listed(others)} would look the same" if others else "",
         "remedy": row.remedy,
     }
