@@ -26,10 +26,12 @@ from kit.problems import (
 
 import collocation_sysid as cs
 from collocation_sysid.errors import SimulationError
+from collocation_sysid.methods import reduced_search
 from collocation_sysid.methods.horizon import Horizon, Iterate, motion_shares, rows_of_share
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.loss_curvature import secant_update, with_curvature
 from collocation_sysid.methods.options import SHARES
+from collocation_sysid.methods.reduced_search import ReducedSearch
 from collocation_sysid.methods.reduced_space import ReducedSpace, memory_mb
 from collocation_sysid.methods.solution import Iteration, Solution, Status
 from collocation_sysid.methods.starts.initial_trajectories import (
@@ -231,6 +233,44 @@ def test_no_progress_is_a_status(monkeypatch: pytest.MonkeyPatch):
     assert solution.status is Status.STALLED
     np.testing.assert_allclose(solution.theta, as_theta(GUESS), rtol=1e-12)
     assert solution.max_violation_relative < 1e-3
+
+
+def test_a_search_ends_at_the_noise_of_its_loss(monkeypatch: pytest.MonkeyPatch):
+    collocation = Collocation([noisy(hung_cube(15))], GUESS)
+    exact = ReducedSpace()(collocation)
+    errors = Horizon(collocation, [exact.positions_m[0].shape[0]]).evaluate(
+        *collocation.unpack(exact.z)
+    )
+    evaluated = Horizon._iterate_from
+    rng = np.random.default_rng(1)
+
+    def with_noise(self: Horizon, p, trajectories) -> Iterate:
+        point = evaluated(self, p, trajectories)
+        row = np.sqrt(2 * rng.random(1))
+        return replace(point, fit=point.fit.with_rows(row, np.zeros((1, len(p)))))
+
+    monkeypatch.setattr(Horizon, "_iterate_from", with_noise)
+    solution = ReducedSpace()(collocation)
+    assert solution.status is Status.CONVERGED
+    assert solution.iterations < exact.iterations + 20
+    count = collocation.nq
+    assert (np.abs(solution.q - exact.q) < errors.fit.standard_errors[:count]).all()
+
+
+def test_a_trial_outside_the_funnel_is_simulated(monkeypatch: pytest.MonkeyPatch):
+    collocation = Collocation([noisy(hung_cube(15))], GUESS)
+    infeasible_m = []
+    accepted = ReducedSearch._accept
+
+    def recorded(self: ReducedSearch, horizon: Horizon, point: Iterate) -> Iterate:
+        infeasible_m.append(point.feasibility_m / self.edge_m)
+        return accepted(self, horizon, point)
+
+    monkeypatch.setattr(ReducedSearch, "_accept", recorded)
+    monkeypatch.setattr(reduced_search, "FUNNEL", 1e-5)
+    solution = ReducedSpace()(collocation)
+    assert solution.status is Status.CONVERGED
+    assert max(infeasible_m) < 1e-5
 
 
 def test_rows_that_can_be_simulated_are_solved_first(monkeypatch: pytest.MonkeyPatch):
