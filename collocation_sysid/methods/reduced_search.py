@@ -473,10 +473,6 @@ class ReducedSearch:
                 rejections=0,
                 is_rough=not self._is_final_accuracy(self._accuracy_after(length)),
             )
-        if trial is not None:
-            least_m = FEASIBLE * self.size_m
-            funnel_m = max(least_m, min(state.funnel_m, SHRINK * trial.feasibility_m))
-            state = replace(state, funnel_m=funnel_m)
         if not state.rejections and point.feasibility_m > FEASIBLE * self.size_m:
             point = self._make_feasible(horizon, point)
         return replace(
@@ -531,12 +527,15 @@ class ReducedSearch:
             with suppress(SimulationError):
                 accuracy = self._accuracy_after(length)
                 trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
-        if trial is not None and not trial.feasibility_m <= state.funnel_m:
+        if trial is None:
+            swept *= 2.0  # what left the funnel once need not leave it again
+        elif length and not trial.feasibility_m <= state.funnel_m:
             # Infeasibility is of second order in the step.
             share = np.sqrt(state.funnel_m / np.fmin(trial.feasibility_m, self.edge_m))
-            swept = share * length if length else swept
+            swept = share * length
             trial = None
-        trial = trial or self._simulated(horizon, p, point)
+        if not state.rejections:  # shorter steps will soon stay in the funnel
+            trial = trial or self._simulated(horizon, p, point)
         return (trial if trial is not None and trial.is_finite else None), swept
 
     def _simulated(self, horizon: Horizon, p: Array, previous: Iterate) -> Iterate | None:
