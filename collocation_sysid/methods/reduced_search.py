@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from ..program.transcription import Transcription
     from .experiment_executors import ExperimentExecutor
 
-# Infeasibility of a trial over an edge of the mesh above which it is simulated: the strain that it
-# causes is then small enough for Newton's next step to remove it. The bound of a funnel (Gould &
-# Toint, Math. Program. 122, 2010), which only shrinks.
+# Infeasibility over an edge of the mesh up to which a trial is accepted: the strain that it causes is
+# then small enough for Newton's next step to remove it (the bound of a funnel: Gould & Toint, Math.
+# Program. 122, 2010; one that shrinks makes searches on wrong descriptions simulate every trial).
 FUNNEL = 0.1
 # Shares of the predicted decrease (Conn, Gould & Toint, Trust-Region Methods, 2000, section 6.1): the
 # smallest of an accepted trial, that below which the trust region shrinks, and that above which it
@@ -148,9 +148,7 @@ class SearchState:
     point: Iterate  # best iterate
     curvature: Array  # (np, np): part of the Hessian that Gauss–Newton neglects
     trust: float  # longest step, relative to `ReducedSearch.reach`
-    funnel_m: float  # largest infeasibility of a trial that is not simulated
-    # Step of the parameters whose sweep is expected to leave as much infeasibility.
-    swept: float = np.inf
+    swept: float = np.inf  # step whose sweep is expected to leave the largest infeasibility
     rejections: int = 0  # in a row
     noise: float = 0.0  # actual less predicted decrease of the trial that was rejected last
     is_rough: bool = False  # whether the sweep was too inaccurate for a result
@@ -378,7 +376,6 @@ class ReducedSearch:
             point,
             np.zeros((len(point.p), len(point.p))),
             trust=min(self.options.trust, self.largest_trust),
-            funnel_m=FUNNEL * self.edge_m,
             is_rough=not self._is_final_accuracy(accuracy),
         )
         while (status := self._outcome(horizon, state, is_last)) is None:
@@ -529,9 +526,9 @@ class ReducedSearch:
                 trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
         if trial is None:
             swept *= 2.0  # what left the funnel once need not leave it again
-        elif length and not trial.feasibility_m <= state.funnel_m:
+        elif length and not trial.feasibility_m <= FUNNEL * self.edge_m:
             # Infeasibility is of second order in the step.
-            share = np.sqrt(state.funnel_m / np.fmin(trial.feasibility_m, self.edge_m))
+            share = np.sqrt(FUNNEL * self.edge_m / np.fmin(trial.feasibility_m, self.edge_m))
             swept = share * length
             trial = None
         if not state.rejections:  # shorter steps will soon stay in the funnel
