@@ -88,8 +88,12 @@ CLEARLY_BETTER = 1.2
 # Largest error of a pose, clock or place in a scan, in standard deviations of its prior: larger ones
 # would fit wrong stiffnesses.
 LARGEST_ERROR = 3.0
+# Change of the errors, in the same unit, that ends the steps to those that fit best.
+SMALL_ERROR = 1e-3
 # Change of an error, in the same unit, for derivatives of distances without correspondences.
 DIFFERENCE = 1e-3
+# Most steps to the errors that fit best: a turned camera takes about six.
+NUISANCE_STEPS = 10
 
 
 def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
@@ -415,12 +419,26 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
     collocation, p = collocation.place_unknown_markers(p, positions, only_poses=True)
     phi = p[collocation.nq :]
     fit = _nuisance_fit(collocation, p, positions)
-    loss = fit.loss(phi)
+    loss, reach = fit.loss(phi), np.inf
+    low, high = np.minimum(phi, -LARGEST_ERROR), np.maximum(phi, LARGEST_ERROR)
     # What has no effect at a fixed motion, such as a tilt of gravity, keeps its value.
     is_moved = np.diag(fit.information) > 1
-    if np.isfinite(loss) and is_moved.any():
-        low, high = np.minimum(phi, -LARGEST_ERROR), np.maximum(phi, LARGEST_ERROR)
-        loss = fit.loss(np.where(is_moved, fit.minimiser(low, high), phi))
+    for _ in range(NUISANCE_STEPS):
+        if not (np.isfinite(loss) and is_moved.any()):
+            break
+        fitted = fit.minimiser(np.maximum(low, phi - reach), np.minimum(high, phi + reach))
+        other_phi = np.where(is_moved, fitted, phi)
+        step = np.abs(other_phi - phi).max()
+        other = _nuisance_fit(
+            collocation, np.concatenate([p[: collocation.nq], other_phi]), positions
+        )
+        gain = loss - other.loss(other_phi)
+        if gain > 0:
+            fit, phi, loss = other, other_phi, loss - gain
+        if step < SMALL_ERROR or 0 <= gain < BETTER * loss:
+            break
+        if not gain > 0:
+            reach = step / 4
     return math.sqrt(loss / max(fit.row_count - len(phi), 1)) if np.isfinite(loss) else np.nan
 
 
