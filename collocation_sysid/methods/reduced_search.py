@@ -48,13 +48,13 @@ SMALLEST_TRUST = 1e-10
 SEEING = 0.25
 # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors.
 INSIGNIFICANT = 1e-6
+# So is one within so many times the tolerance of standard errors: 1e-3 by default, and at most. Losses
+# below 1, of data without noise, are to be known to that share.
+SIGNIFICANCE = 1e5
 # Share of the standard errors within which a smooth loss agrees with its quadratic model: a trial that
 # disagrees by more than a full step can gain there shows the noise of the loss (contact that opens and
 # closes, points that change to other faces, rounding; Sun & Nocedal, Math. Program. 202, 2023).
 NOISY = 0.3
-# So is one within so many times the tolerance of standard errors: 1e-3 by default, and at most. Losses
-# below 1, of data without noise, are to be known to that share.
-SIGNIFICANCE = 1e5
 # Relative error of the loss by rounding.
 ROUND_OFF = 1e-12
 # Infeasibility over the body's size of an answer: its loss is accurate to a higher order.
