@@ -316,11 +316,17 @@ class Posterior:
     @property
     def expected_phi(self) -> Array:
         """Standard deviations (nphi,) that `phi` has for a true description."""
-        places = slice(len(self.start), len(self.start) + len(self.phi))
-        own = np.diag(self.covariance)[places]
+        return np.sqrt(np.maximum(self._expected_variances[: len(self.phi)], UNSEEN))
+
+    @cached_property
+    def _expected_variances(self) -> Array:
+        """Variances (nphi + a,) that nuisance parameters and learnt effects have for a true
+        description.
+        """
+        own = np.diag(self.covariance)[len(self.start) :]
         # The residuals may show more noise than stated, or correlated noise.
-        more = np.diag(self.uncertainty.nuisance_covariance)[: len(own)] - own
-        return np.sqrt(np.maximum(1 - own, UNSEEN) + np.maximum(more, 0.0))
+        actual = np.diag(self.uncertainty.nuisance_covariance)[: len(own)]
+        return np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
 
     @cached_property
     def _information(self) -> Array:
@@ -602,13 +608,11 @@ class Posterior:
         places = self._of_effects
         values = self.step[places]
         own = np.diag(self.covariance)[places]
-        # The residuals may show more noise than stated, or correlated noise.
         count = len(self.effects.names)
-        actual = np.diag(self.uncertainty.nuisance_covariance)[-count:] if count else own
-        predicted = np.maximum(1 - own, 0.0) + np.maximum(actual - own, 0.0)
+        predicted = self._expected_variances[len(self.phi) :]
         # Some effects are seldom as large as their prior allows.
         response = np.eye(count) - self.covariance[np.ix_(places, places)]
-        predicted -= response**2 @ (1 - self.effects.typical**2)
+        predicted = predicted - response**2 @ (1 - self.effects.typical**2)
         # The shape of the errors of mesh and time step is not known.
         by_shape = self._priors[1][places, count + len(self.considered.names) :]
         predicted += np.sum(by_shape**2, axis=1)

@@ -369,8 +369,9 @@ class ReducedSearch:
         """
         assert self.trajectories is not None
         self.ended_by_association = False
-        known = self.point
-        start = horizon.evaluate(self.p, self.trajectories, known_iterate=known, accuracy=accuracy)
+        start = horizon.evaluate(
+            self.p, self.trajectories, known_iterate=self.point, accuracy=accuracy
+        )
         point = self._accept(horizon, start)
         state = SearchState(
             point,
@@ -378,14 +379,20 @@ class ReducedSearch:
             trust=min(self.options.trust, self.largest_trust),
             is_rough=not self._is_final_accuracy(accuracy),
         )
-        while (status := self._outcome(horizon, state, is_last)) is None:
-            state = self._advance(horizon, state, is_last)
-        return status
+        while True:
+            step = self._next_step(state, state.trust)
+            status = self._outcome(horizon, state, step, is_last)
+            if status is not None:
+                return status
+            state = self._advance(horizon, state, step, is_last)
 
-    def _outcome(self, horizon: Horizon, state: SearchState, is_last: bool) -> Status | None:
-        """Return the status if the search ends at a state, by the first reason that holds."""
+    def _outcome(
+        self, horizon: Horizon, state: SearchState, step: Array, is_last: bool
+    ) -> Status | None:
+        """Return the status if the search ends at a state with the next step (np,), by the first
+        reason that holds.
+        """
         point, tolerance = state.point, self.options.tolerance
-        step = self._next_step(point, state.curvature, state.trust)
         length = self._step_length(step)
         # A step that the trust region shortens contains no information on the remaining distance.
         is_full = length < 0.99 * state.trust and not state.is_rough
@@ -401,7 +408,7 @@ class ReducedSearch:
         if is_full and share < self.options.least_decrease * min(1.0, length):
             return Status.CONVERGED
         if state.rejections:
-            farthest = self._full_step(point, state.curvature)
+            farthest = self._next_step(state, self.largest_trust)
             remaining = self._predicted(state, farthest)
             noisy = NOISY * float(np.sqrt(insignificant / INSIGNIFICANT))
             is_local = self._step_length(farthest) <= LOCAL and self._is_near(
@@ -443,10 +450,11 @@ class ReducedSearch:
                 point = self._make_feasible(horizon, point)
         return point
 
-    def _advance(self, horizon: Horizon, state: SearchState, is_last: bool) -> SearchState:
-        """Return the state after a trial, which is accepted or not."""
+    def _advance(
+        self, horizon: Horizon, state: SearchState, step: Array, is_last: bool
+    ) -> SearchState:
+        """Return the state after the trial of a step (np,), which is accepted or not."""
         point = state.point
-        step = self._next_step(point, state.curvature, state.trust)
         length = self._step_length(step)
         trial, swept = self._try(horizon, state, step)
         state = replace(state, swept=swept)
@@ -485,10 +493,6 @@ class ReducedSearch:
         count = self.collocation.nq
         return bool((np.abs(step[:count]) <= share * point.fit.standard_errors[:count]).all())
 
-    def _full_step(self, point: Iterate, curvature: Array) -> Array:
-        """Return the next step (np,) within the largest trust region."""
-        return self._next_step(point, curvature, self.largest_trust)
-
     def _update_curvature(self, curvature: Array, previous: Iterate, after: Iterate) -> Array:
         """Return the part (np, np) that Gauss–Newton neglects: exact, or by a secant update."""
         if self.options.hessian == "exact":
@@ -499,15 +503,16 @@ class ReducedSearch:
         """Return the largest change of a parameter relative to `reach`; 0 without any."""
         return float(np.abs(step / self.reach).max(initial=0.0))
 
-    def _next_step(self, point: Iterate, curvature: Array, trust: float) -> Array:
-        """Return the step that minimises the quadratic model within bounds and trust region."""
+    def _next_step(self, state: SearchState, trust: float) -> Array:
+        """Return the step (np,) that minimises the quadratic model within bounds and trust region."""
+        point = state.point
         largest = trust * self.reach
         low = np.maximum(self.lower - point.p, -largest)
         high = np.minimum(self.upper - point.p, largest)
         # Rounding may leave a parameter on its bound by a hair.
         low = np.minimum(low, 0.0) - 1e-15
         high = np.maximum(high, 0.0) + 1e-15
-        return with_curvature(point.fit, curvature).minimiser(low, high)
+        return with_curvature(point.fit, state.curvature).minimiser(low, high)
 
     def _try(
         self, horizon: Horizon, state: SearchState, step: Array

@@ -161,14 +161,11 @@ def unknown_concerns(solution: Solution, posterior: Posterior | None) -> list[Co
         expected = np.ones_like(phi)
     else:
         phi, expected = posterior.phi, posterior.expected_phi
-    places = {
-        each: each.nuisance_indices.indices - collocation.nq for each in collocation.transcriptions
-    }
-    return [
-        concern
-        for each, at in places.items()
-        for concern in _nuisance_concerns(each, phi[at], expected[at])
-    ]
+    found: list[Concern] = []
+    for each in collocation.transcriptions:
+        at = each.nuisance_indices.indices - collocation.nq
+        found += _nuisance_concerns(each, phi[at], expected[at])
+    return found
 
 
 def _nuisance_concerns(
