@@ -57,6 +57,7 @@ def refine(
     from ..result.run_refinement import refine_run
     from ..result.run_sections import refinement_table, verdict_section
 
+    require_possible(run.run_folder)
     try:
         with shown_progress(f"reading {run.run_folder}", quiet=output.quiet) as progress:
             refinement, result = refine_run(

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from ..common.files import replaced_file
+from ..common.files import replaced_file, require_possible
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .command_options import OutputOptions, command, option
@@ -105,6 +105,8 @@ def track(
             raise InputError(
                 f"found {str(file)!r}, which is read; expected another file", where=name
             )
+        if file is not None:
+            require_possible(file.parent)
     names, start = stated_points(points, "--points")
     gripper_names, gripper_px = stated_points(gripper, "--gripper")
     motion = None if poses is None else read_poses(poses)

@@ -266,3 +266,24 @@ def test_a_run_whose_folder_another_process_wrote_meanwhile_is_kept_elsewhere(
     assert f"; the run is kept in {kept}: move it to another place" in outcome.err
     assert (tiny / "run" / "frames").exists() is (other == "notes")
     assert read_run(kept)[0].status == "converged"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("refine", "."),
+        ("track", "film.mp4", "--out", "tracks.csv"),
+        ("track", "film.mp4", "--out", "../tracks.csv", "--film", "seen.mp4"),
+        ("new", "body"),
+    ],
+)
+def test_a_folder_that_is_not_writable_is_refused_before_work(monkeypatch, tmp_path, words):
+    (tmp_path / "film.mp4").touch()
+    monkeypatch.chdir(tmp_path)
+    kept = os.access
+    monkeypatch.setattr(os, "access", lambda place, mode: mode != os.W_OK and kept(place, mode))
+    refused = run_command(*words)
+    assert refused.code == 2
+    assert refused.err.count("\n") == 1
+    assert "this folder is not writable; expected one that is" in refused.err
+    assert [each.name for each in tmp_path.iterdir()] == ["film.mp4"]
