@@ -42,6 +42,7 @@ from ..statistics.combinations import (
     WIDE,
     Combination,
     Fix,
+    precision_text,
     undetermined_names,
     vague_constants,
     widest_after,
@@ -203,7 +204,7 @@ def views_note(collocation: Collocation, z: Array) -> str:
 
     def in_words(what: str, deviations: Mapping[str, float]) -> str:
         known = (
-            f"{symbol_of(name)} ±{100 * NORMAL_95 * each:.2g} %"
+            f"{symbol_of(name)} {precision_text(1 + NORMAL_95 * each).removeprefix('to ')}"
             for name, each in deviations.items()
         )
         return f"{what} {', '.join(known)}"

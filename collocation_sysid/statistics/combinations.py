@@ -44,8 +44,10 @@ SMALLEST_POWER = 0.05
 WIDE = (1 + 5**0.5) / 2
 # Half width, as a factor, from which on an interval is no information.
 HOPELESS = 1e4
-# Half width below which an interval is stated in percent.
+# Half width below which an interval is stated in percent, and one below which it is not stated:
+# rounding of the covariance and effects that are not modelled decide there.
 PERCENT = 1.5
+EXACT = 1.0001
 # Logarithm beyond which a factor is not representable.
 LARGEST_LOGARITHM = 700.0
 # Standard deviation of a constant that would be known, relative to its value.
@@ -62,6 +64,8 @@ def precision_text(factor: float) -> str:
     """Return the half width of an interval, as a factor of 1 or more, as text that follows
     "determine … ".
     """
+    if factor < EXACT:
+        return "to better than ±0.01 %"
     if factor < PERCENT:
         return f"to ±{100 * (factor - 1):.2g} %"
     return f"to within a factor of {short(factor)}" if factor < HOPELESS else "not at all"

@@ -305,9 +305,9 @@ TOPICS: dict[str, Topic] = {
         messages={
             "refined": "step and mesh dominate the uncertainty of {name}: it was corrected by "
             "{change}, {errors:.2g} standard uncertainties; use smaller steps "
-            "(transcription.substeps) or a finer mesh",
-            "error": "the mesh is too coarse: on one with half the edge lengths {name} would change "
-            "by more than half, too much for an estimate to first order; refine the mesh",
+            "(transcription.substeps) or smaller elements",
+            "error": "the elements are too large: with half their lengths {name} would change by more "
+            "than half, too much for an estimate to first order; use smaller ones",
             "flat": "element {number} is nearly flat (mean-ratio quality {quality:.2g}, aspect "
             "ratio {aspect_ratio:.0f}), which makes the body stiffer and Newton's steps short: "
             "improve the mesh there",
@@ -373,7 +373,7 @@ TOPICS: dict[str, Topic] = {
             "length_m",
             "shapes": "the {modes} shapes of the field of {name} represent only {share:.0%} of its "
             "variance for a length of {length_m:.2g} m: variations finer than {detail_m:.2g} "
-            "m are covered by the intervals only; raise modes or length_m",
+            "m are covered by the intervals only; raise modes",
             "length": "{name} changes over less than the length of its field: the data suggest "
             "about {likely:.2g} m, not {stated:.2g} m; give several lengths in length_m to "
             "choose from",

@@ -170,12 +170,17 @@ class FieldEstimate:
 
     def list_concerns(self) -> list[Concern]:
         """Return the concerns about the field: values of zero or less in some elements
-        ("doubtful", first), and an amplitude or a length that the data contradict.
+        ("doubtful"), at which evidence means nothing; or an amplitude or a length that the data
+        contradict.
 
         The amplitude is reported if the best of `AMPLITUDES` is larger than the stated one and its
         log-evidence ratio exceeds `LIKELIER`, the length if that of half the length does.
         """
         amplitude = self.modes.field.deviation
+        if below := int((self.value <= 0).sum()):
+            counts = {"name": self.name, "below": below, "elements": len(self.value)}
+            least = {"least": float(self.value.min()), "stated": amplitude}
+            return [Concern("field/negative", "doubtful", data=counts | least)]
         contradicted = dict[str, dict[str, float]]()
         best = max(AMPLITUDES, key=lambda factor: self.log_evidence_ratio(factor=factor))
         if best > 1 and self.log_evidence_ratio(factor=best) > LIKELIER:
@@ -185,15 +190,10 @@ class FieldEstimate:
                 "stated": self.modes.length_m,
                 "likely": self.modes.length_m / 2,
             }
-        determined = [
+        return [
             Concern(f"field/{what}", data={"name": self.name, **v})
             for what, v in contradicted.items()
         ]
-        if below := int((self.value <= 0).sum()):
-            counts = {"name": self.name, "below": below, "elements": len(self.value)}
-            least = {"least": float(self.value.min()), "stated": amplitude}
-            determined.insert(0, Concern("field/negative", "doubtful", data=counts | least))
-        return determined
 
 
 def field_estimates(

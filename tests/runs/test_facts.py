@@ -74,7 +74,7 @@ def test_a_part_that_no_grasp_holds_is_refused_before_a_search(shift_m, count, l
             command(problem)
         assert f"no grasp of 'hung' holds {loose} of these parts" in str(refused.value)
         assert (f"{twins} of {8 * count} nodes coincide" in str(refused.value)) is bool(twins)
-        assert "finer mesh" not in str(refused.value)
+        assert "smaller elements" not in str(refused.value)
 
 
 def test_parts_that_are_held_or_belong_to_a_free_body_are_accepted():

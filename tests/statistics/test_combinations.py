@@ -19,6 +19,7 @@ from collocation_sysid.runs.expected_precision import (
 from collocation_sysid.statistics.combinations import (
     Direction,
     find_combinations,
+    precision_text,
     principal_directions,
     undetermined_names,
 )
@@ -289,3 +290,16 @@ def test_without_a_force_a_hanging_body_determines_stiffness_over_density():
     assert sensor.what == "a force sensor at the grasp (noise 1% of the largest force)"
     # The force is the weight: the logarithm of ρ, and with it that of E, has the deviation 1 %.
     assert np.log(sensor.factor) == pytest.approx(Z95 * 0.01, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (1 + 3.2e-13, "to better than ±0.01 %"),
+        (1.0, "to better than ±0.01 %"),
+        (1.032, "to ±3.2 %"),
+        (4.0, "to within a factor of 4"),
+    ],
+)
+def test_no_precision_below_that_of_any_experiment_is_stated(factor: float, said: str):
+    assert precision_text(factor) == said

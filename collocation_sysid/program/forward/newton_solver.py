@@ -779,7 +779,7 @@ def simulation_error(
     remedy = "smaller loads" if static else "a smaller time step"
     return SimulationError(
         f"{what} failed: {failure.reason}; the most deformed element has the volume ratio "
-        f"det F = {ratio:.3g}. Stiffer parameters, {remedy} or a finer mesh may help",
+        f"det F = {ratio:.3g}. Stiffer parameters, {remedy} or smaller elements may help",
         time_s,
         element=element,
         state_m=failure.x if static else None,

@@ -1419,7 +1419,7 @@ DISCRETISATION = (
         "1",
         considered=0.5,
         description="error of the mesh, as a share of its estimate by elements of half the size",
-        remedy="solve on a finer mesh, or run refine",
+        remedy="solve with smaller elements (of a rod: more sections), or run refine",
     ),
     Deviation(
         "time_step",
