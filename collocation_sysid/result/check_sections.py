@@ -85,11 +85,10 @@ def _check_verdict(findings: CheckResult) -> Line:
         )
     if findings.omitted and not findings.causes:
         longer = findings.longer_edges
-        edges = f" with edges {longer[0]:.2g} times as long" if longer else ""
+        coarser = f"use edges {longer[0]:.2g} times as long, or " if longer else ""
         return Line(
             f"{'' if findings.concerns else 'No mistake was found. '}Left out, because check would "
-            f"take longer than half a minute: {', '.join(findings.omitted)}. Use a coarser mesh{edges}, "
-            "or check --full.",
+            f"take longer than half a minute: {', '.join(findings.omitted)}: {coarser}check --full.",
             "check",
         )
     if findings.causes:

@@ -40,6 +40,7 @@ from collocation_sysid.result.check_sections import (
 )
 from collocation_sysid.runs.check import CheckResult, check_problem, quick_check
 from collocation_sysid.runs.check.body import (
+    bending_concerns,
     element_concerns,
     longest_edges,
     slenderness,
@@ -269,13 +270,39 @@ def test_slender_bodies_need_several_linear_elements_across(size_m, divisions, e
     )
 
 
-def test_edges_may_be_longer_until_too_few_are_across_a_slender_body():
-    slender = box_mesh((0.1, 0.03, 0.03), (15, 6, 6))
-    for element, ratio in {"tet4": 1.5, "tet10-p0": 3.0, "tet10": np.inf}.items():
-        body = Body(slender, density_kg_m3=30.0, element=element)
-        assert longest_edges(body, *slenderness(slender)) == pytest.approx(ratio, rel=0.1)
-    cube = box_mesh((0.1, 0.1, 0.1), (2, 2, 2))
-    assert longest_edges(Body(cube, density_kg_m3=30.0), *slenderness(cube)) == np.inf
+@pytest.mark.parametrize(("element", "most"), [("tet4", 1.5), ("tet10-p0", 3.0), ("tet10", 3.0)])
+def test_edges_may_be_longer_until_too_few_are_across(element: str, most: float):
+    """A mesh with the longest edges is not called too coarse, and no coarser one is proposed."""
+    for number, ratio in ((6, most), (round(6 / most), 1.0)):
+        mesh = box_mesh((0.12, 0.03, 0.03), (4 * number, number, number))
+        body = Body(mesh, density_kg_m3=30.0, element=element)
+        shape = slenderness(mesh)
+        assert longest_edges(body, shape[2]) == pytest.approx(ratio)
+        assert not bending_concerns(body, *shape)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("poisson", [0.3, 0.47])
+def test_followed_remedies_of_a_mesh_leave_no_warning(number: int, poisson: float):
+    """The elements that warnings ask for, and as many across the body, are enough."""
+    element, seen = "tet4", list[str]()
+    while True:
+        mesh = box_mesh((0.12, 0.03, 0.03), (4 * number, number, number))
+        body = Body(mesh, density_kg_m3=30.0, element=element)
+        mu_pa = 1e4
+        lame = {"mu_pa": mu_pa, "lambda_pa": 2 * mu_pa * poisson / (1 - 2 * poisson)}
+        theta = body.theta_from_values({**lame, "gamma_r_s": 0.0, "gamma_m_1_s": 0.0})
+        warnings = sentences(
+            element_concerns(body, theta, slenderness(mesh), worst_elements(mesh)[0])
+        )
+        if not warnings:
+            break
+        seen += warnings
+        assert element == "tet4"  # the first warnings say all that is to be done
+        element = "tet10-p0" if poisson >= 0.45 else "tet10"
+        assert all(f'"{element}"' in each for each in warnings)
+        number = max(number, 2) if "2 or more across" in seen[0] else number
+    assert seen
 
 
 def test_as_many_elements_across_as_are_needed_are_enough():
@@ -366,6 +393,26 @@ def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme
     whole = Problem.read(tiny / "problem.toml", overrides).collocation()
     assert findings.jacobian_nonzeros == len(whole.jacobian_structure[1])
     assert findings.hessian_nonzeros == len(whole.hessian_structure[1])
+
+
+def test_only_some_of_many_recordings_are_examined(tiny: Path, monkeypatch):
+    """Sizes count all recordings; memory and time grow with their number."""
+    monkeypatch.setattr("collocation_sysid.runs.check.MOST_EXAMINED", 2)
+    monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
+    problem = Problem.read(tiny / "problem.toml")
+    (swing,) = problem.experiments
+    named = [replace(swing, name=f"swing {k}", validation=k == 4) for k in range(5)]
+    many = replace(problem, experiments=named)
+    one, some, whole = (check_problem(problem), check_problem(many), check_problem(many, full=True))
+    assert [len(each.motions) for each in (one, some, whole)] == [1, 2, 4]
+    assert len(some.recordings) == 5
+    assert some.timesteps == whole.timesteps == 4 * one.timesteps
+    assert one.jacobian_nonzeros is not None
+    assert some.jacobian_nonzeros == pytest.approx(4 * one.jacobian_nonzeros, rel=0.01)
+    assert some.memory_mb == pytest.approx(whole.memory_mb, rel=0.1)
+    said = "3 recordings were read, but the description was only examined in the longest 2"
+    assert any(said in note for note in some.notes)
+    assert not any("only examined" in note for note in whole.notes)
 
 
 def test_nonzeros_are_estimated_for_a_problem_without_guesses(tiny: Path):
@@ -497,7 +544,8 @@ def test_a_check_leaves_out_what_takes_too_long_with_the_remedy(tiny: Path, monk
     assert not found.motions
     shown = " ".join(plain_text(full_check_tables(found)).split())
     assert "Left out, because check would take longer than half a minute: time and memory" in shown
-    assert "Use a coarser mesh, or check --full." in shown
+    # A mesh of few elements across the body is not to be coarser.
+    assert "the comparison of derivatives: check --full." in shown
     assert "nonzeros not counted" in plain_text(full_check_tables(found, details=True))
     assert found.as_dict()["jacobian_error"] is None
     whole = check_problem(problem, full=True)
@@ -506,6 +554,7 @@ def test_a_check_leaves_out_what_takes_too_long_with_the_remedy(tiny: Path, monk
 
 
 def test_an_edge_length_is_proposed_with_which_a_search_takes_a_minute(tiny: Path, monkeypatch):
+    monkeypatch.setattr("collocation_sysid.runs.check.longest_edges", lambda *_: np.inf)
     problem = Problem.read(tiny / "problem.toml")
     assert check_problem(problem).longer_edges is None
     monkeypatch.setattr("collocation_sysid.runs.check.LONG_SOLVE_S", 1e-3)

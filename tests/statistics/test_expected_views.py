@@ -85,8 +85,10 @@ def test_check_goes_on_if_what_other_views_promise_cannot_be_computed(monkeypatc
     def singular(*_):
         raise SimulationError("singular", 0.0)
 
-    collocation = SimpleNamespace(nq=1)
+    problem, collocation = SimpleNamespace(assumed_deviations={}), SimpleNamespace(nq=1)
+    known = SimpleNamespace(combinations=tuple)
+    monkeypatch.setattr(check, "expected_precision", lambda *_: known)
     monkeypatch.setattr(check, "views_note", singular)
-    assert check._views_notes(collocation, np.zeros(1)) == []
+    assert check._expected_precision(problem, collocation, np.zeros(1)) == ((), [])
     monkeypatch.setattr(check, "views_note", lambda *_: "expected")
-    assert check._views_notes(collocation, np.zeros(1)) == ["expected"]
+    assert check._expected_precision(problem, collocation, np.zeros(1)) == ((), ["expected"])

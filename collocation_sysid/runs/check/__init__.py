@@ -77,6 +77,12 @@ __all__ = [
 ]
 
 
+# Most recordings of which derivatives, natural modes, costs and the description are examined.
+MOST_EXAMINED = 12
+EXAMPLES_NOTE = (
+    "{} recordings were read, but the description was only examined in the longest {}; check --full "
+    "examines all of them"
+)
 # Longest simulation of the whole recordings that needs no request [s].
 LONGEST_SIMULATION_S = 10.0
 # Longest check without a request, and longest search for initial values and simulation of the first
@@ -131,7 +137,7 @@ class CheckResult(QuickCheck):
     # RMS distance of the markers in the simulation at the guess; None if only the first samples
     # were simulated.
     rms_at_guess_m: float | None
-    motions: tuple[ModesCheck, ...]
+    motions: tuple[ModesCheck, ...] = ()
     # Size of the program without lifted variables.
     variables: int
     constraints: int
@@ -140,23 +146,24 @@ class CheckResult(QuickCheck):
     overstresses: int
     wrenches: int
     # With lifted variables; None if they were not counted.
-    jacobian_nonzeros: int | None
-    hessian_nonzeros: int | None
+    jacobian_nonzeros: int | None = None
+    hessian_nonzeros: int | None = None
     method: str  # the chosen method
-    costs: tuple[MethodCost, ...]
+    costs: tuple[MethodCost, ...] = ()
     # Largest relative deviation from central differences along random directions; NaN if they were not
     # compared.
-    jacobian_error: float
-    hessian_error: float
+    jacobian_error: float = np.nan
+    hessian_error: float = np.nan
     # Likely errors in the description; their sentences are the first warnings.
-    causes: tuple[Hypothesis, ...]
+    causes: tuple[Hypothesis, ...] = ()
     # Combinations of constants that the recordings determine at the guess although a constant alone
     # is not determined; empty unless the complete recordings were simulated.
     combinations: tuple[Combination, ...] = ()
     notes: tuple[str, ...] = ()  # sentences for information, without a remedy
     omitted: tuple[str, ...] = ()  # parts of the check that would take too long
     # Length of the edges over that of the mesh with which the search takes about a minute, or the
-    # longest that bending allows, and the time of the search with them [s]; None if none are longer.
+    # longest with enough elements across the body, and the time of the search with them [s]; None
+    # if none are longer.
     longer_edges: tuple[float, float] | None = None
     # Expected problems, with the remedy; `warnings` are their sentences.
     concerns: tuple[Concern, ...] = ()
@@ -254,23 +261,33 @@ def check_problem(
     report_progress = report_progress or (lambda _: None)
     began_s = time.perf_counter()
     known = facts(problem)
-    collocation = problem.collocation()
+    examined = problem if full else _examples(problem)
+    collocation = examined.collocation()
     notes = []
     if problem.parameters.names_without_guess:
         report_progress("searching for initial values, because no guess is given")
         collocation, found_notes = _started(collocation, full)
+        examined = replace(examined, parameters=collocation.parameters)
         problem = replace(problem, parameters=collocation.parameters)
         notes += found_notes
+    whole = collocation
+    if others := len(problem.experiments) - len(examined.experiments):
+        whole = problem.collocation()
+        notes.append(EXAMPLES_NOTE.format(others, len(examined.experiments)))
     report_progress("simulating the first samples at the guess")
     started_s = time.perf_counter()
-    first = shortened_problem(problem).collocation()
+    first = shortened_problem(examined).collocation()
     omitted: list[str] = []
     try:
         with time_limit(np.inf if full else LONGEST_START_S):
             first_z, start_notes = initial_variables(first)
         first_s = time.perf_counter() - started_s
     except TimeLimitReached:
-        first_z, start_notes, first_s = _rigid_variables(first), [], np.inf
+        rigid = [
+            each.experiment.rigid_positions(each.dynamics.t_s).reshape(each.grid_times, -1)
+            for each in first.transcriptions
+        ]
+        first_z, start_notes, first_s = first.pack(first.guess_p, rigid), [], np.inf
 
     def is_possible(factor: float, what: str) -> bool:
         """Whether the time is sufficient for a part of the check."""
@@ -280,25 +297,44 @@ def check_problem(
         omitted.append(what)
         return False
 
-    total_s = first_s * _grid_rows(collocation) / _grid_rows(first)
-    program = _program_size(problem, collocation)
+    rows = _grid_rows(whole)
+    total_s = first_s * rows / _grid_rows(first)
+    lifted = with_lifted_variables(whole)
+    found: dict[str, Any] = {}
     if is_possible(COST_FACTOR, "time and memory of a solve"):
         report_progress("estimating time and memory of the methods")
-        program |= _program_costs(problem, collocation, first=first, first_z=first_z)
+        jacobian, hessian = nonzeros(examined, lifted)
+        # Reduced space as the file has it, whichever method is chosen.
+        reduced = next(
+            each
+            for each in (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
+            if isinstance(each, ReducedSpace)
+        )
+        size = rows / _grid_rows(collocation)
+        costs = method_costs(
+            collocation, first, size, first_z, jacobian + hessian, reduced.factorisation
+        )
+        found |= {"jacobian_nonzeros": jacobian, "hessian_nonzeros": hessian, "costs": costs}
     simulated, z = first, first_z
-    if full or (not omitted and total_s <= LONGEST_SIMULATION_S):
+    if full or (not (omitted or others) and total_s <= LONGEST_SIMULATION_S):
         report_progress(f"simulating the recordings at the guess, about {max(1, round(total_s))} s")
-        simulated = collocation
-        (z, start_notes) = initial_variables(collocation)
-    causes: tuple[Hypothesis, ...] = ()
-    combinations: tuple[Combination, ...] = ()
-    motions: tuple[ModesCheck, ...] = ()
+        simulated = whole
+        (z, start_notes) = initial_variables(whole)
     unstable: Sequence[Instability] = ()
     at_guess: list[Concern] = []
     if is_possible(DESCRIPTION_FACTOR, "natural modes and tests of the description"):
         report_progress("computing natural modes and testing the description")
-        causes = misspecification_hypotheses(problem)
-        motions = _natural_modes(problem, collocation)
+        found["causes"] = misspecification_hypotheses(examined)
+        found["motions"] = tuple(
+            check_modes(
+                each.experiment,
+                as_scheme(collocation.scheme),
+                each.dynamics.step_s,
+                theta=each.constants.theta(each.parameters.guess_q),
+            )
+            for each in collocation.transcriptions
+            if not each.experiment.is_static
+        )
         unstable = find_instabilities(simulated, z)
         parts = simulated.iterates(z)
         at_guess += strain_stability_concerns(parts)
@@ -308,23 +344,22 @@ def check_problem(
                 at_guess += feature.guess_concerns(parts, simulated is not first)
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
-        combinations = _expected_combinations(problem, collocation, z)
-        notes += _views_notes(collocation, z)
-    jacobian_error = hessian_error = np.nan
+        found["combinations"], of_views = _expected_precision(problem, whole, z)
+        notes += of_views
     if is_possible(DERIVATIVE_FACTOR, "the comparison of derivatives"):
         report_progress("comparing derivatives with differences")
-        jacobian_error, hessian_error = derivative_errors(first, first_z)
+        found["jacobian_error"], found["hessian_error"] = derivative_errors(first, first_z)
+    method = problem.method
     findings = CheckResult(
         **_simulated_fields(problem, simulated, z=z),
-        timesteps=_grid_rows(collocation),
-        rms_at_guess_m=None if simulated is first else collocation.rms_marker_distance_m(z),
-        motions=motions,
-        **program,
-        jacobian_error=jacobian_error,
-        hessian_error=hessian_error,
-        causes=causes,
-        combinations=combinations,
+        timesteps=rows,
+        rms_at_guess_m=None if simulated is first else whole.rms_marker_distance_m(z),
+        variables=whole.variable_count,
+        constraints=whole.constraint_count,
+        **{field: lifted_count(lifted, group) for group, field, _, _ in LIFTED_KINDS},
+        method=method if isinstance(method, str) else getattr(method, "name", repr(method)),
         omitted=tuple(omitted),
+        **found,
     )
     concerns = (
         *(each for each in known if isinstance(each, Concern)),
@@ -341,25 +376,42 @@ def check_problem(
         )
     if problem.substeps == "auto" and findings.motions:
         steps = problem.choose_first_substeps()
-        has_obstacles = any(e.obstacles for e in problem.experiments)
-        if steps > 1 and has_obstacles:
+        if steps > 1 and any(e.obstacles for e in problem.experiments):
             notes.append(IMPACT_NOTE.format(steps))
         else:
             notes.append(SUBSTEPS_NOTE.format(f"{steps} time step{'s' * (steps > 1)}"))
-    search_s = chosen_cost.time_s if chosen_cost else None
-    if first_s == np.inf:
+    if chosen_cost:
+        search_s = chosen_cost.time_s
+    else:
         largest = max(findings.bodies, key=lambda body: body.nodes)
-        rows = _grid_rows(collocation)
         search_s = Size(largest.nodes, largest.elements, rows, unknowns=1).time_s()
-    findings = replace(findings, concerns=concerns, longer_edges=_longer_edges(problem, search_s))
     rests_on = scale_reference(
         problem.experiments, problem.parameters, problem.assumed_deviations["mass"]
     )
     notes += [] if rests_on is None else [rests_on.sentence]
-    first = [*problem.notes, *sentences(known)]
+    warnings = sentences(concerns)
+    stated = (each for each in (*problem.notes, *sentences(known)) if each not in warnings)
     return replace(
-        findings, notes=(*(note for note in first if note not in findings.warnings), *notes)
+        findings,
+        concerns=concerns,
+        longer_edges=_longer_edges(problem, search_s),
+        notes=(*stated, *notes),
     )
+
+
+def _examples(problem: Problem) -> Problem:
+    """Return the problem with the longest recording of each kind and the longest others, together
+    `MOST_EXAMINED`; itself if it has no more.
+    """
+    longest = sorted(problem.experiments, key=lambda e: (e.validation, -len(e.t_s)))
+    of_kinds = {
+        (e.is_static, *e.body.parameter_names, *map(type, (*e.measurements, *e.obstacles))): e
+        for e in reversed(longest)
+    }
+    chosen = [*dict.fromkeys((*of_kinds.values(), *longest))][: max(MOST_EXAMINED, len(of_kinds))]
+    if len(chosen) == len(longest):
+        return problem
+    return replace(problem, experiments=[each for each in problem.experiments if each in chosen])
 
 
 def _longer_edges(problem: Problem, search_s: float | None) -> tuple[float, float] | None:
@@ -367,17 +419,9 @@ def _longer_edges(problem: Problem, search_s: float | None) -> tuple[float, floa
     if search_s is None or len(meshed) != 1 or (body := meshed.pop()).is_slender:
         return None
     of_a_minute = (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
-    ratio = round(min(of_a_minute, longest_edges(body, *slenderness(body.mesh))), 1)
+    longest = longest_edges(body, slenderness(body.mesh)[2])
+    ratio = float(np.floor(10 * min(of_a_minute, longest))) / 10  # such a mesh has enough elements
     return (ratio, search_s / ratio**EDGE_POWER) if ratio > 1 else None
-
-
-def _rigid_variables(collocation: Collocation) -> Array:
-    """Return the variables of bodies that move rigidly with their grasps."""
-    positions = [
-        each.experiment.rigid_positions(each.dynamics.t_s).reshape(each.grid_times, -1)
-        for each in collocation.transcriptions
-    ]
-    return collocation.pack(collocation.guess_p, positions)
 
 
 def _started(collocation: Collocation, full: bool) -> tuple[Collocation, list[str]]:
@@ -389,37 +433,30 @@ def _started(collocation: Collocation, full: bool) -> tuple[Collocation, list[st
             with time_limit(np.inf if full else LONGEST_START_S):
                 start = start_problem(collocation)
         except TimeLimitReached:
-            usual = typical_parameters(collocation.parameters, SOFT_PA)
-            parameters = best.solution().collocation.parameters if best.answer else usual
+            if best.answer:
+                parameters = best.solution().collocation.parameters
+            else:
+                parameters = typical_parameters(collocation.parameters, SOFT_PA)
             return collocation.with_parameters(parameters), [
                 f"the search for initial values was ended after {LONGEST_START_S:g} s"
             ]
-    notes = [start.scan.sentence if start.scan else "", start.note]
-    return start.collocation, [note for note in notes if note]
+    notes = (start.scan.sentence if start.scan else "", start.note)
+    return start.collocation, [*filter(None, notes)]
 
 
-def _expected_combinations(
+def _expected_precision(
     problem: Problem, collocation: Collocation, z: Array
-) -> tuple[Combination, ...]:
-    """Return an empty tuple if the combinations cannot be computed."""
+) -> tuple[tuple[Combination, ...], list[str]]:
+    """Return combinations, and `views_note` as a list; both empty if they cannot be computed."""
     if not collocation.nq:
-        return ()
+        return (), []
     deviations = problem.assumed_deviations
     try:
         found = expected_precision(collocation, z, deviations).combinations()
-        return with_something_to_state(with_measurements(found, collocation, z, deviations))
+        found = with_something_to_state(with_measurements(found, collocation, z, deviations))
+        return found, [note] if (note := views_note(collocation, z)) else []
     except SimulationError:
-        return ()
-
-
-def _views_notes(collocation: Collocation, z: Array) -> list[str]:
-    """Return `views_note` as a list; empty if it cannot be computed."""
-    if not collocation.nq:
-        return []
-    try:
-        return [note] if (note := views_note(collocation, z)) else []
-    except SimulationError:
-        return []
+        return (), []
 
 
 def _simulated_fields(problem: Problem, collocation: Collocation, z: Array) -> dict[str, Any]:
@@ -443,59 +480,12 @@ def _grid_rows(collocation: Collocation) -> int:
     return sum(transcription.grid_times for transcription in collocation.transcriptions)
 
 
-def _program_size(problem: Problem, collocation: Collocation) -> dict[str, Any]:
-    """Return the size of the program, without what takes time."""
-    lifted = with_lifted_variables(collocation)
-    method = problem.method
-    return {
-        "variables": collocation.variable_count,
-        "constraints": collocation.constraint_count,
-        **{field: lifted_count(lifted, group) for group, field, _, _ in LIFTED_KINDS},
-        "jacobian_nonzeros": None,
-        "hessian_nonzeros": None,
-        "method": method if isinstance(method, str) else getattr(method, "name", repr(method)),
-        "costs": (),
-    }
-
-
-def _program_costs(
-    problem: Problem, collocation: Collocation, first: Collocation, first_z: Array
-) -> dict[str, Any]:
-    """Return nonzeros of the program and cost of the methods."""
-    jacobian, hessian = nonzeros(problem, with_lifted_variables(collocation))
-    # Reduced space as the file has it, whichever method is chosen.
-    named = (problem.solver(), problem.solver(ReducedSpace.name), ReducedSpace())
-    reduced = next(each for each in named if isinstance(each, ReducedSpace))
-    counted = method_costs(
-        collocation,
-        first,
-        z=first_z,
-        nonzeros=jacobian + hessian,
-        factorisation=reduced.factorisation,
-    )
-    return {"jacobian_nonzeros": jacobian, "hessian_nonzeros": hessian, "costs": counted}
-
-
-def _natural_modes(problem: Problem, collocation: Collocation) -> tuple[ModesCheck, ...]:
-    """Static and held out experiments are left out."""
-    scheme = as_scheme(collocation.scheme)
-    guesses = problem.parameters.guesses
-    return tuple(
-        check_modes(
-            s.experiment, scheme, step_s=s.dynamics.step_s, theta=s.body.theta_from_values(guesses)
-        )
-        for s in collocation.transcriptions
-        if not s.experiment.is_static
-    )
-
-
 def _concerns(
     problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
     """Return the likeliest mistakes first."""
-    experiments = problem.experiments
-    parameters = problem.parameters
-    bodies = findings.bodies
+    experiments, parameters, bodies = problem.experiments, problem.parameters, findings.bodies
+    steps = problem.choose_first_substeps()
     chosen = findings.chosen_cost
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
@@ -506,11 +496,7 @@ def _concerns(
         *(each for grasp_check in findings.holds for each in grasp_concerns(grasp_check)),
         *(each for motion in findings.motions for each in mode_concerns(motion)),
         *stability_concerns(unstable),
-        *(
-            each
-            for e in experiments
-            for each in rotation_step_concerns(e, problem.choose_first_substeps())
-        ),
+        *(each for e in experiments for each in rotation_step_concerns(e, steps)),
         *(c for r in findings.recordings for c in recording_concerns(r, body_of[r.experiment])),
         *(cost_concerns(chosen, findings.costs) if chosen else ()),
     )

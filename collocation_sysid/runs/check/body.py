@@ -33,11 +33,13 @@ LEAST_SLENDERNESS = 2.5
 # Elements needed across the thickness of a bending body: with averaged dilatation one element
 # sags by half too much, two by 4 to 8 %.
 CELLS_ACROSS = {"tet4": 4.0, "tet10-p0": 2.0}
+# Elements across the thickness below which no coarser mesh is proposed, whatever the elements are.
+FEWEST_CELLS = 2.0
 # Name of the linear element.
 LINEAR = "tet4"
 # Remedies in messages.
-FOR_BENDING = 'set object.element = "tet10"'
-FOR_VOLUME = 'set object.element = "tet10-p0"'
+FOR_BENDING = 'set object.element = "tet10" (for ν ≥ 0.45 "tet10-p0", with 2 or more across)'
+FOR_VOLUME = 'set object.element = "tet10-p0", with 2 or more across a body that bends'
 
 # Corners of the faces of a tetrahedron; face k is opposite to corner k.
 _FACES = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
@@ -52,8 +54,8 @@ class ElementShape:
     aspect_ratio: float  # longest edge over smallest height: 1.22 for the regular tetrahedron
 
 
-def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
-    """Return the shapes of the `count` elements of lowest quality, worst first, with indices from
+def worst_elements(mesh: TetMesh) -> tuple[ElementShape, ...]:
+    """Return the shapes of the three elements of lowest quality, worst first, with indices from
     0; all of them if there are fewer. The mesh is undeformed, and of quadratic elements the corners
     count alone.
     """
@@ -64,7 +66,7 @@ def worst_elements(mesh: TetMesh, count: int = 3) -> tuple[ElementShape, ...]:
     longest = edge_lengths(mesh.points_m, mesh.tetrahedra).max(axis=1)
     return tuple(
         ElementShape(int(e), float(quality[e]), aspect_ratio=float(longest[e] / heights[e]))
-        for e in np.argsort(quality, kind="stable")[:count]
+        for e in np.argsort(quality, kind="stable")[:3]
     )
 
 
@@ -129,8 +131,9 @@ def bending_concerns(
     """
     name = body.element.name
     off, level = ("stiff", "low") if name == LINEAR else ("soft", "high")
+    bends = name in CELLS_ACROSS and length_m > LEAST_SLENDERNESS * thickness_m
     return concern_if(
-        longest_edges(body, length_m, thickness_m, cells_across) < 1 - ROUNDING,
+        bends and longest_edges(body, cells_across) < 1 - ROUNDING,
         False,
         code="mesh/few",
         # Rounded down, so that it is below the number that is needed.
@@ -144,14 +147,11 @@ def bending_concerns(
     )
 
 
-def longest_edges(body: Body, length_m: float, thickness_m: float, cells_across: float) -> float:
+def longest_edges(body: Body, cells_across: float) -> float:
     """Return the length of the longest edges with which a body has enough elements across its
-    thickness over that of its mesh; infinite unless it is slender. The numbers are those of
-    `slenderness`.
+    thickness over that of its mesh.
     """
-    needed = CELLS_ACROSS.get(body.element.name)
-    is_slender = length_m > LEAST_SLENDERNESS * thickness_m
-    return cells_across / needed if needed and is_slender else np.inf
+    return cells_across / CELLS_ACROSS.get(body.element.name, FEWEST_CELLS)
 
 
 def _covariance(mesh: TetMesh) -> Array:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import time
+import timeit
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,8 @@ from ...program.lifted.collocation import lifted_nonzeros, with_lifted_variables
 from ...program.linear_algebra.factorisation import Choice
 from ...program.sweep import Sweep
 from ...recording.experiment import Experiment
-from ...recording.measurement_selection import shortened_experiment
 from ...statistics.concerns import Concern
-from .derivatives import first_sample_count, shortened_problem
+from .derivatives import shortened_problem
 
 # Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.
 BYTES_PER_NONZERO = 280.0
@@ -77,37 +77,32 @@ def interior_point_mb(entries: int) -> float:
 
 
 def nonzeros(problem: Problem, lifted: Collocation) -> tuple[int, int]:
-    """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of the
-    lifted program, extrapolated linearly from a few samples of each experiment.
+    """Return the numbers of nonzeros of the Jacobian and of the Hessian's upper triangle of a
+    program with lifted variables, extrapolated from a few samples by the number of variables.
 
     Parameters
     ----------
     problem : Problem
-        Problem; its parameters may lack guesses.
+        Problem with all experiments of the program, or examples of them; its parameters may lack
+        guesses.
     lifted : Collocation
-        Program of the problem with lifted variables, as interior point needs it, and with a guess
-        of every parameter.
+        Program with lifted variables, as interior point needs it, and with a guess of every
+        parameter.
     """
-    further = lifted_nonzeros(lifted)
     problem = replace(problem, parameters=lifted.parameters)
-    short = shortened_problem(problem)
-    total = least = _count_nonzeros(short)
-    for k, experiment in enumerate(problem.experiments):
-        if not experiment.validation:
-            parts = list(short.experiments)
-            parts[k] = shortened_experiment(
-                experiment, first_sample_count(experiment) + 1, shortens_sensors=True
-            )
-            more = _count_nonzeros(replace(problem, experiments=parts)) - least
-            total = total + max(0, len(experiment.t_s) - first_sample_count(experiment)) * more
-    return int(total[0]) + further[0], int(total[1]) + further[1]
+    short, longer = (_count_nonzeros(shortened_problem(problem, more)) for more in (0, 1))
+    variables = problem.collocation().variable_count
+    examined = short + (variables - short[0]) / max(1, longer[0] - short[0]) * (longer - short)
+    size = lifted.phi_columns.stop / variables
+    jacobian, hessian = np.rint(size * examined[1:]) + lifted_nonzeros(lifted)
+    return int(jacobian), int(hessian)
 
 
 def _count_nonzeros(problem: Problem) -> NDArray[np.int64]:
-    """Return nonzeros (2,) of the Jacobian and of the Hessian's upper triangle, without lifting."""
-    collocation = problem.collocation()
-    structures = (collocation.jacobian_structure, collocation.hessian_structure)
-    return np.array([len(indices) for _, indices in structures])
+    """Return the number of variables and nonzeros (3,), without lifting."""
+    program = problem.collocation()
+    (_, of_jacobian), (_, of_hessian) = program.jacobian_structure, program.hessian_structure
+    return np.array([program.variable_count, len(of_jacobian), len(of_hessian)])
 
 
 # Time steps of the sweep that is timed: enough for a steady time per step.
@@ -148,33 +143,42 @@ class MethodCost:
 
 
 def method_costs(
-    collocation: Collocation, short: Collocation, z: Array, nonzeros: int, factorisation: Choice
+    collocation: Collocation,
+    short: Collocation,
+    size: float,
+    z: Array,
+    nonzeros: int,
+    factorisation: Choice,
 ) -> tuple[MethodCost, ...]:
     """Return the estimated memory [MB] and time [s] of reduced space and of interior point, in this
-    order.
-
-    One sweep is computed to measure its time. The time of reduced space is None if the equations at
-    the start cannot be solved.
+    order; the time of reduced space is None if the equations at the start cannot be solved.
 
     Parameters
     ----------
     collocation : Collocation
-        Program of the complete recordings.
+        Program of the examined recordings.
     short : Collocation
         First samples of the same experiments, in which sweeps are timed.
+    size : float
+        Size of the program of all recordings over that of `collocation`.
     z : (variables,) array
         Start of `short`.
     nonzeros : int
-        Number of nonzeros of the Jacobian and the Hessian of interior point, together.
+        Number of nonzeros of the Jacobian and the Hessian of interior point for all recordings.
     factorisation : {"auto", "band", "sparse", "supernodal"}
         Option of reduced space.
     """
-    width = max(unknowns_of_a_timestep(collocation))
+    sweeps_s = _estimated_sweeps_s(collocation, short, z, factorisation)
+    width = max(  # free dofs and overstresses
+        len(each.free_dofs)
+        + sum(b.columns.stop - b.columns.start for b in each.body.memory.branches)
+        for each in collocation.transcriptions
+    )
     return (
         MethodCost(
             "reduced-space",
-            memory_mb(collocation),
-            time_s=estimated_sweeps_s(collocation, short, z=z, factorisation=factorisation),
+            size * memory_mb(collocation),
+            time_s=None if sweeps_s is None else PREPARATION_S + TYPICAL_SWEEPS * size * sweeps_s,
         ),
         MethodCost(
             "interior-point",
@@ -182,17 +186,6 @@ def method_costs(
             time_s=TYPICAL_ITERATIONS * SECONDS_PER_NONZERO * nonzeros * width**TIMESTEP_POWER,
         ),
     )
-
-
-def unknowns_of_a_timestep(collocation: Collocation) -> list[int]:
-    """Return, for each fitted experiment in their order, the number of unknowns per time step in
-    interior point: free dofs and overstresses.
-    """
-    return [
-        len(transcription.free_dofs)
-        + sum(b.columns.stop - b.columns.start for b in transcription.body.memory.branches)
-        for transcription in collocation.transcriptions
-    ]
 
 
 def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
@@ -205,9 +198,12 @@ def cost_notes(chosen: MethodCost, others: Sequence[MethodCost]) -> list[str]:
         Costs of at least one method; the chosen one may be among them.
     """
     quickest = min(others, key=lambda cost: cost.time_s or np.inf)
-    if chosen.time_s is None or quickest.time_s is None:
-        return []
-    if chosen.time_s < LONG_SOLVE_S or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s:
+    if (
+        chosen.time_s is None
+        or quickest.time_s is None
+        or chosen.time_s < LONG_SOLVE_S
+        or quickest.time_s > LARGEST_TIME_SHARE * chosen.time_s
+    ):
         return []
     return [
         f'solver.method = "{quickest.method}" finds the same optimum much faster than '
@@ -234,32 +230,26 @@ def cost_concerns(chosen: MethodCost, others: Sequence[MethodCost]) -> list[Conc
     return [Concern("memory/short", data={"method": chosen.method, **sizes, "remedy": remedy})]
 
 
-def estimated_sweeps_s(
-    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice = "auto"
+def _estimated_sweeps_s(
+    collocation: Collocation, short: Collocation, z: Array, factorisation: Choice
 ) -> float | None:
-    """Return the estimated time of the search of a solve [s], from two timed sweeps over the first
-    rows of each experiment and its `search_factor`; None if the equations cannot be solved.
-    """
+    """Return the time of a sweep over all rows [s], weighted by `search_factor`, from two timed ones."""
     total = 0.0
     free_names = {item.name for item in collocation.parameters.free}
     for transcription, part in zip(collocation.transcriptions, short.iterates(z), strict=True):
         rows = min(TIMED_ROWS, len(part.x))
-        setting = part.equations
         solver = Sweep(part.transcription, rows, factorisation=factorisation)
-        took_s = []
-        for _ in range(2):  # the first one loads what it calls
-            began = time.perf_counter()
-            try:
-                solver.forward(part.x[:rows], setting)
-            except SimulationError:
-                return None
-            took_s.append(time.perf_counter() - began)
-        sweep_s = transcription.grid_times / rows * min(took_s)
+        sweep = partial(solver.forward, part.x[:rows], part.equations)
+        try:  # the first one loads what it calls
+            took_s = min(timeit.repeat(sweep, repeat=2, number=1))
+        except SimulationError:
+            return None
+        sweep_s = transcription.grid_times / rows * took_s
         factor = search_factor(transcription.experiment, free_names)
         if any(entry.row.of == "images" for entry in transcription.nuisance.entries):
             factor *= CAMERA_FACTOR
         total += factor * sweep_s
-    return PREPARATION_S + TYPICAL_SWEEPS * total
+    return total
 
 
 def search_factor(experiment: Experiment, free_names: Set[str]) -> float:

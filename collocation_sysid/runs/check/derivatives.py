@@ -14,7 +14,6 @@ from ...model.contact.force import contact_terms
 from ...problem import Problem
 from ...program.collocation import Collocation, convert_variables
 from ...program.lifted.collocation import lifted_nonzeros, with_lifted_variables
-from ...recording.experiment import Experiment
 from ...recording.measurement_selection import shortened_experiment
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
@@ -32,22 +31,15 @@ LARGE_HUBER = 1e9
 MOST_LIFTED_NONZEROS = 5e6
 
 
-def first_sample_count(experiment: Experiment) -> int:
-    """Return the number of first samples that contain all kinds of equations: `STATIC_SAMPLES` or
-    `SAMPLES`, also if the experiment has fewer samples.
-    """
-    return STATIC_SAMPLES if experiment.is_static else SAMPLES
-
-
-def shortened_problem(problem: Problem) -> Problem:
+def shortened_problem(problem: Problem, more: int = 0) -> Problem:
     """Return the problem with the first samples of every experiment, also of those for validation:
-    at least `first_sample_count` or, if there are fewer, all, see `shortened_experiment`. The
-    problem itself is not modified.
+    at least `STATIC_SAMPLES` or `SAMPLES`, and `more`, or, if there are fewer, all, see
+    `shortened_experiment`.
     """
-    short = tuple(
-        shortened_experiment(e, first_sample_count(e), shortens_sensors=True)
-        for e in problem.experiments
-    )
+    short = []
+    for each in problem.experiments:
+        count = (STATIC_SAMPLES if each.is_static else SAMPLES) + more
+        short.append(shortened_experiment(each, count, shortens_sensors=True))
     return replace(problem, experiments=short)
 
 
@@ -77,8 +69,7 @@ def derivative_errors(collocation: Collocation, z: Array) -> tuple[float, float]
     rng = np.random.default_rng(0)
     of_slopes = 0.0
     step = _difference_step(collocation)
-    program = with_lifted_variables(collocation)
-    plain = collocation
+    plain, program = collocation, with_lifted_variables(collocation)
     if program is not collocation:  # gradients alone need no such variables
         of_slopes = _slope_error(plain.objective, plain.gradient, z=z, rng=rng, step=step)
         if plain.has_eliminated_histories:

@@ -142,10 +142,13 @@ def recording_concerns(recording: RecordingCheck, body: BodyCheck) -> list[Conce
         return []
 
     def marker_data(marker: MarkerCheck, distance_m: float | None = 0.0) -> dict[str, Any]:
-        by_mm = 1e3 * (distance_m or 0.0)
-        frames = recording.frames
-        named = {"marker": marker.name, "experiment": recording.experiment}
-        return named | {"by_mm": by_mm, "missing": marker.missing, "frames": frames}
+        return {
+            "marker": marker.name,
+            "experiment": recording.experiment,
+            "by_mm": 1e3 * (distance_m or 0.0),
+            "missing": marker.missing,
+            "frames": recording.frames,
+        }
 
     farthest = recording.farthest_marker
     most_missing = recording.most_missing_marker
