@@ -59,6 +59,7 @@ from ..recording.nuisance import (
     cayley_rotation,
 )
 from ..recording.obstacle import Obstacle
+from ..recording.obstacle_solids import orthogonal_axes
 from .generated_functions import GeneratedFunction
 
 Load = TypeVar("Load", PointMass, Force)
@@ -539,7 +540,10 @@ class NuisanceMap(RecordingQuantities):
         values = self.values_by_row(phi, self.gravity_indices)
         gravity = ca.DM(self.gravity_m_s2)
         if TILT in values:
-            gravity = self._tilted_gravity(values[TILT])
+            size = ca.norm_2(gravity)
+            across = ca.DM(orthogonal_axes(self.gravity_m_s2).T)
+            tilted = gravity + size * (across @ values[TILT])
+            gravity = size * tilted / ca.norm_2(tilted)
         if POSE_TURN in values:
             gravity = cayley_rotation(values[POSE_TURN]).T @ gravity
         return ca.SX(gravity)
@@ -560,17 +564,6 @@ class NuisanceMap(RecordingQuantities):
         for position, k in enumerate(places):
             parts.setdefault(self.entries[k].row, []).append(values[position])
         return {row: ca.vertcat(*each) for row, each in parts.items()}
-
-    def _tilted_gravity(self, angles: ca.SX) -> ca.SX:
-        """Return gravity (3,), tilted by two angles [rad] about its perpendicular axes."""
-        size = float(np.linalg.norm(self.gravity_m_s2))
-        if size == 0:
-            return ca.SX(ca.DM(self.gravity_m_s2))
-        down = self.gravity_m_s2 / size
-        # Two axes across gravity: those that complete it to a basis.
-        across = np.linalg.svd(down[None])[2][1:]
-        tilted = down + ca.mtimes(ca.DM(across.T), angles)
-        return ca.SX(size * tilted / ca.norm_2(tilted))
 
 
 def _strain_shifts_m(experiment: Experiment) -> Array:

@@ -260,10 +260,14 @@ class Cuboid(Solid):
 
 
 def orthogonal_axes(normal: Array) -> Array:
-    """Return two unit vectors (2, 3) orthogonal to a nonzero direction (3,) and to each other;
-    which of all such pairs is not specified.
+    """Return two unit vectors (2, 3) orthogonal to a nonzero direction (3,) and to each other, which
+    hardly change with small changes of the direction.
     """
-    return np.linalg.svd(normal[None])[2][1:]
+    # Weights, because directions in the middle between two axes are common, too.
+    k = np.argmax(np.abs(normal) * [1.0, 1.5, 2.0])
+    across = np.cross(normal, np.eye(3)[k - 1])
+    axes = np.array([np.cross(across, normal), across])
+    return axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
 def _circle(centre_m: Array, axis: Array, radius_m: float) -> Array:

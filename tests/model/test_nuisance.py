@@ -192,6 +192,18 @@ def test_a_tilt_turns_gravity_and_keeps_its_size():
     assert angle == pytest.approx(np.arctan(0.05 * np.sqrt(5)), rel=1e-9)
 
 
+@pytest.mark.parametrize("angles", [*product((1.0, -1.0), repeat=2)])
+@pytest.mark.parametrize("down", [(0, 0, -1), (0, -1, 0), (1, 0, 0), (0, -1, -1), (1, 1, 1)])
+def test_a_tilt_acts_alike_in_the_recording_and_about_its_tilted_gravity(down, angles):
+    """A motion that is planned with the identified gravity deviates by the tilt of the recording."""
+    stated = hung_cube(gravity_m_s2=9.81 * np.array(down) / np.linalg.norm(down))
+    nuisance = NuisanceMap.from_experiment(replace(stated, nuisance=ONE_OF_EACH["tilt"]))
+    tilted = replace(nuisance, gravity_m_s2=nuisance.gravity(np.array(angles)))
+    for phi in np.eye(2):
+        changes = [each.gravity(phi) - each.gravity_m_s2 for each in (nuisance, tilted)]
+        assert np.linalg.norm(changes[0] - changes[1]) < 0.1 * np.linalg.norm(changes[0])
+
+
 def test_a_body_without_gravity_has_no_tilt():
     floating = hung_cube(start="undeformed", gravity_m_s2=np.zeros(3))
     nuisance = NuisanceMap.from_experiment(replace(floating, nuisance=ONE_OF_EACH["tilt"]))
