@@ -421,17 +421,17 @@ class Posterior:
         )
 
     def joint(self, transcriptions: Iterable[Transcription]) -> JointPosterior:
-        """Return the joint posterior of what acts on the body in the fitted experiments, without the
-        grips, which another session does not have.
+        """Return the joint posterior of what acts on the body in the fitted experiments, without grips
+        of single recordings, which another session does not have.
         """
         count, learnt = len(self.fit.names), len(self.effects.names)
         rows = {name: (k, 1.0) for k, name in enumerate(self.fit.names[: len(self.start)])}
         for each in transcriptions:
-            entries = each.nuisance.entries
+            entries, scope = each.nuisance.entries, each.experiment.nuisance.scope
             places = each.nuisance_indices.indices.tolist()
             for place, name, entry in zip(places, each.nuisance.names, entries, strict=True):
                 acts = entry.row == PLACE or entry.row.changes_motion
-                if acts and entry.row not in GRIP:
+                if acts and (entry.row not in GRIP or entry.row.name in scope):
                     rows[name] = place, entry.sigma
         effects = (*self.effects.names, *self.considered.names)
         for k, name in enumerate(effects, start=count - learnt):

@@ -25,8 +25,13 @@ STATED = {"torsion_n_m2": 3e-4, "axial_n": 200.0}
 MASS_PER_LENGTH_KG_M, CLAMP_M, SECTIONS = 0.034, 0.05, 81
 
 
-def write_twin(folder: Path, seed: int) -> None:
-    """Write the problem of the example with the data of a twin."""
+Grip = tuple[Rotation, np.ndarray]
+
+
+def write_twin(folder: Path, seed: int) -> tuple[cs.Experiment, Grip]:
+    """Write the problem of the example with the data of a twin, and return the true cable with the
+    stated poses, and its grip.
+    """
     shutil.copytree(TEMPLATES / "cable", folder, dirs_exist_ok=True)
     rng = np.random.default_rng(seed)
     mass_kg_m = MASS_PER_LENGTH_KG_M * (1 + 0.01 * rng.normal())
@@ -39,20 +44,12 @@ def write_twin(folder: Path, seed: int) -> None:
         f"experiment.0.gravity_m_s2={down.tolist()!r}",
     ]
     (stated,) = cs.Problem.read(folder / "problem.toml", changes, simulation=True).experiments
-    (grasp,) = stated.grasps
-    turn = Rotation.from_rotvec(rng.normal(0, np.radians(0.5), 3))
-    pivot_m = np.array([CLAMP_M / 2, 0.0, 0.0])
-    shift_m = pivot_m + rng.normal(0, 1e-3, 3) - turn.apply(pivot_m)
-    poses = grasp.poses
-    hand = Rotation.from_quat(poses.quaternions_xyzw)
-    held = cs.PoseSequence(
-        poses.t_s, poses.positions_m + hand.apply(shift_m), (hand * turn).as_quat()
-    )
+    grip = drawn_grip(rng)
     along = stated.body.nodes_m[stated.body.cells, 0].mean(axis=1)
     gradient = 0.05 * rng.normal() * (2 * along / along.max() - 1)
     body = stated.body.with_stiffness_factors(1 + gradient)
-    true = replace(stated, body=body, grasps=(replace(grasp, poses=held),))
-    motion = cs.simulate(true, TRUTH | STATED)
+    true = replace(stated, body=body)
+    motion = cs.simulate(gripped(true, true.grasps[0].poses, grip), TRUTH | STATED)
     t_s = stated.t_s
 
     def late(values: np.ndarray) -> np.ndarray:
@@ -72,3 +69,22 @@ def write_twin(folder: Path, seed: int) -> None:
     write_columns_csv(
         folder / "wrench.csv", {"t_s": t_s, **dict(zip(names, wrench.T, strict=True))}
     )
+    return true, grip
+
+
+def drawn_grip(rng: np.random.Generator) -> Grip:
+    """Draw turn and shift of the cable in the gripper."""
+    turn = Rotation.from_rotvec(rng.normal(0, np.radians(0.5), 3))
+    pivot_m = np.array([CLAMP_M / 2, 0.0, 0.0])
+    return turn, pivot_m + rng.normal(0, 1e-3, 3) - turn.apply(pivot_m)
+
+
+def gripped(experiment: cs.Experiment, poses: cs.PoseSequence, grip: Grip) -> cs.Experiment:
+    """Return the experiment with a gripper that moves along poses."""
+    turn, shift_m = grip
+    hand = Rotation.from_quat(poses.quaternions_xyzw)
+    held = cs.PoseSequence(
+        poses.t_s, poses.positions_m + hand.apply(shift_m), (hand * turn).as_quat()
+    )
+    (grasp,) = experiment.grasps
+    return replace(experiment, grasps=(replace(grasp, poses=held),))

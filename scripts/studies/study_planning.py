@@ -394,7 +394,7 @@ def band_report(tip: Array, plan: MotionPlan) -> str:
     """Return the state of a plan, and how its band agrees with the executed tip."""
     half = plan.half_widths_m
     assert half is not None
-    predicted = plan.points_m["tip"]
+    predicted = plan.expected_m["tip"]
     off = np.abs(tip[: len(predicted)] - (predicted - predicted[0]))
     error = plan.tracking_error(plan.program.references[0])
     return (

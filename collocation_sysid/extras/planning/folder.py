@@ -28,7 +28,7 @@ from ...result.report import report_html
 from ...result.run_writers import replaced_folder
 from ...statistics.budget.systematic_effects import source_label
 from ...statistics.concerns import remedy_for
-from .band import OF_GRIP, OTHERS
+from .band import DESCRIPTION, OF_GRIP, OTHERS
 from .execution_problems import (
     CHECK_FILE,
     POSES_FILE,
@@ -37,7 +37,7 @@ from .execution_problems import (
     write_commands,
 )
 from .hand_motion import angular_motion
-from .motion_plan import DESCRIPTION, BandContribution, MotionPlan
+from .motion_plan import BandContribution, MotionPlan
 from .pictures import plan_figures
 from .trajectory_log import write_trajectory_mcap
 
@@ -56,7 +56,7 @@ CAPTIONS = {
 REMEDIES = {
     OTHERS: "record longer, measure the places of the markers, or refine the mesh",
     DESCRIPTION: "use a finer mesh or another law",
-    OF_GRIP: "grip the body at the same place again, and state its prior, hand_eye",
+    OF_GRIP: 'keep the body in the gripper, and state hand_eye = { scope = "shared" }',
 }
 # Form of plan.json.
 SCHEMA = 2

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.stats import norm
 
 from ...common.array_types import Array
 from ...common.validated_classes import validated
@@ -24,6 +23,7 @@ from ...problem.code_loader import CodeLoader
 from ...program.simulation import Trajectory, simulate
 from ...recording import Experiment, Markers, PoseSequence
 from ...runs.solved_problem import SolvedProblem
+from ...statistics.budget.combined_intervals import NORMAL_95
 from .band import point_deviations
 from .durations import shortest, shortest_of_hand
 from .full_program import require_full_program, solve_full
@@ -44,10 +44,6 @@ from .task import Reference, Task
 Solver = Literal["reduced-space", "interior-point"]
 # Share of a limit, tightened by its margin, from which it binds.
 BINDING = 1 - 1e-4
-# Probability with which the whole motion of all points is inside the band.
-BAND = 0.95
-# Source of the band beside those of a budget and the grip.
-DESCRIPTION = "description"
 # Limits of a hand that does not move.
 STANDING = Limits(
     **{
@@ -242,59 +238,48 @@ class MotionPlan:
 
     @cached_property
     def _deviations(self) -> tuple[Array, dict[str, Array]] | None:
-        """Mean (T, P, 3) [m] and variances [m²] of the deviations of all points from the prediction,
-        see `point_deviations`; None if these are not known.
-        """
-        program = self.program
-        if program.body.joint is None:
-            return None
+        """Those of all points, see `point_deviations`; None if they are not known."""
         try:
-            mean_m, variances = point_deviations(
-                program.body,
-                program.body.joint,
-                program.moved_experiment(self.answer.c),
-                self.answer.x,
-                self._change_by_steps_m,
+            moved = self.program.moved_experiment(self.answer.c)
+            return point_deviations(
+                self.program.body, moved, self.answer.x, self._change_by_steps_m
             )
         except (SimulationError, InputError, np.linalg.LinAlgError):  # must not lose the plan
             return None
-        of_description = np.full(mean_m.shape, program.body.description_std_m**2)
-        return mean_m, variances | {DESCRIPTION: of_description}
+
+    @cached_property
+    def expected_m(self) -> dict[str, Array]:
+        """Middle (T, 3) of the band of each point [m], by name: prediction, and mean of the deviation
+        from it, if it is known.
+        """
+        if self._deviations is None:
+            return self.points_m
+        return {
+            name: each + self._deviations[0][:, k]
+            for k, (name, each) in enumerate(self.points_m.items())
+        }
 
     @cached_property
     def half_widths_m(self) -> dict[str, Array] | None:
-        """Half width (T, 3) of the 95 % band of each point [m], by name: all coordinates of all
-        points at all times are inside at once with a probability of at least 95 %. None if the
-        uncertainty is not known.
-
-        It is `band_factor` standard deviations, and the mean of the deviation to first order.
+        """Half width (T, 3) of the 95 % band of each point about `expected_m` [m], by name: at each
+        time each coordinate is inside with a probability of 95 %. None if it is not known.
         """
         if self._deviations is None:
             return None
-        mean_m, variances = self._deviations
-        half_m = np.abs(mean_m) + self.band_factor * np.sqrt(sum(variances.values()))
-        return dict(zip(self.points_m, np.moveaxis(half_m, 1, 0), strict=True))
-
-    @cached_property
-    def band_factor(self) -> float:
-        """Half width of the band in standard deviations for normal deviations: Šidák's bound for the
-        number of coordinates and times, whatever their correlation (JASA 62, 1967).
-        """
-        values = 3 * len(self.program.experiment.markers.names) * len(self.t_s)
-        return float(norm.ppf(0.5 + 0.5 * BAND ** (1 / values)))
+        half_m = NORMAL_95 * np.sqrt(sum(self._deviations[1].values()))
+        return {name: half_m[:, k] for k, name in enumerate(self.points_m)}
 
     @cached_property
     def band_contributions(self) -> tuple[BandContribution, ...]:
         """Contributions to the variance of the tracked coordinates, the largest first; empty if the
         uncertainty is not known.
         """
-        if not self.program.references or self._deviations is None:
+        if self._deviations is None:
             return ()
-        weights = np.zeros(self._deviations[0].shape)
-        points = [*self.points_m]
-        for reference in self.program.references:
-            counted = np.isfinite(reference.position_m)
-            weights[:, points.index(reference.name)] += counted / reference.sigma_m**2
+        weights, points = 0 * self._deviations[0], [*self.points_m]
+        for each in self.program.references:
+            counted = np.isfinite(each.position_m)
+            weights[:, points.index(each.name)] += counted / each.sigma_m**2
         parts = {name: float(np.sum(weights * v)) for name, v in self._deviations[1].items()}
         total = sum(parts.values())
         found = [BandContribution(name, part / total) for name, part in parts.items() if part > 0]

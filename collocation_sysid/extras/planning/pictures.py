@@ -109,10 +109,10 @@ def tracking_picture(plan: MotionPlan) -> Figure:
             alone = is_alone(wanted)  # of a reference at one time, for example
             panel.plot(plan.t_s[alone], wanted[alone], color=colour, ls="", marker="o", ms=3)
             if half_widths is not None:
-                half = 1e3 * half_widths[reference.name][:, axis]
-                panel.fill_between(
-                    plan.t_s, middle - half, middle + half, color=colour, alpha=0.2, lw=0
-                )
+                half = half_widths[reference.name][:, axis]
+                about = plan.expected_m[reference.name][:, axis] - points[0, axis]
+                ends = 1e3 * (about - half), 1e3 * (about + half)
+                panel.fill_between(plan.t_s, *ends, color=colour, alpha=0.2, lw=0)
         panel.axvline(plan.program.task.duration_s, color="black", lw=0.6, ls=":")
         style_axes(panel, "", xlabel="", ylabel=f"{reference.name} [mm]")
     panels[-1].set_xlabel("time [s]")
