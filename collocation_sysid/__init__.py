@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from .methods.interior_point import InteriorPoint
     from .methods.reduced_space import ReducedSpace
     from .methods.solution import Iteration, Solution, Status
-    from .methods.starts.continuation import Continuation
     from .model.parameters import FieldCoefficients, Parameter, Parameters, Tied, Unknown
     from .pipeline import Run, run
     from .problem import Problem, RolloutOptions, UncertaintyOptions
@@ -102,7 +101,6 @@ __all__ = [
     "Capsule",
     "Collocation",
     "Constant",
-    "Continuation",
     "CrossSection",
     "Cuboid",
     "CustomSensor",

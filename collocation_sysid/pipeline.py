@@ -27,24 +27,22 @@ from .methods.experiment_executors import connect_executor
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Method, Solution, Status, Watch
 from .methods.starts.initial_trajectories import simulate_trajectories
+from .methods.starts.start import Start
 from .problem import Problem
 from .program.collocation import Collocation
 from .recording.impact_steps import IMPACT_NOTE
-from .runs.check.cost import require_memory
+from .runs.branch_order import without_limitless_shares
+from .runs.cost import require_memory
 from .runs.expected_precision import with_measurements
 from .runs.forward_simulation import simulate_experiments, step_changes, step_error
 from .runs.mesh_resolution import mesh_changes
 from .runs.numerical_error import refine
 from .runs.result_builder import build_result
 from .runs.result_content import Elapsed, Result
+from .runs.searches import Searches
+from .runs.several_starts import BEYOND_BOUNDS
 from .runs.solved_problem import SolvedProblem
-from .runs.solving import (
-    AnyStart,
-    continued_beyond_bounds,
-    solve,
-    solve_with_renewed_correspondences,
-    with_workers,
-)
+from .runs.solving import AnyStart, solve
 from .statistics.assessment import impact_step_concerns, rotation_step_concerns
 from .statistics.budget.discretisation_error import (
     MESH_ORDER,
@@ -488,11 +486,10 @@ def _solve_from_parameters(
     if isinstance(solver, ReducedSpace):
         solver = replace(solver, tolerance=solver.tolerance_after_coarse)
     with connect_executor(scheduler) as workers:
-        method = with_workers(solver, workers)
-        solution = solve_with_renewed_correspondences(
-            method, collocation, watch=watch, start=collocation.pack(p, positions)
-        )
+        searches = Searches(solver, watch, workers)
+        solution = searches.once(Start(collocation, collocation.pack(p, positions)))
         if isinstance(solver, ReducedSpace):
             # Errors of coarse steps may have hidden that the best value is beyond a default bound.
-            solution = continued_beyond_bounds(method, solution, watch)
+            solution = searches.continued(solution, BEYOND_BOUNDS)
+            solution = without_limitless_shares(solution)
     return solution.unless_interrupted()

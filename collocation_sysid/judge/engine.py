@@ -13,14 +13,12 @@ import numpy as np
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
 from ..features.measurements import present
-from ..methods.reduced_search import UNLIMITED
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
-from ..methods.starts.continuation import first_samples
 from ..methods.starts.initial_trajectories import associated_at_guess
 from ..methods.starts.stiffness_scan import start_problem, without_guesses
 from ..recording.experiment import Experiment
-from ..recording.measurement_selection import measured_count
+from ..recording.measurement_selection import first_samples, measured_count
 from ..statistics.hypothesis import NO_CAUSE, Hypothesis, rank
 from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL
 from .fit import Corrected, TestedFit, discrepancy, has_trend, least_loss, thinned, with_corrected
@@ -283,10 +281,10 @@ class _Refits:
             max_iterations=max(FEWEST_SWEEPS, min(self.each, self.sweeps)),
             tolerance=TOLERANCE if self.stated[0].specimen is None else SPECIMEN_TOLERANCE,
             least_decrease=LEAST_DECREASE,
-            largest_loss=UNLIMITED
-            if stated is None
-            else REFUTED * max(1.0, stated.history[-1].loss),
         )
+        if stated is not None:
+            largest_loss = REFUTED * max(1.0, stated.history[-1].loss)
+            method = replace(method, largest_loss=largest_loss)
         collocation = self.whole.collocation
         experiments = with_corrected(self.stated, corrected)
         try:

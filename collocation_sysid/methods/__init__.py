@@ -12,7 +12,7 @@ Solvers
     compare with.
 Start
     `starts` contains what happens before a search: scans, closed forms, simulations at given
-    parameters, and searches of the first samples.
+    parameters.
 Common
     `solution` defines the protocol of methods and the result, `solve_recorder` the history
     and the answer after an interruption, `options` the construction of methods from
@@ -27,10 +27,14 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from ..errors import InputError, require_among
-from .comparison.casadi_nlp import refusal_reason
-from .starts.continuation import STAGES, Continuation
+from .comparison.casadi_nlp import Sleqp, SqpMethod, refusal_reason
+from .comparison.penalty import AugmentedLagrangian, Penalty
+from .comparison.shooting import Shooting
+from .interior_point import InteriorPoint
+from .reduced_space import ReducedSpace
 
-METHODS: dict[str, type] = STAGES | {Continuation.name: Continuation}
+_ALL = (InteriorPoint, ReducedSpace, Penalty, AugmentedLagrangian, Shooting, SqpMethod, Sleqp)
+METHODS: dict[str, type] = {kind.name: kind for kind in _ALL}
 
 
 def require_method(name: str, option: str) -> None:

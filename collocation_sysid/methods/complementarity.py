@@ -26,8 +26,6 @@ from .solution import Solution
 
 # Pressure times gap in each of the successive solves, in κδ².
 RELAXED = (1e-2, 1e-3, 1e-4)
-# Distance from an obstacle below which a face may touch it, in mean edges.
-REACH = 1.0
 # Solves a collocation from variables of its form with lifted variables.
 Solve = Callable[[Collocation, Array], Solution]
 
@@ -99,8 +97,8 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
     Returns
     -------
     list of Obstacle
-        One per obstacle, with the faces that come within `REACH` of their mean edges of it; an
-        obstacle that no face comes near is unchanged.
+        One per obstacle, with the faces that come within a mean edge of it; an obstacle that no face
+        comes near is unchanged.
     """
     obstacles = []
     mesh = experiment.body.mesh
@@ -108,7 +106,7 @@ def reachable_obstacles(experiment: Experiment, x: Array) -> list[Obstacle]:
         surface = contact.law_of_contact.surface
         faces = mesh.surface[surface.faces]
         gaps = smallest_gaps(contact, x).reshape(-1, surface.points_per_face).min(axis=1)
-        if len(reachable_faces := np.unique(faces[gaps < REACH * surface.edge_m])):
+        if len(reachable_faces := np.unique(faces[gaps < surface.edge_m])):
             obstacle = replace(obstacle, faces=Indices(mesh.file_index[reachable_faces].tolist()))
         obstacles.append(obstacle)
     return obstacles

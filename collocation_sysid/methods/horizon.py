@@ -23,7 +23,7 @@ from ..errors import SimulationError
 from ..program.collocation import Collocation
 from ..program.experiment_iterate import ExperimentIterate
 from ..program.least_squares import SquareRootInformation
-from ..program.linear_algebra.factorisation import ACCURACY, Choice
+from ..program.linear_algebra.factorisation import Choice
 from ..program.linear_algebra.lapack import one_blas_thread
 from ..program.stopwatch import Stopwatch
 from ..program.sweep import Sweep
@@ -134,7 +134,6 @@ class Horizon:
         p: Array,
         trajectories: Sequence[Any],
         known_iterate: Iterate | None = None,
-        accuracy: float = ACCURACY,
         previous: Iterate | None = None,
     ) -> Iterate:
         """Sweep all experiments at parameters p and trajectories x, and return the iterate.
@@ -151,8 +150,6 @@ class Horizon:
             Trajectories, one per experiment, with the rows of the horizon.
         known_iterate : Iterate, optional
             Iterate of the first rows at the same p and positions, which is continued.
-        accuracy : float
-            Relative accuracy of the solution of each time step, see `Sweep.forward`.
         previous : Iterate, optional
             Iterate from which changes are measured.
 
@@ -172,14 +169,11 @@ class Horizon:
             trajectories,
             known,
             previous.trajectories if previous else self._repeat(None),
-            self._repeat(accuracy),
         )
         return self._iterate_from(p, sweep_results)
 
     @one_blas_thread()
-    def evaluate_step(
-        self, p: Array, previous: Iterate, step: Array, accuracy: float = ACCURACY
-    ) -> Iterate:
+    def evaluate_step(self, p: Array, previous: Iterate, step: Array) -> Iterate:
         """Sweep all experiments after a step of the parameters, and return the new iterate.
 
         Static experiments are solved for their equilibria first, see
@@ -193,8 +187,6 @@ class Horizon:
             Iterate before the step.
         step : (np,) array
             Step of the parameters, along which the positions are extrapolated.
-        accuracy : float
-            Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
         Raises
         ------
@@ -210,7 +202,6 @@ class Horizon:
             self._by_experiment(p),
             previous.trajectories,
             self._by_experiment(step),
-            self._repeat(accuracy),
         )
         return self._iterate_from(p, sweep_results)
 

@@ -79,36 +79,43 @@ IPOPT_STATUS = {
 
 # Longest step of a parameter's logarithm while warming up.
 STEP_LIMIT = np.log(2.0)
-# A row without a pivot of its own on the diagonal waits for its columns' pivots, and fills the
-# factor on the way. With a constant there a step leaves a violation of that constant times the
-# change of the multipliers, which are some hundreds. So it must be small: with 1e-9 the fit of a
-# soft bar with unknown places gains a third of the remaining distance per iteration near the
-# optimum, and hardly moves far from it.
-ROW_PIVOT = 1e-11
-# That of slender bodies, whose rows of strains are steeper: with 1e-11 the growth of the factor
-# leaves the inertia wrong in nearly every iteration.
-SLENDER_ROW_PIVOT = 1e-8
-# Largest product of that constant with the largest curvature of the objective.
-ROW_SLOWNESS = 1e-9
-# Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
-# gives in place of zero.
-PIVOT_TOLERANCE = 1e-12
-# Near the optimum variables stay where they are, to this distance from their bounds.
-WARM_PUSH = 1e-9
-# Least multiplier of a bound there: with a logarithm of 20 from its bound, a fifth of the tolerance
-# of complementarity.
-WARM_MULTIPLIER = 1e-10
-# The barrier parameter begins there at this share of the tolerance, near where it ends.
-WARM_BARRIER = 0.1
-# Least tolerance for slender bodies: rounding errors of their positions, which the rigid sections
-# multiply, change the gradient by about 2e-8.
-SLENDER_TOLERANCE = 1e-7
-# Time that IPOPT is given at least, in which it begins and ends at once [s].
-SHORTEST_S = 1e-9
-# Smallest and largest factor by which one step changes the damping.
-DAMPING_CHANGE = (0.1, 10.0)
-# Share of the initial damping that is considered negligible.
-NO_DAMPING = 1e-2
+
+
+@dataclass(frozen=True)
+class IpoptPolicy:
+    """Accuracies of the matrices that IPOPT factorises, and of its start near an optimum."""
+
+    # A row without a pivot of its own on the diagonal waits for its columns' pivots, and fills the
+    # factor on the way. With a constant there a step leaves a violation of that constant times the
+    # change of the multipliers, which are some hundreds. So it must be small: with 1e-9 the fit of a
+    # soft bar with unknown places gains a third of the remaining distance per iteration near the
+    # optimum, and hardly moves far from it.
+    row_pivot: float = 1e-11
+    # That of slender bodies, whose rows of strains are steeper: with 1e-11 the growth of the factor
+    # leaves the inertia wrong in nearly every iteration.
+    slender_row_pivot: float = 1e-8
+    # Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
+    # gives in place of zero.
+    pivot_tolerance: float = 1e-12
+    # Number that is added to the diagonal entries of the Hessian that belong to positions, and to
+    # stresses of rods, most of which would otherwise be zero. It changes the steps slightly, but not
+    # the solution, and avoids factorisations that fail because of rounding (wrong inertia).
+    proximal: float = 1e-5
+    # Near the optimum variables stay where they are, to this distance from their bounds.
+    warm_push: float = 1e-9
+    # Least multiplier of a bound there: with a logarithm of 20 from its bound, a fifth of the
+    # tolerance of complementarity.
+    warm_multiplier: float = 1e-10
+    # The barrier parameter begins there at this share of the tolerance, near where it ends.
+    warm_barrier: float = 0.1
+    # Least tolerance for slender bodies: rounding errors of their positions, which the rigid sections
+    # multiply, change the gradient by about 2e-8.
+    slender_tolerance: float = 1e-7
+    # Eigenvalues of the reduced Hessian below this share of the largest are rounding.
+    smallest_curvature: float = 1e-12
+
+
+POLICY = IpoptPolicy()
 
 
 @validated
@@ -251,7 +258,8 @@ class InteriorPoint(MethodOptions):
 
         def settings(functions: NlpFunctions) -> dict[str, Any]:
             options = self._settings(functions, program, is_warm=is_warm)
-            remaining_s = max(SHORTEST_S, self.max_time_s - recorder.measure_elapsed_s())
+            # IPOPT refuses zero.
+            remaining_s = max(1e-9, self.max_time_s - recorder.measure_elapsed_s())
             return {"ipopt.max_wall_time": remaining_s} | options
 
         solution = nlpsol.solve(
@@ -283,7 +291,7 @@ class InteriorPoint(MethodOptions):
     ) -> dict[str, Any]:
         """Return the options except the time limit; those of the user replace the others."""
         is_slender = any(each.body.is_slender for each in program.transcriptions)
-        tolerance = max(self.tolerance, SLENDER_TOLERANCE * is_slender)
+        tolerance = max(self.tolerance, POLICY.slender_tolerance * is_slender)
         settings = nlpsol.ipopt_settings(
             functions, self.linear_solver, tolerance, self.max_iterations
         )
@@ -294,47 +302,30 @@ class InteriorPoint(MethodOptions):
         if is_warm:
             settings |= {
                 "ipopt.warm_start_init_point": "yes",
-                "ipopt.warm_start_bound_push": WARM_PUSH,
-                "ipopt.warm_start_bound_frac": WARM_PUSH,
-                "ipopt.warm_start_mult_bound_push": WARM_MULTIPLIER,
-                "ipopt.mu_init": WARM_BARRIER * tolerance,
+                "ipopt.warm_start_bound_push": POLICY.warm_push,
+                "ipopt.warm_start_bound_frac": POLICY.warm_push,
+                "ipopt.warm_start_mult_bound_push": POLICY.warm_multiplier,
+                "ipopt.mu_init": POLICY.warm_barrier * tolerance,
             }
         if self.linear_solver == "mumps":  # the matrix as it is: IPOPT refines
-            settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_pivtol": PIVOT_TOLERANCE}
+            settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_pivtol": POLICY.pivot_tolerance}
             settings["ipopt.mumps_pivot_order"] = AMD if is_slender else METIS
             if not (is_warm or is_slender or "mumps_pivot_order" in self.ipopt):
                 with_hessian = self.hessian != "limited-memory"
                 settings["ipopt.mumps_pivot_order"] = cheaper_ordering(program, with_hessian)
         if self.hessian == "limited-memory":
             settings["ipopt.hessian_approximation"] = "limited-memory"
-        sharpness = _largest_curvature(program)
         settings |= {
             # Rows of pressures are nearly dependent where a surface lies on another.
             "ipopt.perturb_always_cd": "no"
             if lifted_count(complete_program(program), "pressure")
             else "yes",
             "ipopt.jacobian_regularization_exponent": 0.0,
-            "ipopt.jacobian_regularization_value": SLENDER_ROW_PIVOT
+            "ipopt.jacobian_regularization_value": POLICY.slender_row_pivot
             if is_slender
-            else min(ROW_PIVOT, ROW_SLOWNESS / sharpness),
+            else POLICY.row_pivot,
         }
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
-
-
-def _largest_curvature(collocation: Collocation) -> float:
-    """Return about the largest curvature by a scaled position, of markers alone; at least 1."""
-    units = (
-        transcription.length_m / float(np.min(transcription.experiment.markers.sigma_m))
-        for transcription in collocation.transcriptions
-        if transcription.experiment.markers.names
-    )
-    return max(1.0, collocation.loss_scale * max((unit**2 for unit in units), default=0.0))
-
-
-# Number that is added to the diagonal entries of the Hessian that belong to positions, and to
-# stresses of rods, most of which would otherwise be zero. It changes the steps slightly, but not the
-# solution, and avoids factorisations that fail because of rounding (wrong inertia).
-PROXIMAL = 1e-5
 
 
 class _DampedHessian:
@@ -349,33 +340,27 @@ class _DampedHessian:
         self._damping = 1.0
 
     def __call__(self, z: Array, weight: float, multipliers: Array, values: Array) -> None:
-        """Write the upper triangle, with `PROXIMAL` on positions and, in warm-up, damping of q."""
+        """Write the upper triangle, with the proximal term and, in warm-up, damping of q."""
         is_settled = self._ends_warm_up(self.collocation.parameters_from(z))
         is_exact = self.options.hessian == "exact" and is_settled
         self.collocation.hessian_values(
             z, weight, multipliers=multipliers if is_exact else None, out=values
         )
         of_q, of_x = self.collocation.hessian_diagonals
-        values[of_x] += PROXIMAL
+        values[of_x] += POLICY.proximal
         if not is_settled:
             # With S = ∂r/∂q a step (SᵀS + κ) Δq = −Sᵀr is no longer than |r| / 2√κ.
             largest = self.collocation.objective(z) / (2 * STEP_LIMIT**2)
             values[of_q] += weight * self._damping * largest
 
     def _ends_warm_up(self, p: Array) -> bool:
-        """Whether the step is short and the damping negligible; both are updated."""
+        """Whether the step is short; the damping is updated."""
         steps = np.abs(p - self._last_p) / self.collocation.reach_p
         self._last_p = p
         of_q = steps[: self.collocation.nq].max(initial=0.0)
-        is_short = steps.max(initial=0.0) < self.options.warm_up and self._damping <= NO_DAMPING
         if np.isfinite(of_q):
-            change = np.clip((of_q / STEP_LIMIT) ** 2, *DAMPING_CHANGE)
-            self._damping = min(1.0, self._damping * change)
-        return self.options.warm_up == 0 or bool(is_short)
-
-
-# Eigenvalues of the reduced Hessian below this share of the largest are rounding.
-SMALLEST_CURVATURE = 1e-12
+            self._damping = min(1.0, self._damping * (of_q / STEP_LIMIT) ** 2)
+        return self.options.warm_up == 0 or bool(steps.max(initial=0.0) < self.options.warm_up)
 
 
 @dataclass(frozen=True)
@@ -393,7 +378,9 @@ class Certificate:
     @property
     def flat_count(self) -> int:
         """Number of eigenvalues that are not positive."""
-        return int(np.sum(self.curvatures <= SMALLEST_CURVATURE * self.curvatures.max(initial=0)))
+        return int(
+            np.sum(self.curvatures <= POLICY.smallest_curvature * self.curvatures.max(initial=0))
+        )
 
     @property
     def is_strict_minimum(self) -> bool:

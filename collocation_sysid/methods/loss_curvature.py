@@ -23,9 +23,6 @@ from ..program.sweep import Sweep
 from .horizon import Iterate
 from .solution import constraint_multipliers
 
-# B may not take more than this share of the curvature of SᵀS away in any direction.
-LARGEST_SHARE = 0.9
-
 
 def secant_update(curvature: Array, previous: Iterate, after: Iterate) -> Array:
     """Return B (np, np) after an accepted step, by the update of Dennis, Gay and Welsch; the given
@@ -69,9 +66,8 @@ def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootIn
     are kept, without the part of the residual that no step can reduce: losses of the result differ
     from the model's by a constant.
 
-    The problem is returned unchanged if B is zero, S is rank-deficient, B reduces the curvature too
-    much (`LARGEST_SHARE`), or B is so much larger than SᵀS that rounding makes their sum
-    indefinite.
+    The problem is returned unchanged if B is zero, S is rank-deficient, or their sum is not positive
+    definite.
 
     Parameters
     ----------
@@ -87,8 +83,6 @@ def with_curvature(fit: SquareRootInformation, curvature: Array) -> SquareRootIn
     half = solve_triangular(triangle, curvature, trans=1)
     relative = solve_triangular(triangle, half.T, trans=1)
     relative = (relative + relative.T) / 2
-    if np.linalg.eigvalsh(relative)[0] < -LARGEST_SHARE:
-        return fit
     try:
         factor = np.linalg.cholesky(np.eye(len(curvature)) + relative)
     except np.linalg.LinAlgError:

@@ -19,7 +19,7 @@ from ..common.array_types import Array
 from ..common.validated_classes import validated
 from ..common.validated_types import Count, NotNegative, Positive, Shares
 from ..errors import SimulationError
-from ..program.linear_algebra.factorisation import ACCURACY, Choice, Factoriser
+from ..program.linear_algebra.factorisation import Choice
 from .horizon import Horizon, Iterate, motion_shares, rows_of_share
 from .loss_curvature import exact_curvature, secant_update, with_curvature
 from .options import FEWEST, SHARES, MethodOptions
@@ -32,60 +32,57 @@ if TYPE_CHECKING:
     from ..program.transcription import Transcription
     from .experiment_executors import ExperimentExecutor
 
-# Infeasibility over an edge of the mesh up to which a trial is accepted: the strain that it causes is
-# then small enough for Newton's next step to remove it (the bound of a funnel: Gould & Toint, Math.
-# Program. 122, 2010; one that shrinks makes searches on wrong descriptions simulate every trial).
-FUNNEL = 0.1
-# Shares of the predicted decrease (Conn, Gould & Toint, Trust-Region Methods, 2000, section 6.1): the
-# smallest of an accepted trial, that below which the trust region shrinks, and that above which it
-# grows.
-DECREASE, POOR, GOOD = 1e-3, 0.25, 0.75
-# Length of the next trial over that of a rejected step.
-SHRINK = 0.25
-# Shortest step, at which a search ends.
-SMALLEST_TRUST = 1e-10
-# Largest trust region with unlabelled points, whose correspondences are valid only nearby.
-SEEING = 0.25
-# Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors.
-INSIGNIFICANT = 1e-6
-# So is one within so many times the tolerance of standard errors: 1e-3 by default, and at most. Losses
-# below 1, of data without noise, are to be known to that share.
-SIGNIFICANCE = 1e5
-# Share of the standard errors within which a smooth loss agrees with its quadratic model: a trial that
-# disagrees by more than a full step can gain there shows the noise of the loss (contact that opens and
-# closes, points that change to other faces, rounding; Sun & Nocedal, Math. Program. 202, 2023).
-NOISY = 0.3
-# Relative error of the loss by rounding.
-ROUND_OFF = 1e-12
-# Infeasibility over the body's size of an answer: its loss is accurate to a higher order.
-FEASIBLE = 1e-6
-# Largest residual of the equations of motion after the last step, in the scaling of the NLP.
-FEASIBLE_FORCE = 1e-10
-# Largest step within which the loss is about quadratic, so that the curvature is learned from it.
-LOCAL = 0.1
-# Relative accuracy of the solutions of the time steps after long steps of the parameters, in sweeps
-# of large bodies.
-ROUGH_ACCURACY = 1e-3
-# That accuracy after a short step, over the square of its length: the terms of second order that
-# Gauss–Newton neglects are larger.
-SECOND_ORDER_SHARE = 0.1
-# Highest relative accuracy of these solutions, over the tolerance: that of the parameters is
-# better, because only the part of the residuals that the model does not explain is multiplied by
-# the error.
-ACCURACY_SHARE = 0.01
-# Relative accuracy over the tolerance above which the point of a sweep is not the result.
-FINAL_ACCURACY_SHARE = 0.1
-# Larger than any loss.
-UNLIMITED = 1e100
-# The search on each share of a recording but the last ends when the next step is predicted to decrease
-# the loss by less than this fraction.
-RUNG_DECREASE = 0.05
-# Standard deviation of a prior of the logarithm of each parameter about its guess on these shares: a
-# short part of a recording does not determine all parameters, and those would move to their bounds.
-RUNG_PRIOR = 2.3
-# Largest number of rows of a share over that of the next one: a longer one would cost a simulation
-# and sweeps, and prepare nothing.
-LONGEST_RUNG = 0.7
+
+@dataclass(frozen=True)
+class SearchPolicy:
+    """When trials are accepted, and when the search ends.
+
+    The shares of the predicted decrease are those of Conn, Gould & Toint, Trust-Region Methods, 2000,
+    section 6.1; the bound of the infeasibility is that of a funnel (Gould & Toint, Math. Program.
+    122, 2010), and the noise of the loss is recognised as by Sun & Nocedal (Math. Program. 202, 2023).
+    """
+
+    # Infeasibility over an edge of the mesh up to which a trial is accepted: the strain that it causes
+    # is then small enough for Newton's next step to remove it. One that shrinks makes searches on
+    # wrong descriptions simulate every trial.
+    funnel: float = 0.1
+    # Shares of the predicted decrease: the smallest of an accepted trial, that below which the trust
+    # region shrinks, and that above which it grows.
+    decrease: float = 1e-3
+    poor: float = 0.25
+    good: float = 0.75
+    shrink: float = 0.25  # length of the next trial over that of a rejected step
+    # Rises of the loss by new associations before they are rejected: points that change to other faces
+    # make minima without them, and cycles with more.
+    most_rises: int = 5
+    # Largest trust region with unlabelled points, whose correspondences are valid only nearby.
+    seeing: float = 0.25
+    # Largest step within which the loss is about quadratic, so that the curvature is learned from it.
+    local: float = 0.1
+    # Largest decrease of the loss that is insignificant: the step is within 1e-3 standard errors.
+    insignificant: float = 1e-6
+    # Share of the standard errors within which a smooth loss agrees with its quadratic model: a trial
+    # that disagrees by more than a full step can gain there shows the noise of the loss (contact that
+    # opens and closes, points that change to other faces, rounding).
+    noisy: float = 0.3
+    round_off: float = 1e-12  # relative error of the loss by rounding
+    # Infeasibility over the body's size of an answer: its loss is accurate to a higher order.
+    feasible: float = 1e-6
+    # Largest residual of the equations of motion after the last step, in the scaling of the NLP.
+    feasible_force: float = 1e-10
+    # The search on each share of a recording but the last ends when the next step is predicted to
+    # decrease the loss by less than this fraction.
+    rung_decrease: float = 0.05
+    # Largest number of rows of a share over that of the next one: a longer one would cost a
+    # simulation and sweeps, and prepare nothing.
+    longest_rung: float = 0.7
+    # Standard deviation of a prior of the logarithm of each parameter about its guess on these shares:
+    # a short part of a recording does not determine all parameters, and those would move to their
+    # bounds.
+    rung_prior: float = 2.3
+
+
+POLICY = SearchPolicy()
 
 
 @validated
@@ -130,7 +127,7 @@ class SearchOptions(MethodOptions):
     max_iterations: Count = 200
     trust: Positive = 1.0
     ladder: Shares = SHARES
-    largest_loss: Positive = UNLIMITED
+    largest_loss: Positive = 1e100
     hessian: Literal["gauss-newton", "exact"] = "gauss-newton"
     factorisation: Choice = "auto"
 
@@ -150,8 +147,8 @@ class SearchState:
     trust: float  # longest step, relative to `ReducedSearch.reach`
     swept: float = np.inf  # step whose sweep is expected to leave the largest infeasibility
     rejections: int = 0  # in a row
+    rises: int = 0  # of the loss by new associations
     noise: float = 0.0  # actual less predicted decrease of the trial that was rejected last
-    is_rough: bool = False  # whether the sweep was too inaccurate for a result
 
 
 class ReducedSearch:
@@ -184,9 +181,6 @@ class ReducedSearch:
         short steps did, while a full step was longer than a standard error of a parameter.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
-    refines_solutions : bool
-        Whether sweeps can be done with less accuracy: those of large bodies, whose solutions are
-        refined.
     edge_m, size_m : float
         Mesh edge and body size [m].
 
@@ -218,16 +212,8 @@ class ReducedSearch:
         ]
         self.has_correspondences = bool(correspondences)
         self.has_unlabelled = not all(each.is_labelled for each in correspondences)
-        self.largest_trust = SEEING if self.has_unlabelled else np.inf
+        self.largest_trust = POLICY.seeing if self.has_unlabelled else np.inf
         self.indefinite_steps = 0
-        self.refines_solutions = not all(
-            Factoriser.cached(
-                transcription.experiment.sparsity,
-                transcription.free_dofs,
-                choice=options.factorisation,
-            ).skyline
-            for transcription in collocation.transcriptions
-        )
         self.lower, self.upper = collocation.parameter_bounds
         self.is_associated = True
         self.ended_by_association = False
@@ -260,8 +246,7 @@ class ReducedSearch:
         try:
             rows = [transcription.grid_times for transcription in self.collocation.transcriptions]
             horizon = self.horizon(rows, last=True)
-            accuracy = self._accuracy_at_start(horizon)
-            return self.minimise(horizon, is_last=True, accuracy=accuracy)
+            return self.minimise(horizon, is_last=True)
         except SimulationError:
             self.trajectories = self.point = None
             return None
@@ -280,8 +265,8 @@ class ReducedSearch:
         rungs: list[list[int]] = []
         for share in shares:
             rows = [rows_of_share(motion, share) for motion in motions]
-            shortest = sum(rungs[-1]) / LONGEST_RUNG if rungs else 0.0
-            if shortest <= sum(rows) <= LONGEST_RUNG * sum(every):
+            shortest = sum(rungs[-1]) / POLICY.longest_rung if rungs else 0.0
+            if shortest <= sum(rows) <= POLICY.longest_rung * sum(every):
                 rungs.append(rows)
         return [*rungs, every]
 
@@ -289,7 +274,7 @@ class ReducedSearch:
         """Return the problem on the given numbers of first rows of each experiment; unless it is
         the last horizon, with the prior of the options.
         """
-        prior = None if last else RUNG_PRIOR
+        prior = None if last else POLICY.rung_prior
         watch = self.recorder.stopwatch
         choice = self.options.factorisation
         return Horizon(
@@ -342,7 +327,7 @@ class ReducedSearch:
 
     # Steps on one horizon ---------------------------------------------------------------------
 
-    def minimise(self, horizon: Horizon, is_last: bool, accuracy: float = ACCURACY) -> Status:
+    def minimise(self, horizon: Horizon, is_last: bool) -> Status:
         """Take Gauss–Newton steps on one horizon until convergence, and return the status.
 
         It starts at `p` and `trajectories`, which must exist and have the rows of the horizon, and
@@ -357,9 +342,7 @@ class ReducedSearch:
             Problem on the first rows.
         is_last : bool
             Whether it is the complete problem. Otherwise the status is also that of convergence if
-            the predicted relative decrease of the loss is less than `RUNG_DECREASE`.
-        accuracy : float
-            Relative accuracy of the time steps' solutions in the first sweep.
+            the predicted relative decrease of the loss is less than `SearchPolicy.rung_decrease`.
 
         Raises
         ------
@@ -369,15 +352,12 @@ class ReducedSearch:
         """
         assert self.trajectories is not None
         self.ended_by_association = False
-        start = horizon.evaluate(
-            self.p, self.trajectories, known_iterate=self.point, accuracy=accuracy
-        )
-        point = self._accept(horizon, start)
+        start = horizon.evaluate(self.p, self.trajectories, known_iterate=self.point)
+        point = self._accept(self._reassociate(horizon, start))
         state = SearchState(
             point,
             np.zeros((len(point.p), len(point.p))),
             trust=min(self.options.trust, self.largest_trust),
-            is_rough=not self._is_final_accuracy(accuracy),
         )
         while True:
             step = self._next_step(state, state.trust)
@@ -395,30 +375,31 @@ class ReducedSearch:
         point, tolerance = state.point, self.options.tolerance
         length = self._step_length(step)
         # A step that the trust region shortens contains no information on the remaining distance.
-        is_full = length < 0.99 * state.trust and not state.is_rough
+        is_full = length < 0.99 * state.trust
         decrease = self._predicted(state, step)
-        share = decrease / max(point.loss, 1e-300)
+        fraction = decrease / max(point.loss, 1e-300)
         level = min(1.0, point.loss)  # data without noise are fitted more closely than their errors
-        insignificant = min(INSIGNIFICANT, (SIGNIFICANCE * tolerance) ** 2) * level
+        share = min(1.0, tolerance / SearchOptions.tolerance)
+        insignificant = share**2 * level * POLICY.insignificant
         is_small = is_full and (decrease <= insignificant or length <= tolerance)
         if is_last and is_small and self._ends(horizon, point, step):
             return Status.CONVERGED
-        if not is_last and share < RUNG_DECREASE:
+        if not is_last and fraction < POLICY.rung_decrease:
             return Status.CONVERGED
-        if is_full and share < self.options.least_decrease * min(1.0, length):
+        if is_full and fraction < self.options.least_decrease * min(1.0, length):
             return Status.CONVERGED
         if state.rejections:
             farthest = self._next_step(state, self.largest_trust)
             remaining = self._predicted(state, farthest)
-            noisy = NOISY * float(np.sqrt(insignificant / INSIGNIFICANT))
-            is_local = self._step_length(farthest) <= LOCAL and self._is_near(
+            noisy = share * float(np.sqrt(level)) * POLICY.noisy
+            is_local = self._step_length(farthest) <= POLICY.local and self._is_near(
                 point, farthest, noisy
             )
             is_noise = is_local and remaining <= state.noise
-            is_rounding = is_small or remaining <= max(insignificant, ROUND_OFF * point.loss)
-            if is_noise or is_rounding or state.trust <= SMALLEST_TRUST:
+            is_rounding = is_small or remaining <= max(insignificant, POLICY.round_off * point.loss)
+            if is_noise or is_rounding or state.trust <= tolerance:
                 point = self._settled(horizon, point)
-                is_feasible = point.feasibility_m <= FEASIBLE * self.size_m
+                is_feasible = point.feasibility_m <= POLICY.feasible * self.size_m
                 is_near = is_noise or is_rounding or self._is_near(point, farthest, 1.0)
                 self.ended_by_association = self.has_unlabelled and not is_near
                 is_answer = is_feasible and (is_near or self.has_unlabelled)
@@ -446,7 +427,7 @@ class ReducedSearch:
     def _settled(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return a point that is feasible: steps of the parameters would disturb it again."""
         for _ in range(2):
-            if point.feasibility_m > FEASIBLE * self.size_m:
+            if point.feasibility_m > POLICY.feasible * self.size_m:
                 point = self._make_feasible(horizon, point)
         return point
 
@@ -460,30 +441,36 @@ class ReducedSearch:
         state = replace(state, swept=swept)
         predicted = self._predicted(state, step)
         actual = -np.inf if trial is None else point.loss - trial.loss
-        rounding = ROUND_OFF * point.loss + 1e-20
-        if trial is not None and actual >= DECREASE * predicted - rounding:
+        rounding = POLICY.round_off * point.loss + 1e-20
+        if trial is not None and actual >= POLICY.decrease * predicted - rounding:
             trust = state.trust
-            if actual > GOOD * predicted and length > 0.9 * trust:
+            if actual > POLICY.good * predicted and length > 0.9 * trust:
                 trust = min(2.0 * trust, self.largest_trust)
-            elif actual < POOR * predicted - rounding:
-                trust = max(0.5 * length, SMALLEST_TRUST)
-            curvature = state.curvature
-            if is_last and length <= LOCAL:
-                curvature = self._update_curvature(curvature, point, after=trial)
-            return replace(
-                state,
-                point=self._accept(horizon, trial),
-                curvature=curvature,
-                trust=trust,
-                rejections=0,
-                is_rough=not self._is_final_accuracy(self._accuracy_after(length)),
-            )
-        if not state.rejections and point.feasibility_m > FEASIBLE * self.size_m:
+            elif actual < POLICY.poor * predicted - rounding:
+                trust = 0.5 * length
+            known, loss = (self.collocation, self.p), point.loss + self.collocation.excluded_loss
+            renewed = self._reassociate(horizon, trial)
+            actual = loss - renewed.loss - self.collocation.excluded_loss
+            has_risen = actual < -rounding
+            if not (has_risen and state.rises == POLICY.most_rises):
+                curvature = state.curvature
+                if is_last and length <= POLICY.local:
+                    curvature = self._update_curvature(curvature, point, after=trial)
+                return replace(
+                    state,
+                    point=self._accept(renewed),
+                    curvature=curvature,
+                    trust=trust,
+                    rejections=0,
+                    rises=state.rises + has_risen,
+                )
+            self._set_collocation(horizon, *known)
+        if not state.rejections and point.feasibility_m > POLICY.feasible * self.size_m:
             point = self._make_feasible(horizon, point)
         return replace(
             state,
             point=point,
-            trust=SHRINK * length,
+            trust=POLICY.shrink * length,
             rejections=state.rejections + 1,
             noise=abs(actual - predicted),
         )
@@ -527,13 +514,12 @@ class ReducedSearch:
         if length <= swept:
             self.sweeps += 1
             with suppress(SimulationError):
-                accuracy = self._accuracy_after(length)
-                trial = horizon.evaluate_step(p, point, step=step, accuracy=accuracy)
+                trial = horizon.evaluate_step(p, point, step=step)
         if trial is None:
             swept *= 2.0  # what left the funnel once need not leave it again
-        elif length and not trial.feasibility_m <= FUNNEL * self.edge_m:
+        elif length and not trial.feasibility_m <= POLICY.funnel * self.edge_m:
             # Infeasibility is of second order in the step.
-            share = np.sqrt(FUNNEL * self.edge_m / np.fmin(trial.feasibility_m, self.edge_m))
+            share = np.sqrt(POLICY.funnel * self.edge_m / np.fmin(trial.feasibility_m, self.edge_m))
             swept = share * length
             trial = None
         if not state.rejections:  # shorter steps will soon stay in the funnel
@@ -551,31 +537,6 @@ class ReducedSearch:
         except SimulationError:
             return None
 
-    def _accuracy_after(self, length: float) -> float:
-        """Return the relative accuracy of the sweep after a step of a length."""
-        if not self.refines_solutions:
-            return ACCURACY
-        highest = max(ACCURACY, ACCURACY_SHARE * self.options.tolerance)
-        return max(highest, min(ROUGH_ACCURACY, SECOND_ORDER_SHARE * length**2))
-
-    def _accuracy_at_start(self, horizon: Horizon) -> float:
-        """Low where positions violate the equations of motion, because steps follow then."""
-        if not self.refines_solutions:
-            return ACCURACY
-        assert self.trajectories is not None
-        reached = horizon.feasibilities(self.p, self.trajectories)
-        is_exact = self._are_feasible(reached)
-        return self._accuracy_after(0.0 if is_exact else np.inf)
-
-    def _is_final_accuracy(self, accuracy: float) -> bool:
-        """Whether a point whose sweep had a relative accuracy can be the result."""
-        tolerance = self.options.tolerance
-        return (
-            not self.refines_solutions
-            or accuracy <= ACCURACY
-            or accuracy <= FINAL_ACCURACY_SHARE * tolerance
-        )
-
     def _make_feasible(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the point after its feasibility step, or simulated if that is not halved."""
         # The loss of the projected trajectory is accurate to a higher order, so that trials are no
@@ -586,19 +547,19 @@ class ReducedSearch:
             refined = horizon.evaluate_step(point.p, point, step=np.zeros(len(point.p)))
         if refined is None or not refined.feasibility_m <= 0.5 * point.feasibility_m:
             return self._resimulated(horizon, point)
-        return self._accept(horizon, refined)
+        return self._accept(self._reassociate(horizon, refined))
 
     def _resimulated(self, horizon: Horizon, point: Iterate) -> Iterate:
         """Return the simulated point as the best so far; the point itself if that fails."""
         resimulated = self._simulated(horizon, point.p, point)
         if resimulated is None or not resimulated.is_finite:
             return point
-        return self._accept(horizon, resimulated)
+        return self._accept(self._reassociate(horizon, resimulated))
 
     def _are_feasible(self, reached: list[Feasibility]) -> bool:
-        """Whether each largest residual is at most `FEASIBLE_FORCE` times its `stiffness_n`."""
+        """Whether each largest residual is at most `SearchPolicy.feasible_force` times its `stiffness_n`."""
         return all(
-            each.violation_n <= FEASIBLE_FORCE * transcription.stiffness_n
+            each.violation_n <= POLICY.feasible_force * transcription.stiffness_n
             for each, transcription in zip(reached, self.collocation.transcriptions, strict=True)
         )
 
@@ -636,9 +597,9 @@ class ReducedSearch:
         self._set_collocation(horizon, collocation, p=p)
         return horizon.reassociate(p, point)
 
-    def _accept(self, horizon: Horizon, point: Iterate) -> Iterate:
-        """Make a point the best so far: associate its measurements, store and record it."""
-        self.point = point = self._reassociate(horizon, point)
+    def _accept(self, point: Iterate) -> Iterate:
+        """Make a point the best so far: store and record it."""
+        self.point = point
         self.indefinite_steps = sum(report.indefinite_steps for report in point.reports)
         self._record(point.p, point.trajectories, loss=point.loss, reached=point.reports)
         return point

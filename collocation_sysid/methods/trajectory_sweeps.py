@@ -21,7 +21,6 @@ from ..program.forward.newton_linearisation import LaggedStress
 from ..program.forward.newton_solver import NewtonOptions
 from ..program.forward.scheme_simulation import continue_simulation
 from ..program.least_squares import SquareRootInformation
-from ..program.linear_algebra.factorisation import ACCURACY
 from ..program.measurement_residual import huber_as_least_squares
 from ..program.observable_response import ObservableResponse
 from ..program.sweep import Sweep, SweepResult
@@ -109,7 +108,6 @@ def sweep(
     trajectory: LinearisedTrajectory | SimulationResult | Array,
     known_sweep: LinearisedTrajectory | None = None,
     previous: LinearisedTrajectory | None = None,
-    accuracy: float = ACCURACY,
     resultants: Array | None = None,
 ) -> LinearisedTrajectory:
     """Return the result of one sweep at parameters p and given positions: the feasibility step, the
@@ -130,8 +128,6 @@ def sweep(
     previous : LinearisedTrajectory, optional
         Previous trajectory, from which changes are measured; without one they are zero. Its
         sensitivities are the first guess of solutions that are refined.
-    accuracy : float
-        Relative accuracy of the solution of each time step, see `Sweep.forward`.
     resultants : array, optional
         See `Sweep.forward`.
 
@@ -147,12 +143,7 @@ def sweep(
     return _linearised_trajectory(
         part,
         solver.forward(
-            part.x,
-            part.equations,
-            known=known_sweep,
-            accuracy=accuracy,
-            similar=previous,
-            resultants=resultants,
+            part.x, part.equations, known=known_sweep, similar=previous, resultants=resultants
         ),
         previous=previous,
         times_s=solver.stopwatch.read_and_reset(),
@@ -165,7 +156,6 @@ def sweep_after_step(
     p: Array,
     previous: LinearisedTrajectory,
     step: Array,
-    accuracy: float = ACCURACY,
 ) -> LinearisedTrajectory:
     """Return the result of one sweep after a step of the parameters to p.
 
@@ -184,8 +174,6 @@ def sweep_after_step(
         Trajectory before the step.
     step : (k,) array
         Step of the parameters.
-    accuracy : float
-        Relative accuracy of the solution of each time step, see `Sweep.forward`.
 
     Raises
     ------
@@ -199,7 +187,7 @@ def sweep_after_step(
     part = _iterate(transcription, p, x=x)
     dynamics = part.equations.dynamics
 
-    sweep_from = partial(sweep, solver, transcription, p, previous=previous, accuracy=accuracy)
+    sweep_from = partial(sweep, solver, transcription, p, previous=previous)
 
     def equilibria(options: NewtonOptions) -> Array | None:
         """Return the equilibria near the extrapolated positions; None if one is not found."""

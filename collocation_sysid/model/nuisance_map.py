@@ -508,15 +508,20 @@ class NuisanceMap(RecordingQuantities):
         return point
 
     def grasp_motion_matrix(self, phi: Array, number: int | None = None) -> Array:
-        """Return the motion H C at φ (k,) of the grasp with an index, by default H alone, as a matrix
-        (4, 4), [[R, p], [0, 1]], with p in metres; the identity if it is not estimated.
+        """Return the motion H C at φ (…, k) of the grasp with an index, by default H alone, as a
+        matrix (…, 4, 4), [[R, p], [0, 1]], with p in metres; the identity if it is not estimated.
         """
-        points = np.hstack([np.zeros((3, 1)), np.eye(3)])
+        data = self.grasp_motion_data(np.eye(3, 4), number)
+        u = np.moveaxis(phi[..., self.grasp_indices], -1, 0)[..., None]
+        shape = (*phi.shape[:-1], 4)
         images = self.grasp_motion.evaluate(
-            phi[self.grasp_indices], self.grasp_motion_data(points, number)
+            np.broadcast_to(u, (len(u), *shape)),
+            np.broadcast_to(data.reshape(-1, *(1 for _ in shape[1:]), 4), (len(data), *shape)),
         )
-        matrix = np.eye(4)
-        matrix[:3] = np.column_stack([images[:, 1:] - images[:, :1], images[:, 0]])
+        matrix = np.zeros((*shape, 4))
+        matrix[..., :3, :] = np.moveaxis(images, 0, -2)
+        matrix[..., :3, :3] -= matrix[..., :3, 3:]
+        matrix[..., 3, 3] = 1.0
         return matrix
 
     def gravity(self, phi: Array) -> Array:

@@ -23,7 +23,6 @@ from ..methods.interior_point import InteriorPoint
 from ..methods.options import MethodOptions, method_from_options
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Method
-from ..methods.starts.continuation import Continuation
 
 OPTIONS = {method: [field.name for field in fields(kind)] for method, kind in METHODS.items()}
 DEFAULT = "reduced-space"
@@ -90,9 +89,6 @@ class SolverSection(Section):
     shooting: Annotated[Shooting | None, OptionTable(Shooting)] = _method_key(Shooting)
     casadi_sqpmethod: Annotated[SqpMethod | None, OptionTable(SqpMethod)] = _method_key(SqpMethod)
     casadi_sleqp: Annotated[Sleqp | None, OptionTable(Sleqp)] = _method_key(Sleqp)
-    continuation: Annotated[Continuation | None, OptionTable(Continuation)] = _method_key(
-        Continuation
-    )
 
     @model_validator(mode="before")
     @classmethod

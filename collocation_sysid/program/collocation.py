@@ -356,6 +356,19 @@ class Collocation:
 
     # Where recordings are read ----------------------------------------------------------------
 
+    @property
+    def excluded_loss(self) -> float:
+        """Loss of measurements that the present correspondences exclude.
+
+        A loss leaves out points beyond the gate of a camera: compared by it, the point that loses
+        most of them would seem the best.
+        """
+        return sum(
+            model.excluded_loss
+            for transcription in self.transcriptions
+            for model in transcription.main_residuals
+        )
+
     def follow_estimates(
         self, p: Array, positions: Sequence[Array] = ()
     ) -> tuple[Collocation, Array]:

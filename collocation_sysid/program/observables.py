@@ -132,7 +132,17 @@ class PointPositions:
         """Return the indices of the npe nodes of each point's element (e, npe), and the shape
         functions with their derivatives at the places estimated by φ (k,).
         """
-        return self.association.shape_functions(np.append(phi, 0.0)[self.coordinate_parameters])
+        places = np.append(phi, 0.0)[self.coordinate_parameters]
+        key = places.tobytes()
+        if key not in self._last_shapes:
+            self._last_shapes.clear()
+            self._last_shapes[key] = self.association.shape_functions(places)
+        return self._last_shapes[key]
+
+    @cached_property
+    def _last_shapes(self) -> dict[bytes, tuple[Index, ShapeFunctions]]:
+        """Result of `shape_functions` at the last coordinates: motions are compared at equal ones."""
+        return {}
 
     def operator(self, phi: Array) -> sp.csr_array:
         """Return the matrix H (3e, 3n) from positions to points at φ (k,); row 3 m + axis,

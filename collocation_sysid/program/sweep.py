@@ -41,7 +41,7 @@ from ..model.internal_variables import AnyHistory
 from ..model.viscoelasticity import MemoryForwardColumns
 from .forward.retraction import Retraction
 from .linear_algebra.block_band import Submatrix
-from .linear_algebra.factorisation import ACCURACY, Choice, Factor, Factoriser
+from .linear_algebra.factorisation import Choice, Factor, Factoriser
 from .linear_algebra.lapack import one_blas_thread
 from .linear_algebra.reused_factor import (
     MEASURED_COLUMNS,
@@ -333,7 +333,6 @@ class Sweep:
         x: Array,
         equations: EquationsAtParameters,
         known: SweepResult | None = None,
-        accuracy: float = ACCURACY,
         similar: SweepResult | None = None,
         resultants: Array | None = None,
     ) -> SweepResult:
@@ -348,9 +347,6 @@ class Sweep:
         known : SweepResult, optional
             Result for the first rows at the same positions and parameters; it is continued, not
             modified.
-        accuracy : float
-            Relative accuracy of the solution of each time step where it is refined, as for large
-            bodies; others have that of the arithmetic.
         similar : SweepResult, optional
             Result at other parameters and positions, not modified. Its sensitivities are the first
             guess of solutions that are refined, which need fewer corrections then.
@@ -371,7 +367,6 @@ class Sweep:
             sweep_columns,
             last=known.last if known else None,
             grasp_forces=grasp_forces,
-            accuracy=accuracy,
             similar=None if similar is None else similar.by_p,
             resultants=resultants,
         )
@@ -599,7 +594,6 @@ class Sweep:
         backward: bool = False,
         first: int = 0,
         histories: Sequence[AnyHistory] = (),
-        accuracy: float = ACCURACY,
         resultants: Array | None = None,
     ) -> Iterator[tuple[slice, Linearisation, list[FactorisedStep]]]:
         """Iterate over the linearised and factorised time steps, a few at a time, using threads:
@@ -620,8 +614,6 @@ class Sweep:
             Index of the grid time to begin with; rows without an equation are skipped.
         histories : sequence of histories
             History variables at x; empty if there are none.
-        accuracy : float
-            Relative accuracy of solutions that are refined.
         resultants : (N − first row, any) array, optional
             See `forward`.
 
@@ -634,9 +626,7 @@ class Sweep:
         xi, nu = dynamics.evaluation_states(x)
         starts = range(max(first, dynamics.first_row), dynamics.row_count, self.choose_chunk_rows())
         sequence = (
-            FactorSequence(
-                self.factoriser, NodeRotation(self.free, self.pattern.size // 3), accuracy=accuracy
-            )
+            FactorSequence(self.factoriser, NodeRotation(self.free, self.pattern.size // 3))
             if self.reuses_factors
             else None
         )
@@ -666,11 +656,7 @@ class Sweep:
                 )
                 factors: Sequence[Factor] = (
                     self._factorise(
-                        matrix,
-                        len(rows),
-                        time_s=float(dynamics.t_s[start]),
-                        buffers=buffers,
-                        accuracy=accuracy,
+                        matrix, len(rows), time_s=float(dynamics.t_s[start]), buffers=buffers
                     )
                     if sequence is None
                     else [
@@ -697,7 +683,6 @@ class Sweep:
         count: int,
         time_s: float,
         buffers: Sequence[FactorMemory | None] = (),
-        accuracy: float = ACCURACY,
     ) -> list[Factor]:
         """Return the factors of −∂c_t/∂x_t of some rows, computed on several threads."""
         try:
@@ -707,7 +692,6 @@ class Sweep:
                 threads=self.body.threads,
                 buffers=buffers,
                 is_single=self.has_single_precision,
-                accuracy=accuracy,
             )
         except np.linalg.LinAlgError as error:
             raise self._singular(error, time_s) from error
@@ -770,8 +754,6 @@ class ForwardSubstitution:
         State after earlier rows; by default there are none.
     grasp_forces : GraspForces, optional
         Filled in place with the forces on instrumented grasps; ignored if there are none.
-    accuracy : float
-        Relative accuracy of the solution of each row where it is refined.
     similar : (N, 3n, m) array, optional
         Sensitivities at other parameters, as a guess of the last m columns; not modified.
     resultants : (N − first row, any) array, optional
@@ -784,13 +766,11 @@ class ForwardSubstitution:
         columns: SweepColumns,
         last: ForwardState | None = None,
         grasp_forces: GraspForces | None = None,
-        accuracy: float = ACCURACY,
         similar: Array | None = None,
         resultants: Array | None = None,
     ) -> None:
         self.solver = solver
         self._resultants = resultants
-        self.accuracy = accuracy
         self._similar = similar
         # Solutions of the last rows minus similar ones, latest first.
         self._deviations = deque[Array](maxlen=len(EXTRAPOLATION) - 1)
@@ -862,12 +842,7 @@ class ForwardSubstitution:
             self.past.appendleft(start)
             yield np.zeros(self.shape) if columns.start_m is None else start
         for rows, linearisation, steps in solver.chunks(
-            x,
-            setting,
-            first=done,
-            histories=histories,
-            accuracy=self.accuracy,
-            resultants=self._resultants,
+            x, setting, first=done, histories=histories, resultants=self._resultants
         ):
             residual = None
             if columns.has_step:

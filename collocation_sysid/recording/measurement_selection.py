@@ -26,6 +26,20 @@ NOISE_OF_CURVATURE = 2.5
 FEWEST_PLACEHOLDERS = 3
 
 
+def first_samples(experiment: Experiment, count: int) -> Experiment:
+    """Return the experiment with its first samples, see `shortened_experiment`.
+
+    Parameters
+    ----------
+    count : int
+        Number of samples; it is increased to three and to the first sample with a marker, and as in
+        `shortened_experiment`, but not beyond the recording.
+    """
+    first_visible = experiment.markers.first_visible_sample
+    count = max(count, first_visible + 1, FEWEST_SHARED_SAMPLES)
+    return shortened_experiment(experiment, min(len(experiment.t_s), count))
+
+
 def shortened_experiment(
     experiment: Experiment, count: int, *, shortens_sensors: bool = False
 ) -> Experiment:

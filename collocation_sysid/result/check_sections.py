@@ -15,7 +15,7 @@ from ..common.display import Line, Shown, Table, duration, labelled, quantity
 from ..fem.laws.constants import symbol_of, unit_of
 from ..runs.check import BodyCheck, CheckResult, GraspCheck, QuickCheck, RecordingCheck
 from ..runs.check.body import grasp_sentence
-from ..runs.check.cost import MethodCost
+from ..runs.cost import MethodCost
 from .run_sections import remedy_command
 
 # Natural modes in the table, lowest first.

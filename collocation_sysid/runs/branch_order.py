@@ -1,11 +1,15 @@
-"""Order of the branches of a memory, which a search without guesses does not know."""
+"""What a search does not know of the branches of a memory: their order, and that a share without limit
+is that of a liquid.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..fem.laws.constants import SHARE, TAU
+import numpy as np
+
+from ..fem.laws.constants import SHARE, TAU, is_limitless
 from ..methods.solution import Solution
 from ..model.parameters import Parameters
 
@@ -44,6 +48,31 @@ def with_ascending_times(solution: Solution, stated: Parameters) -> Solution:
     ]
     collocation = solution.collocation.with_parameters(parameters)
     return replace(solution, collocation=collocation, z=z, history=history)
+
+
+def without_limitless_shares(solution: Solution) -> Solution:
+    """Return the solution with the shares of memory fixed that grew to their largest value: of a
+    liquid the data determine E (1 + Σg), the instantaneous modulus, and neither factor.
+    """
+    collocation = solution.collocation
+    values = solution.parameters
+    is_fixed = [is_limitless(item.name, values[item.name]) for item in collocation.parameters.free]
+    if not (any(is_fixed) and solution.status.converged):
+        return solution
+    names = [
+        n.name for n, fixed in zip(collocation.parameters.free, is_fixed, strict=True) if fixed
+    ]
+    parameters = collocation.parameters.map_components(
+        lambda item: (
+            replace(item, guess=values[item.name], is_fixed=True) if item.name in names else item
+        )
+    )
+    fixed = np.flatnonzero(is_fixed)
+    return replace(
+        solution,
+        collocation=collocation.with_parameters(parameters),
+        z=np.delete(solution.z, fixed),
+    )
 
 
 def _alike_branches(solution: Solution, stated: Parameters) -> Iterator[list[tuple[str, str]]]:

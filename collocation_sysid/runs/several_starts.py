@@ -1,13 +1,12 @@
-"""Solves from several stiffnesses of a scan, where there may be local minima.
+"""Starts that may lead to a better solution than the best so far, see `searches`.
 
-Points measured by a camera are associated with the nearest part of the surface: a body that is too
-soft, with the camera turned to match, can be a local minimum of the loss. So the scan's best
-stiffness and those next to it are all followed to convergence, or to a minimum that is already
-known, and the solution with the lowest loss counts. Without correspondences that is done where the
-first solution needs an error of a pose or clock that nobody makes.
-
-A second search starts where the first one may have ended in the worse of several optima:
-
+- *Other stiffnesses of a scan*: points measured by a camera are associated with the nearest part of the
+  surface; a body that is too soft, with the camera turned to match, can be a local minimum of the loss.
+  So those next to the scan's best are searched, too, and of bodies that touch obstacles, whose impacts
+  make other minima; of others where the best solution needs an error of a pose or clock that nobody
+  makes.
+- *Stated guesses* where the scan fits better, and *the best of a scan* where the search from guesses
+  failed.
 - *Poisson's ratio near one half*: linear elements lock towards ν = ½, so that with a smaller
   modulus and a ratio near one half a body can move almost like a stiffer, compressible one.
 - *Laws in powers of the stretches*: with every order and every sign of the exponents there is
@@ -21,105 +20,59 @@ A second search starts where the first one may have ended in the worse of severa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from ..common.array_types import Array
 from ..fem.laws.constants import (
     SHARE,
     USUAL_EXPONENTS,
     constant_named,
-    is_limitless,
     is_modulus,
     usual_value,
     without_region,
 )
-from ..methods.reduced_space import ReducedSpace
-from ..methods.solution import Iteration, Method, Solution, Watch
-from ..methods.starts.initial_trajectories import associated_at_guess
+from ..methods.solution import Solution, Status
 from ..methods.starts.power_law import power_law_start
 from ..methods.starts.start import Start
-from ..methods.starts.stiffness_scan import Scan
-from ..model.parameters import Parameter, Parameters, can_be_widened, with_widest_bounds
-from ..program.collocation import Collocation
+from ..methods.starts.stiffness_scan import rescue
+from ..model.parameters import Parameter, can_be_widened, with_widest_bounds
 from ..statistics.linearised import AT_BOUND, parameter_values
+from .searches import NextStart, has_correspondences
 
-# Difference of losses below which two solutions are the same minimum with other correspondences:
-# in simulated recordings they differ by up to 5.
-SAME_LOSS = 10.0
-# Relative difference of all parameters below which a search with such a loss is where another one
-# was, and need not continue. A first share of a recording determines them to several per cent.
-SAME_PARAMETERS = 0.1
 # Estimate of an error, in standard deviations of its prior, that makes a solution doubtful.
 UNLIKELY = 4.5
-Solve = Callable[[Method, Collocation], Solution]
+# Outcomes of a failed search, after which another start may help.
+FAILED_STATUSES = (
+    Status.INFEASIBLE,
+    Status.STALLED,
+    Status.DIVERGED,
+    Status.NUMERICAL_FAILURE,
+    Status.NOT_SIMULABLE,
+)
 
 
-def has_local_minima(collocation: Collocation) -> bool:
-    """Return whether a fitted experiment has correspondences, which change during the search and
-    can make local minima.
-    """
-    return any(
-        transcription.association.correspondences for transcription in collocation.transcriptions
-    )
+def of_scan(first: Start) -> list[NextStart]:
+    """Return the other stiffnesses of the scan of a start, and the stated guesses."""
+    others = () if first.scan is None else first.scan.others
+    return [
+        *(partial(_other_stiffness, first, number) for number in others),
+        lambda _: first.stated and Start(first.stated, note="the search from the stated guess"),
+    ]
 
 
-def robust_loss(solution: Solution) -> float:
-    """Return the loss with priors and with that of the measurements that the fit excludes.
-
-    The loss of a solution leaves out points beyond the gate of a camera: compared by it, the
-    solution that loses most points would seem the best.
-    """
-    collocation = solution.collocation
-    p, _ = collocation.unpack(solution.z)
-    prior, _ = collocation.prior_residuals(p)
-    excluded_loss = sum(
-        model.excluded_loss
-        for part in solution.parts
-        for model in part.transcription.main_residuals
-    )
-    return sum(part.loss for part in solution.parts) + float(prior @ prior) + excluded_loss
-
-
-class KnownMinimum(Exception):
-    """A search has arrived where another one was."""
-
-    def __init__(self, solution: Solution) -> None:
-        super().__init__()
-        self.solution = solution
-
-
-def until_known(method: Method, known: Sequence[Solution]) -> Method:
-    """Return a method that raises `KnownMinimum` at an iterate of the search for a known solution."""
-
-    def solve(
-        collocation: Collocation, watch: Watch | None = None, start: Array | None = None
-    ) -> Solution:
-        def watch_for_known(line: Iteration) -> None:
-            """Pass an entry of the history to `watch`, then compare it with the known solutions."""
-            if watch is not None:
-                watch(line)
-            for solution in known:
-                if _is_at(line, solution):
-                    raise KnownMinimum(solution)
-
-        return method(collocation, watch_for_known, start)
-
-    return solve if known else method
-
-
-def _is_at(line: Iteration, solution: Solution) -> bool:
-    return any(
-        line.share == known.share
-        and abs(line.loss - known.loss) <= SAME_LOSS
-        and all(
-            np.isclose(value, known.parameters[name], rtol=SAME_PARAMETERS, atol=0)
-            for name, value in line.parameters.items()
-        )
-        for known in solution.history
-    )
+def _other_stiffness(first: Start, number: int, best: Solution) -> Start | None:
+    """None where the best solution is no local minimum."""
+    is_unlikely = best.status.converged and not _is_likely(best)
+    has_contact = any(each.experiment.obstacles for each in best.collocation.transcriptions)
+    if not (is_unlikely or has_contact or has_correspondences(best.collocation)):
+        return None
+    assert first.scan is not None
+    scan = replace(first.scan, best=number, parameters=first.scan.starts[number])
+    note = f"the search from E = {scan.young_pa[number]:.3g} Pa"
+    return Start(first.collocation.with_parameters(scan.parameters), note=note, scan=scan)
 
 
 def _is_likely(solution: Solution) -> bool:
@@ -127,100 +80,27 @@ def _is_likely(solution: Solution) -> bool:
     return bool((np.abs(p[solution.collocation.nq :]) <= UNLIKELY).all())
 
 
-def follow_starts(
-    solver: Method, start: Start, scan: Scan, solve: Solve
-) -> tuple[Start, Solution | None]:
-    """Follow the starts of a scan to convergence and return the one with the lowest `robust_loss`.
-
-    Without local minima the first solution counts, unless one of its nuisance parameters is above
-    `UNLIKELY`. The best start of the scan, `start`, is returned without a solution if the scan found
-    only one start, or no start converges. Exceptions of `solve` are not caught.
-
-    Parameters
-    ----------
-    solver : Method
-        If this is not the reduced-space method, the starts are followed in reduced space, which is
-        much faster, and the result has no solution: the solver goes on from the best start.
-    start : Start
-        With the guesses of the scan's best stiffness.
-    solve : callable
-        ``solve(method, collocation)``, with renewed correspondences.
-
-    Returns
-    -------
-    (start, solution)
-        The best start, not associated with the body there, with the scan that has it as its best and
-        a note on the losses; and the solution from there if the method is reduced space.
+def after_failure(failed: Solution, is_complete: bool) -> Start | None:
+    """Return the best stiffness of a scan after a search from guesses failed; with `is_complete` one
+    at which the complete recordings can be simulated.
     """
-    collocation = start.collocation
-    if not scan.others:
-        return start, None
-    is_unique = not has_local_minima(collocation)
-    own = getattr(solver, "name", getattr(getattr(solver, "func", None), "name", ""))
-    is_own = own == ReducedSpace.name
-    if is_unique and not is_own:
-        return start, None
-    method: Method = solver if is_own else ReducedSpace()
-    candidates: list[tuple[float, int, Solution]] = []
-    for number in (scan.best, *scan.others):
-        started = collocation
-        if number != scan.best:
-            started = collocation.with_parameters(scan.starts[number])
-        if is_unique:  # otherwise the search associates cameras with its first shape itself
-            started = associated_at_guess(started)
-        try:
-            solution = solve(until_known(method, [each for *_, each in candidates]), started)
-        except KnownMinimum as known:
-            candidates.append((robust_loss(known.solution), number, known.solution))
-            continue
-        if solution.status.converged:
-            candidates.append((robust_loss(solution), number, solution))
-        if is_unique and (not candidates or _is_likely(solution)):
-            break
-    if is_unique and len(candidates) < 2:
-        return start, candidates[0][-1] if candidates else solution
-    if not candidates:
-        return start, None
-    loss, best, solution = min(candidates, key=lambda each: each[0])
-    losses = ", ".join(
-        f"{each:.4g} from E = {scan.young_pa[number]:.3g} Pa" for each, number, _ in candidates
-    )
-    note = (
-        f"{len(candidates)} initial values of the scan were solved to the end, or to a minimum that "
-        f"another one had reached, with the losses {losses}"
-    )
-    if max(each for each, _, _ in candidates) - loss > SAME_LOSS:
-        note += ": there are local minima; the lowest one is reported"
-    chosen = replace(scan, best=best, parameters=scan.starts[best])
-    started = collocation.with_parameters(scan.starts[best])
-    chosen_start = replace(start, collocation=started, note=note, scan=chosen)
-    return chosen_start, solution if is_own else None
+    if failed.scan is not None or failed.status not in FAILED_STATUSES:
+        return None
+    reason = f"the search from the guess failed ({failed.status.value})"
+    scan = rescue(failed.collocation, reason, is_complete=is_complete)
+    if scan is None:
+        return None
+    note = "a search from the best stiffness of a scan"
+    return Start(failed.collocation.with_parameters(scan.parameters), note=note, scan=scan)
 
 
 # Poisson's ratio above which a second search starts from the usual one at the same Young's modulus.
 # Smaller ratios do not lock.
 NEARLY_INCOMPRESSIBLE = 0.42
-# Poisson's ratio of that start.
-USUAL_POISSON = 0.3
 # Names of the constants that determine Young's modulus and Poisson's ratio, two of them at a time.
 LAME = ("young_pa", "poisson", "lambda_pa", "mu_pa")
-# Least difference of an exponent, relative to one plus its size, of another optimum, and least
-# share of χ² by which that is better.
-OTHER_EXPONENT = 0.05
+# Least share of χ² by which another optimum is better.
 LEAST_SHARE = 0.01
-# Least share of a branch of memory, whose logarithm is estimated beyond the default bound.
-LITTLE_MEMORY = 1e-3
-
-
-def second_start(solution: Solution) -> Start | None:
-    """Return the start of a second search after a solution; None if a worse optimum is unlikely.
-
-    The note of a second start says why there is one: a sentence without its predicate.
-    """
-    start = _usual_poisson_start(solution)
-    if start is None and all(part.transcription.experiment.specimen for part in solution.parts):
-        return _power_law_start(solution)
-    return start
 
 
 def start_beyond_bounds(solution: Solution) -> Start | None:
@@ -255,28 +135,10 @@ def start_beyond_bounds(solution: Solution) -> Start | None:
     wider = parameters.map_components(lambda item: _widened(item, values, ended, locks))
     return Start(
         solution.collocation.with_parameters(wider.with_estimates(values)),
+        scan=solution.scan,
         note=f"the search ended at the default bound{'s' * (len(ended) > 1)} {listed}; a second one, "
         "with wider bounds,",
     )
-
-
-def without_limitless_shares(solution: Solution) -> Parameters | None:
-    """Return the estimates of a solution with the shares of memory fixed that grew to their largest
-    value; None if there are none.
-
-    Of a liquid the data determine E (1 + Σg), the instantaneous modulus, and neither factor.
-    """
-    parameters = solution.collocation.parameters
-    values = parameter_values(solution.collocation, solution.q)
-    fixed = {
-        item.name: replace(item, guess=values[item.name], is_fixed=True)
-        for item in parameters.free
-        if is_limitless(item.name, values[item.name])
-    }
-    if not fixed:
-        return None
-    known = {item.name: values[item.name] for item in parameters.free}
-    return parameters.with_estimates(known).map_components(lambda item: fixed.get(item.name, item))
 
 
 def _is_nearly_half(name: str, value: float) -> bool:
@@ -313,7 +175,7 @@ def _widened(
     if locks and _is_nearly_half(item.name, item.upper):
         widened = replace(widened, upper=item.upper)
     if is_share and widened is not item:
-        lower = max(widened.lower, LITTLE_MEMORY)
+        lower = max(widened.lower, 1e-3)  # whose logarithm is finite
         return replace(widened, lower=lower, scale="log", unit=1.0)
     if widened is not item and constant_named(item.name).may_be_negative and item.scale == "log":
         value = values[item.name]
@@ -323,8 +185,10 @@ def _widened(
     return widened
 
 
-def _usual_poisson_start(solution: Solution) -> Start | None:
-    """Keep Young's modulus, where a ratio above `NEARLY_INCOMPRESSIBLE` is estimated."""
+def usual_poisson_start(solution: Solution) -> Start | None:
+    """Return a start from the usual Poisson's ratio, with the same Young's modulus, where a ratio above
+    `NEARLY_INCOMPRESSIBLE` is estimated.
+    """
     collocation = solution.collocation
     values = parameter_values(solution.collocation, solution.q)
     free = {item.name: item for item in collocation.parameters.free}
@@ -335,47 +199,36 @@ def _usual_poisson_start(solution: Solution) -> Start | None:
             own = [region + each for each in LAME if region + each in free]
             if len(own) == 2 or own == [name]:
                 young_pa = values[region + "young_pa"]
-                changed |= {each: _usual_modulus(each, young_pa) for each in own}
+                changed |= {each: usual_value(each, young_pa) or 0.0 for each in own}
     if not changed or any(not free[n].lower < v < free[n].upper for n, v in changed.items()):
         return None
     estimates = {name: values[name] for name in free} | changed
     return Start(
         collocation.with_parameters(collocation.parameters.with_estimates(estimates)),
-        note="Poisson's ratio ended near one half; a second start, from the usual "
-        f"{USUAL_POISSON},",
+        scan=solution.scan,
+        note="Poisson's ratio ended near one half; a second start, from the usual 0.3,",
     )
 
 
-def _usual_modulus(name: str, young_pa: float) -> float:
-    """Return `USUAL_POISSON`, or the modulus [Pa] that follows from it and Young's modulus."""
-    value = (
-        USUAL_POISSON
-        if without_region(name) == "poisson"
-        else usual_value(name, young_pa, poisson=USUAL_POISSON)
-    )
-    assert value is not None
-    return value
-
-
-def _power_law_start(solution: Solution) -> Start | None:
-    """None if the exponents are the same, or the closed forms fit as well."""
-    collocation = solution.collocation
-    start = power_law_start(collocation)
+def other_exponents(solution: Solution) -> Start | None:
+    """Return the start of the closed forms of specimens of a law in powers of the stretches; None if
+    the solution fits as well.
+    """
+    are_specimens = all(each.experiment.specimen for each in solution.collocation.transcriptions)
+    start = power_law_start(solution.collocation) if are_specimens else None
     if start is None:
         return None
-    values = parameter_values(collocation, solution.q)
-    guesses = start.collocation.parameters.guesses
-    exponents = [
-        sorted(value for name, value in each.items() if name.startswith("alpha_"))
-        for each in (values, guesses)
-    ]
-    is_same = all(
-        abs(ended - other) <= OTHER_EXPONENT * (1 + abs(other))
-        for ended, other in zip(*exponents, strict=True)
-    )
     is_as_good = solution.history[-1].loss <= (1 + LEAST_SHARE) * start.loss
-    if is_same or (is_as_good and solution.status.converged):
+    if is_as_good and solution.status.converged:
         return None
-    found = ", ".join(f"{exponent:.3g}" for exponent in exponents[1])
+    guesses = start.collocation.parameters.guesses
+    exponents = sorted(value for name, value in guesses.items() if name.startswith("alpha_"))
+    found = ", ".join(f"{exponent:.3g}" for exponent in exponents)
     note = f"a second start, from the exponents {found} of the closed forms,"
     return replace(start, note=note)
+
+
+# A search beyond a bound may end at that of another parameter: of two shares of memory and a modulus.
+BEYOND_BOUNDS: tuple[NextStart, ...] = 3 * (start_beyond_bounds,)
+# Starts after a solution in reduced space.
+SECOND_STARTS: tuple[NextStart, ...] = (usual_poisson_start, other_exponents, *BEYOND_BOUNDS)

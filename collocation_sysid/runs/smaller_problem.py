@@ -18,7 +18,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -42,14 +41,8 @@ from ..recording.experiment_coarsening import coarse_experiment, node_sets
 from ..recording.measurement_selection import smooth_distance, thinned_experiment, with_some_samples
 from ..statistics.budget.discretisation_error import MESH_ORDER
 from ..statistics.estimates import IntervalCoordinate
-from ..statistics.linearised import parameter_values
+from ..statistics.linearised import AT_BOUND, parameter_values
 from .warm_start import WarmStart
-
-# Largest standard error of a parameter's coordinate, a logarithm as a rule, with which a smaller
-# problem determines it.
-LARGEST_STANDARD_ERROR = 1.0
-# Distance of a coordinate from a bound below which the parameter is at the bound.
-BOUND_DISTANCE = 1e-6
 
 
 class NoStartError(Exception):
@@ -58,20 +51,9 @@ class NoStartError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class SmallerProblem(ABC):
-    """A smaller problem and its relation to the given one.
+    """A smaller problem, with the parameters of the given one, and its relation to that."""
 
-    Attributes
-    ----------
-    missing : str
-        Beginning of the note on a start that was not found.
-    has_second_start : bool
-        Whether there may be another optimum of the given problem.
-    """
-
-    missing: ClassVar[str]
-    has_second_start: ClassVar[bool]
-
-    problem: Problem  # the smaller problem, with the parameters of the given one
+    problem: Problem
 
     @classmethod
     @abstractmethod
@@ -86,21 +68,12 @@ class SmallerProblem(ABC):
 
     @property
     @abstractmethod
-    def activity(self) -> str:
-        """Name of the search, for progress."""
-
-    @property
-    @abstractmethod
-    def search(self) -> tuple[str, str]:
-        """Name of the search, and the size of the problem with its preposition, for messages."""
-
-    def tolerance(self, method: ReducedSpace) -> float:
-        """Return the tolerance of the search on the given problem."""
-        return method.tolerance
+    def size(self) -> str:
+        """Size of the problem, with its preposition, for messages and progress."""
 
     @abstractmethod
-    def given_collocation(self, problem: Problem, solution: Solution) -> Collocation:
-        """Return the program of the given problem with the estimates of a converged solution.
+    def start(self, problem: Problem, solution: Solution) -> Start:
+        """Return the start of the given problem from a converged solution, with all variables.
 
         Raises
         ------
@@ -109,20 +82,12 @@ class SmallerProblem(ABC):
         """
 
     @abstractmethod
-    def start(self, collocation: Collocation, solution: Solution) -> Start:
-        """Return the start from a solution, with all variables, in a program of
-        `given_collocation`.
-        """
-
-    @abstractmethod
     def interrupted_start(self, problem: Problem, solution: Solution) -> Start:
         """Return the present point of an interrupted search, with a note."""
 
     @abstractmethod
-    def notes(self, first: Solution, given: Solution, replaced: Sequence[str]) -> list[str]:
-        """Return notes on the solutions of the smaller and of the given problem; `replaced` are
-        notes of the first that others replace.
-        """
+    def notes(self, first: Solution, given: Solution) -> list[str]:
+        """Return notes on the solutions of the smaller and of the given problem."""
 
     def interrupted(self, problem: Problem, first: Solution) -> Solution:
         """Return the present point of an interrupted search as an interrupted solution of the given
@@ -139,8 +104,8 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
     """Return the names of the estimated parameters, coefficients of fields included, that a
     solution does not determine, in their order.
 
-    They are those within `BOUND_DISTANCE` of a bound, and those with a statistical standard error
-    above `LARGEST_STANDARD_ERROR` or not finite, both in the coordinates q of the solver, as a rule
+    They are those within `AT_BOUND` of a bound, and those with a statistical standard error
+    above 1 or not finite, both in the coordinates q of the solver, as a rule
     logarithms. On a mesh that is too coarse, weakly determined parameters compensate its error: a
     search from such values would take many steps. One sweep is needed; where it fails, only bounds
     count.
@@ -148,7 +113,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
     collocation = solution.collocation
     q = solution.q
     lower, upper = collocation.parameters.bounds_q
-    is_excluded = (q - lower < BOUND_DISTANCE) | (upper - q < BOUND_DISTANCE)
+    is_excluded = (q - lower < AT_BOUND) | (upper - q < AT_BOUND)
     p, positions = collocation.unpack(solution.z)
     rows = [transcription.grid_times for transcription in collocation.transcriptions]
     try:
@@ -157,7 +122,7 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
         pass
     else:
         errors = fit.standard_errors[: len(q)]
-        is_excluded |= ~(errors <= LARGEST_STANDARD_ERROR)
+        is_excluded |= ~(errors <= 1.0)
     names = zip(collocation.parameters.free, is_excluded, strict=True)
     return tuple(item.name for item, excluded in names if excluded)
 
@@ -165,15 +130,10 @@ def undetermined_names(solution: Solution) -> tuple[str, ...]:
 # Nodes of the given mesh over those of the coarse one: edges are then about twice as long, and a
 # coarse sweep costs a tenth to a thirtieth.
 NODE_RATIO = 8
-# Smallest reduction of the number of nodes for which a coarse start is worth its time.
-LEAST_NODE_RATIO = 2.0
-# Largest relative change of the volume: a coarser surface encloses less.
-LARGEST_VOLUME_CHANGE = 0.2
 
-# Numbers of samples from which a search starts with some of them, and that those are at least: with
-# fewer, most of the time passes after the search.
-MANY_SAMPLES = 500
-FEWEST_SAMPLES = 150
+# Fewest samples of a search that starts with some of them: with fewer, most of the time passes after
+# the search.
+FEWEST_SAMPLES = 250
 # Deviation from a straight line between these samples, over the standard deviation of the tracks:
 # that of a swing with 12 samples a period.
 SMOOTH_SHARE = 0.03
@@ -182,9 +142,6 @@ SMOOTH_SHARE = 0.03
 @dataclass(frozen=True, eq=False)
 class CoarseStart(SmallerProblem):
     """Problem on coarser meshes, or with fewer samples."""
-
-    missing = "the search had no coarse start"
-    has_second_start = True
 
     # mapping of str to CoarseBody: relation of coarse and given body, by experiment name;
     # experiments whose body is small are left out.
@@ -227,8 +184,8 @@ class CoarseStart(SmallerProblem):
         samples = sum(len(each.t_s) for each in fitted if each.name in distances)
         return cls(moved, relations, distances, samples)
 
-    def describe_size(self) -> str:
-        """Return the numbers of nodes of the coarse and the given bodies, and of samples, in words."""
+    @property
+    def size(self) -> str:
         parts = []
         if self.relations:
             distinct = {id(r.coarse): r for r in self.relations.values()}.values()
@@ -239,22 +196,7 @@ class CoarseStart(SmallerProblem):
             some = (e for e in self.problem.experiments if e.name in self.distances)
             count = sum(len(each.t_s) for each in some)
             parts.append(f"{count:,} of {self.given_samples:,} samples")
-        return " and ".join(parts)
-
-    def describe_target(self) -> str:
-        """Return on what the search ends, as a phrase."""
-        return "on the given mesh" if self.relations else "with all samples"
-
-    @property
-    def activity(self) -> str:
-        return f"coarse start on {self.describe_size()}"
-
-    @property
-    def search(self) -> tuple[str, str]:
-        return "solve", f"on {self.describe_size()}"
-
-    def tolerance(self, method: ReducedSpace) -> float:
-        return method.tolerance_after_coarse
+        return f"on {' and '.join(parts)}"
 
     @property
     def edge_ratio(self) -> float:
@@ -266,12 +208,22 @@ class CoarseStart(SmallerProblem):
             for each in self.relations.values()
         )
 
-    def given_collocation(self, problem: Problem, solution: Solution) -> Collocation:
-        """A modulus that the coarse mesh does not determine gives no start."""
+    def start(self, problem: Problem, solution: Solution) -> Start:
+        """A modulus that the coarse mesh does not determine gives no start. From interpolated samples
+        a search needs several times as long to find a motion: it is simulated.
+        """
         undetermined = undetermined_names(solution)
         for name in filter(is_modulus, undetermined):
             raise NoStartError(f"the coarse mesh does not determine {symbol_of(name)}")
-        return self._with_estimates(problem, solution, undetermined)
+        collocation = self._with_estimates(problem, solution, undetermined)
+        start = self._interpolated_start(associated_at_guess(collocation), solution)
+        if self.relations or start.variables is None:
+            return start
+        p, _ = start.collocation.unpack(start.variables)
+        positions, failure = simulate_trajectories(start.collocation, p)
+        if failure is not None:
+            return start
+        return replace(start, variables=start.collocation.pack(p, positions))
 
     def _with_estimates(
         self, problem: Problem, solution: Solution, undetermined: Sequence[str]
@@ -284,17 +236,6 @@ class CoarseStart(SmallerProblem):
             if item.name not in undetermined
         }
         return replace(problem.collocation(), parameters=parameters.with_estimates(values))
-
-    def start(self, collocation: Collocation, solution: Solution) -> Start:
-        """The search needs several times as long to find a motion from interpolated samples."""
-        start = self._interpolated_start(associated_at_guess(collocation), solution)
-        if self.relations or start.variables is None:
-            return start
-        p, _ = start.collocation.unpack(start.variables)
-        positions, failure = simulate_trajectories(start.collocation, p)
-        if failure is not None:
-            return start
-        return replace(start, variables=start.collocation.pack(p, positions))
 
     def _interpolated_start(self, collocation: Collocation, solution: Solution) -> Start:
         warm = WarmStart.of(solution)
@@ -309,17 +250,16 @@ class CoarseStart(SmallerProblem):
     def interrupted_start(self, problem: Problem, solution: Solution) -> Start:
         collocation = self._with_estimates(problem, solution, undetermined=())
         note = (
-            f"interrupted during the coarse start ({self.describe_size()}): the motion is "
-            f"interpolated and does not satisfy the equations of motion {self.describe_target()}"
+            f"interrupted during the search {self.size}: the motion is interpolated and does not "
+            "satisfy the equations of motion of the given problem"
         )
         return replace(self._interpolated_start(collocation, solution), note=note)
 
-    def notes(self, first: Solution, given: Solution, replaced: Sequence[str]) -> list[str]:
+    def notes(self, first: Solution, given: Solution) -> list[str]:
         where = "on the coarse mesh" if self.relations else "with some samples"
-        size, target = self.describe_size(), self.describe_target()
         notes = [
-            f"coarse start: solved on {size} first, with {first.iterations} sweeps in "
-            f"{first.timing.total:.2g} s, then {target} with {given.iterations} sweeps in "
+            f"coarse start: solved {self.size} first, with {first.iterations} sweeps in "
+            f"{first.timing.total:.2g} s, then as given with {given.iterations} sweeps in "
             f"{given.timing.total:.2g} s",
             *(f"{where}: {note}" for note in first.notes),
         ]
@@ -366,8 +306,6 @@ class CoarseStart(SmallerProblem):
 def sample_distance(experiment: Experiment) -> int:
     """Return the distance of the samples of a recording with which the search starts."""
     most = len(experiment.t_s) // FEWEST_SAMPLES
-    if len(experiment.t_s) < MANY_SAMPLES:
-        return 1
     return smooth_distance(experiment, most=most, share=SMOOTH_SHARE)
 
 
@@ -380,14 +318,9 @@ def _coarse_body(body: Body, problem: Problem) -> CoarseBody:
     ]
     count = len(body.nodes.points_m)
     relation = coarsen_body(body, count // NODE_RATIO, sets)
-    coarse = relation.coarse
-    if len(coarse.nodes.points_m) * LEAST_NODE_RATIO > count:
-        raise NoStartError(
-            f"only {count - len(coarse.nodes.points_m):,} of {count:,} nodes could be removed"
-        )
-    change = coarse.mesh.volume_m3 / body.mesh.volume_m3 - 1
-    if abs(change) > LARGEST_VOLUME_CHANGE:
-        raise NoStartError(f"the volume of the coarser mesh differs by {change:+.0%}")
+    removed = count - len(relation.coarse.nodes.points_m)
+    if removed < count / 2:  # the solve would take as long as that on the given mesh
+        raise NoStartError(f"only {removed:,} of {count:,} nodes could be removed")
     return relation
 
 
@@ -448,9 +381,6 @@ MANY_POINTS = 4000
 class ThinnedStart(SmallerProblem):
     """Problem with thinned clouds, which determines the same parameters as the given one."""
 
-    missing = "the search was not started with fewer points"
-    has_second_start = False
-
     @classmethod
     def of(cls, problem: Problem, method: ReducedSpace) -> ThinnedStart | None:
         """Keep `THINNED_POINTS` of each sample; None if no sample has more than `MANY_POINTS`."""
@@ -466,46 +396,25 @@ class ThinnedStart(SmallerProblem):
         return cls(replace(problem, experiments=experiments, notes=()))
 
     @property
-    def activity(self) -> str:
-        return "search with fewer points"
+    def size(self) -> str:
+        return f"with {point_counts(self.problem.collocation())}"
 
-    @property
-    def search(self) -> tuple[str, str]:
-        return "search", f"with {point_counts(self.problem.collocation())}"
-
-    def given_collocation(self, problem: Problem, solution: Solution) -> Collocation:
-        """Return the program of a problem with the parameters, places and clocks of a solution with
-        thinned clouds, and the correspondences of all points with its shapes.
-
-        Its variables are those of the solution, which has the same parameters.
-
-        Raises
-        ------
-        NoStartError
-            If the solution does not determine a parameter: all points may have the optimum
-            elsewhere.
-        """
+    def start(self, problem: Problem, solution: Solution) -> Start:
+        """If the solution does not determine a parameter, all points may have the optimum elsewhere."""
         for name in undetermined_names(solution):
-            raise NoStartError(
-                f"{point_counts(solution.collocation)} do not determine {symbol_of(name)}"
-            )
-        return collocation_with_all_points(problem, solution)
-
-    def start(self, collocation: Collocation, solution: Solution) -> Start:
-        return Start(collocation, solution.z)
+            points = point_counts(solution.collocation)
+            raise NoStartError(f"{points} do not determine {symbol_of(name)}")
+        return Start(collocation_with_all_points(problem, solution), solution.z)
 
     def interrupted_start(self, problem: Problem, solution: Solution) -> Start:
-        note = (
-            f"interrupted during the search with {point_counts(solution.collocation)}: the values "
-            "do not fit all points best"
-        )
+        note = f"interrupted during the search {self.size}: the values do not fit all points best"
         return Start(collocation_with_all_points(problem, solution), solution.z, note=note)
 
-    def notes(self, first: Solution, given: Solution, replaced: Sequence[str]) -> list[str]:
+    def notes(self, first: Solution, given: Solution) -> list[str]:
         return [
             f"searched with {point_counts(first.collocation)} first, then with "
             f"{point_counts(given.collocation)} in {given.iterations} sweeps",
-            *(note for note in first.notes if note not in (*given.notes, *replaced)),
+            *first.notes,
         ]
 
 

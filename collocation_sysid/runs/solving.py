@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
-from ..common.array_types import Array
 from ..common.limits import TimeLimitReached, time_limit
 from ..common.step_counting import search_activity
 from ..common.validated_classes import validated
@@ -18,29 +16,22 @@ from ..errors import InputError
 from ..features.measurements import present
 from ..features.registry import FEATURES
 from ..fem.laws.constants import symbol_of, unit_of, without_region
-from ..methods.experiment_executors import ExperimentExecutor, connect_executor
+from ..methods.experiment_executors import connect_executor
 from ..methods.interior_point import InteriorPoint
 from ..methods.reduced_space import UNLIMITED_S, ReducedSpace
 from ..methods.solution import Method, Solution, Status, Watch, multipliers_at
-from ..methods.solve_recorder import answers_as, best_iterate, keep
+from ..methods.solve_recorder import answers_as, best_iterate
 from ..methods.starts.initial_trajectories import associated_at_guess
-from ..methods.starts.start import Scan, Start
-from ..methods.starts.stiffness_scan import EXPLAINED, rescue, start_problem
+from ..methods.starts.start import Start
+from ..methods.starts.stiffness_scan import EXPLAINED, start_problem
 from ..problem import Problem
-from ..program.collocation import Collocation
 from ..statistics.field_estimates import field_estimates_at
-from .branch_order import with_ascending_times
-from .check.cost import require_memory
+from .branch_order import with_ascending_times, without_limitless_shares
+from .cost import require_memory
 from .facts import facts, sentences
 from .forward_simulation import fit_misfits
-from .several_starts import (
-    KnownMinimum,
-    follow_starts,
-    second_start,
-    start_beyond_bounds,
-    until_known,
-    without_limitless_shares,
-)
+from .searches import Searches
+from .several_starts import FAILED_STATUSES, SECOND_STARTS, after_failure, of_scan
 from .smaller_problem import CoarseStart, NoStartError, SmallerProblem, ThinnedStart
 from .warm_start import WarmStart
 
@@ -56,35 +47,10 @@ class Solved(Protocol):
 AnyStart = (
     str | Path | WarmStart | Solution | Solved | ArrayLike | tuple[ArrayLike, ArrayLike | None]
 )
-# Outcomes of a failed search, after which another start may help.
-FAILED_STATUSES = (
-    Status.INFEASIBLE,
-    Status.STALLED,
-    Status.DIVERGED,
-    Status.NUMERICAL_FAILURE,
-    Status.NOT_SIMULABLE,
-)
-# Outcomes after which no other start is tried.
-FINAL_STATUSES = (
-    Status.REFUSED,
-    Status.TIME_LIMIT,
-    Status.CLUSTER_DISCONNECTED,
-    Status.NOT_SIMULABLE,
-)
-# Least decrease of χ² for which the solution from a second start is preferred.
-LEAST_GAIN = 1e-3
-# Most searches that continue beyond a default bound: those of two shares of memory and a modulus.
-MOST_BOUNDS = 3
-# Most iterations of each: those that found a better fit took 5 to 40.
-MOST_BEYOND_BOUNDS = 60
-# Least tolerance of a solve on a coarser mesh: below the difference between both meshes.
-COARSE_TOLERANCE = 1e-4
 # Poisson's ratio from which elements that do not average the volume need many small steps.
 INCOMPRESSIBLE = 0.499
 # Longest search for a start with such elements if no limit is stated [s].
 START_S = 40.0
-# Most repetitions of a solve whose estimates change the correspondences of the measurements.
-MOST_REREADINGS = 5
 
 
 @validated
@@ -97,13 +63,11 @@ def solve(
 ) -> Solution:
     """Solve a problem, without the checks of `run`.
 
-    There may be several searches, one after another: from the results of a scan, if guesses are
-    missing or a search from guesses fails; a second one in reduced space, where the first may have
-    ended in a worse optimum or on the way, see `several_starts`; with correspondences of measurements that
-    the estimates change; with other correlation lengths of fields; and, of a large body,
-    one on a coarser mesh first, see `smaller_problem`. `watch` receives the iterations of all of them,
-    and one of them gives the solution: its history and counts are of that search alone, and its
-    times too, with those of the search on a coarser mesh if it started from there. Nothing is
+    There may be several searches, one after another, see `searches`: of smaller problems first, see
+    `smaller_problem`; from other starts, where the first may have ended in a worse optimum or on the
+    way, see `several_starts`; and with other correlation lengths of fields. `watch` receives the
+    iterations of all of them. The solution is the best one; its history and counts are of its own
+    program with the last correlation lengths, its times with those of a smaller problem. Nothing is
     written.
 
     Parameters
@@ -231,14 +195,14 @@ def _solve_by(
             where="--scheduler",
         )
     with connect_executor(scheduler) as workers:
-        solve_once = partial(_solve_once, solver=solver, watch=watch, workers=workers)
-        solution = solve_once(problem, start)
+        searches = Searches(solver, watch, workers)
+        solution = _solve_once(problem, start, searches)
         tried = [problem.lengths_m]
         lengths_m = _likeliest_lengths(problem, solution)
         while lengths_m is not None and lengths_m not in tried:
             tried.append(lengths_m)
             problem = problem.with_lengths(lengths_m)
-            solution = solve_once(problem, WarmStart.of(solution))
+            solution = _solve_once(problem, WarmStart.of(solution), searches)
             lengths_m = _likeliest_lengths(problem, solution)
         return solution
 
@@ -257,104 +221,66 @@ def _likeliest_lengths(problem: Problem, solution: Solution) -> dict[str, float]
 
 
 def _solve_from_smaller(
-    smaller: SmallerProblem,
-    problem: Problem,
-    solver: ReducedSpace,
-    watch: Watch | None,
-    workers: ExperimentExecutor | None,
+    smaller: SmallerProblem, problem: Problem, solver: ReducedSpace, searches: Searches
 ) -> Solution:
-    """Count iterations on the given problem only, but the times of both solves."""
-    rough = replace(solver, tolerance=max(solver.tolerance, COARSE_TOLERANCE))
     as_given = partial(smaller.interrupted, problem)
-    with search_activity(smaller.activity), answers_as(as_given, of_given_problem=False):
+    with search_activity(f"search {smaller.size}"), answers_as(as_given, of_given_problem=False):
         try:
-            first = _solve_once(smaller.problem, None, rough, watch=watch, workers=workers)
+            first = _solve_once(smaller.problem, None, searches)
         except InputError as error:
             raise NoStartError(error.message) from error
-    search, size = smaller.search
     if not first.status.converged:
-        raise NoStartError(f"the {search} {size} ended with: {first.message}")
-    collocation = smaller.given_collocation(problem, first)
+        raise NoStartError(f"the search {smaller.size} ended with: {first.message}")
+    start = smaller.start(problem, first)
     try:
-        require_memory(problem, collocation, method=solver)
+        require_memory(problem, start.collocation, method=solver)
     except InputError as error:
         raise error.located(problem.path) from error
-    start = smaller.start(collocation, first)
-    method = with_workers(replace(solver, tolerance=smaller.tolerance(solver)), workers)
-    solution = solve_with_renewed_correspondences(
-        method, start.collocation, watch=watch, start=start.variables
-    )
+    method = replace(solver, tolerance=solver.tolerance_after_coarse)
+    solution = replace(searches, method=method).once(start)
     if solution.status in FAILED_STATUSES:
-        raise NoStartError(f"the search from the solution {size} ended with: {solution.message}")
-    replaced = [*_feature_notes(solution), *_feature_notes(first)]
-    notes = smaller.notes(first, solution, replaced)
-    if smaller.has_second_start and solution.status.converged:
-        solution = best_of_second_start(method, solution, watch=watch)
-    return replace(
-        solution,
-        scan=first.scan,
-        timing=solution.timing + first.timing,
-        notes=(*notes, *solution.notes, *_feature_notes(solution)),
-    )
+        what = f"the search from the solution {smaller.size}"
+        raise NoStartError(f"{what} ended with: {solution.message}")
+    own = [*solution.notes, *_feature_notes(solution)]
+    known = {*own, *_feature_notes(first)}
+    notes = [note for note in smaller.notes(first, solution) if note not in known]
+    return replace(solution.after(first, ""), notes=(*notes, *own))
 
 
-def _solve_once(
-    problem: Problem,
-    warm_start: WarmStart | None,
-    solver: Method,
-    watch: Watch | None,
-    workers: ExperimentExecutor | None,
-) -> Solution:
+def _solve_once(problem: Problem, warm_start: WarmStart | None, searches: Searches) -> Solution:
     """Solve with fixed correlation lengths, from guesses, a scan, or an earlier solution."""
     notes: list[str] = []
+    solver = searches.method
     if warm_start is None and isinstance(solver, ReducedSpace):
         for kind in (CoarseStart, ThinnedStart):
             try:
                 smaller = kind.of(problem, solver)
                 if smaller is None:
                     continue
-                solution = _solve_from_smaller(smaller, problem, solver, watch, workers)
+                solution = _solve_from_smaller(smaller, problem, solver, searches)
             except NoStartError as reason:
-                notes.append(f"{kind.missing}: {reason}")
+                notes.append(f"no smaller problem was solved first: {reason}")
             else:
                 return replace(solution, notes=(*notes, *solution.notes))
     if warm_start is not None:
         problem = warm_start.apply_to_problem(problem)
-    scan: Scan | None = None
 
     def finished(solution: Solution) -> Solution:
-        of_start = [scan.sentence] if scan else []
-        return replace(
-            solution,
-            scan=scan or solution.scan,
-            notes=(*notes, *of_start, *solution.notes, *_feature_notes(solution)),
-        )
+        own = [*notes, *solution.notes, *_feature_notes(solution)]
+        return replace(solution, notes=own)
 
     try:
         start = _program_and_start(problem, solver, warm_start=warm_start)
-        scan = start.scan
-        solver = with_workers(solver, workers)
-        if isinstance(solver, InteriorPoint) and start.multipliers is not None:
-            solver = partial(solver, multipliers=start.multipliers)
-        solution = None
+        notes += [start.note] if start.note else []
         with answers_as(finished):
-            if scan is not None:
-                solve_again = partial(solve_with_renewed_correspondences, watch=watch)
-                start, solution = follow_starts(solver, start, scan, solve=solve_again)
-                scan = start.scan
-                if solution is None:
-                    start = replace(start, collocation=associated_at_guess(start.collocation))
-            notes += [start.note] if start.note else []
-            if solution is None:
-                solution = solve_with_renewed_correspondences(
-                    solver, start.collocation, watch=watch, start=start.variables
-                )
-            if start.stated is not None:
-                scan, solution = _search_of_stated(solver, start, solution, watch=watch)
-            elif scan is None and solution.status in FAILED_STATUSES:
-                scan, solution = _solve_from_scan(solver, solution, watch=watch)
-            if warm_start is None and solution.method == ReducedSpace.name:
-                solution = best_of_second_start(solver, solution, watch=watch)
+            solution = searches.once(start)
+            is_complete = getattr(solver, "needs_complete_start", False)
+            failed = partial(after_failure, is_complete=is_complete)
+            solution = searches.continued(solution, [*of_scan(start), failed])
+            is_answer = solution.history and solution.status is not Status.NOT_SIMULABLE
+            if warm_start is None and solution.method == ReducedSpace.name and is_answer:
+                solution = searches.continued(solution, SECOND_STARTS)
+                solution = without_limitless_shares(solution)
             if warm_start is None and any(body.has_memory for body in problem.bodies):
                 solution = with_ascending_times(solution, problem.parameters)
     except InputError as error:
@@ -382,9 +308,9 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
         require_memory(problem, start.collocation, method=solver)
     if start.scan is not None:
         return start
-    start = replace(start, collocation=associated_at_guess(start.collocation))
     if warm_start is None:
         return start
+    start = replace(start, collocation=associated_at_guess(start.collocation))
     is_whole = isinstance(solver, InteriorPoint) and (
         solver.initial == "simulation" or warm_start.has_multipliers
     )
@@ -399,164 +325,3 @@ def _feature_notes(solution: Solution) -> list[str]:
     parts = solution.parts
     features = present(FEATURES, [part.transcription.experiment for part in parts])
     return [note for part in parts for feature in features for note in feature.notes(part)]
-
-
-def with_workers(solver: Method, workers: ExperimentExecutor | None) -> Method:
-    """Return the method `solver` with workers that solve its experiments, as a `functools.partial`
-    of it, if it is an instance of `ReducedSpace`; any other method, also a partial of that one, and
-    any method if `workers` is None, is returned unchanged.
-    """
-    if workers is None or not isinstance(solver, ReducedSpace):
-        return solver
-    return partial(solver, workers=workers)
-
-
-def _search_of_stated(
-    solver: Method, start: Start, of_scan: Solution, watch: Watch | None
-) -> tuple[Scan | None, Solution]:
-    """Solve from the stated guesses, too, as long as that may fit better than the scan's start."""
-    assert start.stated is not None
-    stated = Start(start.stated, note="the search from the stated guess")
-    method = solver
-    if of_scan.status.converged and isinstance(solver, ReducedSpace):
-        limited = replace(solver, largest_loss=max(of_scan.history[-1].loss, LEAST_GAIN))
-        method = until_known(limited, [of_scan])
-    try:
-        best = _better_of(method, of_scan, watch, choose=lambda _: stated)
-    except KnownMinimum:
-        best = of_scan
-    return (start.scan if best.z is of_scan.z else None), best
-
-
-def _solve_from_scan(
-    solver: Method, failed: Solution, watch: Watch | None
-) -> tuple[Scan | None, Solution]:
-    """Solve from the result of a scan after a search from the guess failed."""
-    reason = f"the search from the guess failed ({failed.status.value})"
-    needs_complete_start = getattr(solver, "needs_complete_start", False)
-    scan = rescue(failed.collocation, reason, is_complete=needs_complete_start)
-    if scan is None:
-        return None, failed
-    again = associated_at_guess(failed.collocation.with_parameters(scan.parameters))
-    solution = solve_with_renewed_correspondences(solver, again, watch=watch)
-    return (scan, solution) if solution.status.converged else (None, failed)
-
-
-def best_of_second_start(solver: Method, first: Solution, watch: Watch | None) -> Solution:
-    """Return the best of a solution, of the solution from its `second_start`, and of the one that
-    continues at default bounds, see `start_beyond_bounds`; with a note on each that is better.
-
-    Another solution is better if it converges, and the one before did not or has a χ² that is
-    higher by more than `LEAST_GAIN`, an absolute difference. There is no other search after one
-    that was refused, or ended at the limit of time.
-
-    Otherwise `first` itself is returned. The history, counts and times of the result are those of its
-    own search alone. Exceptions of the method are not caught.
-
-    Parameters
-    ----------
-    solver : Method
-        Method to use, also with workers, see `with_workers`.
-    watch : callable or None
-        Called with every iteration of the other searches.
-    """
-    best = _better_of(solver, first, watch, choose=second_start)
-    return continued_beyond_bounds(solver, best, watch)
-
-
-def continued_beyond_bounds(solver: Method, first: Solution, watch: Watch | None) -> Solution:
-    """Return the better of a solution and of the one that continues at default bounds, as
-    `best_of_second_start`; shares of memory without limit are then held, as of a liquid.
-    """
-    best, short = first, solver
-    if isinstance(solver, ReducedSpace):
-        most = min(solver.max_iterations, MOST_BEYOND_BOUNDS)
-        short = replace(solver, max_iterations=most)
-    for _ in range(MOST_BOUNDS):
-        better = _better_of(short, best, watch, choose=start_beyond_bounds)
-        moved, best = better.z is not best.z, better
-        if not moved:  # the same start would be searched again
-            break
-    limited = without_limitless_shares(best) if best.status.converged else None
-    if limited is None:
-        return best
-    again = _search(solver, best.collocation.with_parameters(limited), watch)
-    if not again.history or again.history[-1].loss > best.history[-1].loss + LEAST_GAIN:
-        return best
-    # A restart at the optimum may find no decrease that exceeds rounding.
-    return replace(again, status=best.status, message=best.message, notes=best.notes)
-
-
-def _better_of(
-    solver: Method, first: Solution, watch: Watch | None, choose: Callable[[Solution], Start | None]
-) -> Solution:
-    """Return the better of a solution and of that from the start chosen for it."""
-    if first.status in FINAL_STATUSES or not first.history:
-        return first
-    other = choose(first)
-    if other is None:
-        return first
-    again = associated_at_guess(other.collocation)
-    second = solve_with_renewed_correspondences(solver, again, watch=watch)
-    gain = first.history[-1].loss - second.history[-1].loss if second.history else 0.0
-    if first.status.converged and not second.status.converged and gain > LEAST_GAIN:
-        note = (
-            f"{other.note} fitted better (χ² lower by {gain:.3g}), but did not converge: "
-            f"{second.message}"
-        )
-        return replace(first, notes=(*first.notes, note))
-    if not second.status.converged or (first.status.converged and gain <= LEAST_GAIN):
-        return first
-    note = f"{other.note} found a better fit (χ² lower by {gain:.3g})"
-    if not first.status.converged:
-        note = f"{other.note} converged, after a first search that did not"
-    return replace(second, notes=(note, *second.notes))
-
-
-def solve_with_renewed_correspondences(
-    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
-) -> Solution:
-    """Solve, and repeat while estimates change the correspondences of the measurements.
-
-    These are the elements of markers, the correspondences of points, and the sample intervals of
-    clocks. There are at most `MOST_REREADINGS` repetitions, and none after a solve that does not
-    converge. The last solution is returned, also if it has not converged; its history, counts and
-    times are those of the last solve alone.
-
-    Parameters
-    ----------
-    solver : Method
-        Method to use, whose exceptions are not caught.
-    collocation : Collocation
-        Program with guesses; not modified.
-    watch : callable or None
-        Called with every iteration.
-    start : (variables,) array, optional
-        Start of the first solve; by default the method chooses it from the guesses.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If a solve was interrupted; its best iterate is kept, see `best_iterate`.
-    """
-    solution = _search(solver, collocation, watch, start)
-    for _ in range(MOST_REREADINGS):
-        if not solution.status.converged:
-            break
-        p, positions = solution.collocation.unpack(solution.z)
-        collocation, moved = solution.collocation.follow_estimates(p, positions)
-        if collocation is solution.collocation:
-            break
-        solution = _search(solver, collocation, watch, collocation.pack(moved, positions))
-    return solution
-
-
-def _search(
-    solver: Method, collocation: Collocation, watch: Watch | None, start: Array | None = None
-) -> Solution:
-    solution = solver(collocation, watch, start)
-    loss, share = float("inf"), 0.0
-    if solution.history:
-        loss, share = solution.history[-1].loss, solution.history[-1].share
-    keep(solution, lambda: solution, loss, share)
-    return solution.unless_interrupted()

@@ -49,7 +49,7 @@ from collocation_sysid.recording.experiment import usual_air_density
 from collocation_sysid.result import run_record
 from collocation_sysid.result import solve_progress as progress_shown
 from collocation_sysid.result.solve_progress import Heartbeat
-from collocation_sysid.runs import forward_simulation, solving
+from collocation_sysid.runs import forward_simulation, several_starts, solving
 
 RESULT_KEYS = {
     "schema": set(),
@@ -406,7 +406,8 @@ def test_an_interrupted_first_rung_keeps_its_iterate(tiny, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
-    monkeypatch.setattr(reduced_search, "LONGEST_RUNG", 1.0)
+    policy = reduced_search.SearchPolicy(longest_rung=1.0)
+    monkeypatch.setattr(reduced_search, "POLICY", policy)
     assert run_command("solve", "problem.toml", "--out", "run").code == 130
     result = result_in(tiny / "run")
     assert result["status"] == "interrupted"
@@ -418,8 +419,8 @@ def test_a_failed_search_survives_an_interrupt_of_the_scan_that_follows(tiny, mo
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(solving, "rescue", interrupt)
-    monkeypatch.setattr(solving, "FAILED_STATUSES", {*Status})
+    monkeypatch.setattr(several_starts, "rescue", interrupt)
+    monkeypatch.setattr(several_starts, "FAILED_STATUSES", {*Status})
     outcome = run_command("solve", "problem.toml", "--out", "run")
     assert outcome.code == 130
     assert "Interrupted" in outcome.out
@@ -475,13 +476,16 @@ def test_an_interrupt_of_a_second_start_keeps_the_first_answer(tiny, monkeypatch
 
     def again(first):
         found.append(first)
-        return Start(first.collocation, note="again")
+        estimates = first.collocation.parameters.with_estimates(
+            {"mu_pa": first.parameters["mu_pa"]}
+        )
+        return Start(first.collocation.with_parameters(estimates), note="again")
 
     def interrupt(self: progress_shown.SolveProgress, line: Iteration) -> None:
         if found:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(solving, "second_start", again)
+    monkeypatch.setattr(solving, "SECOND_STARTS", (again,))
     monkeypatch.setattr(progress_shown.SolveProgress, "iteration", interrupt)
     method = settings("solver.method=reduced-space")
     assert run_command("solve", "problem.toml", *method, "--out", "run").code == 130

@@ -75,7 +75,6 @@ def valid(name: str) -> dict[str, Any]:
         "Camera": {"matrix": MATRIX, "pose": np.eye(4), "size_px": (100, 80)},
         "Capsule": {"radius_m": 0.1, "ends_m": LINE_M},
         "Constant": {"name": "c_pa"},
-        "Continuation": {},
         "CrossSection": {
             **{"area_m2": 1e-6, "moments_m4": (1e-13, 1e-13), "torsion_m4": 2e-13},
             **{"extent_m": (1e-3, 1e-3)},

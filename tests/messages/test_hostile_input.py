@@ -65,7 +65,7 @@ from collocation_sysid.recording.depth_camera import points_from_image
 from collocation_sysid.recording.sources.depth_files import read_depth
 from collocation_sysid.recording.sources.source import open_source
 from collocation_sysid.result import run_writers
-from collocation_sysid.runs.check import cost as memory
+from collocation_sysid.runs import cost as memory
 
 COMMAND_LINE = "from collocation_sysid import cli; cli.main()"
 

@@ -19,8 +19,8 @@ from collocation_sysid.model.parameters import (
     is_default_bound,
     with_widest_bounds,
 )
-from collocation_sysid.runs.several_starts import start_beyond_bounds
-from collocation_sysid.runs.solving import continued_beyond_bounds
+from collocation_sysid.runs.searches import Searches
+from collocation_sysid.runs.several_starts import BEYOND_BOUNDS, start_beyond_bounds
 from collocation_sysid.statistics.assessment import Assessment
 from collocation_sysid.statistics.concerns import Concern
 
@@ -65,7 +65,7 @@ def test_a_search_beyond_a_bound_that_does_not_converge_is_made_and_reported_onc
         better = replace(at_bound.history[-1], loss=0.5 * at_bound.history[-1].loss)
         return replace(at_bound, status=Status.STALLED, history=(better,))
 
-    kept = continued_beyond_bounds(diverging, at_bound, None)
+    kept = Searches(diverging).continued(at_bound, BEYOND_BOUNDS)
     assert len(searches) == 1
     assert len(kept.notes) == 1
     assert "did not converge" in kept.notes[0]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import pytest
-from kit.problems import GUESS, hung_cube, measured
 from pydantic import TypeAdapter
 
 from collocation_sysid.common.field_descriptions import documented
@@ -14,8 +13,6 @@ from collocation_sysid.methods import METHODS
 from collocation_sysid.methods.comparison.penalty import Penalty
 from collocation_sysid.methods.options import method_from_options
 from collocation_sysid.methods.reduced_space import ReducedSpace
-from collocation_sysid.methods.starts.continuation import Continuation
-from collocation_sysid.program.collocation import Collocation
 
 each_method = pytest.mark.parametrize("name", METHODS)
 
@@ -55,12 +52,6 @@ def test_a_method_is_built_from_a_table():
         ("reduced-space", {"ladder": [0.5]}, "solver.ladder: found .0.5.; expected numbers above"),
         ("reduced-space", {"ladder": 1.0}, "solver.ladder: found 1.0; expected a list"),
         ("interior-point", {"ipopt": {"sb": True}}, "solver.ipopt.sb: found true; expected text"),
-        (
-            "continuation",
-            {"stage": {"rho": 1}},
-            "solver.stage: the method 'interior-point' has no option",
-        ),
-        ("continuation", {"stage": {"tolerance": 0}}, "solver.stage.tolerance: found 0; expected"),
     ],
 )
 def test_invalid_options_are_refused_by_key(kind: str, options: dict, message: str):
@@ -71,17 +62,3 @@ def test_invalid_options_are_refused_by_key(kind: str, options: dict, message: s
 def test_a_changed_method_is_checked_again():
     with pytest.raises(InputError, match="tolerance: found 0; expected a number above 0"):
         replace(Penalty(), tolerance=0)
-
-
-def test_whatever_solves_is_a_method():
-    @dataclass(frozen=True)
-    class Patient:
-        patience: int
-
-        def __call__(self, collocation, watch=None, start=None):
-            return ReducedSpace(max_iterations=self.patience)(collocation, watch, start)
-
-    collocation = Collocation([measured(hung_cube(19))], GUESS)
-    solution = Continuation((0.5, 1.0), Patient(50))(collocation)
-    assert solution.status.converged
-    assert solution.notes[0].startswith("50 % of the samples by reduced-space: converged")

@@ -262,12 +262,12 @@ def test_a_trial_outside_the_funnel_is_simulated(monkeypatch: pytest.MonkeyPatch
     infeasible_m = []
     accepted = ReducedSearch._accept
 
-    def recorded(self: ReducedSearch, horizon: Horizon, point: Iterate) -> Iterate:
+    def recorded(self: ReducedSearch, point: Iterate) -> Iterate:
         infeasible_m.append(point.feasibility_m / self.edge_m)
-        return accepted(self, horizon, point)
+        return accepted(self, point)
 
     monkeypatch.setattr(ReducedSearch, "_accept", recorded)
-    monkeypatch.setattr(reduced_search, "FUNNEL", 1e-5)
+    monkeypatch.setattr(reduced_search, "POLICY", reduced_search.SearchPolicy(funnel=1e-5))
     solution = ReducedSpace()(collocation)
     assert solution.status is Status.CONVERGED
     assert max(infeasible_m) < 1e-5

@@ -11,8 +11,13 @@ from kit.problems import hung_cube
 
 import collocation_sysid as cs
 from collocation_sysid.runs import solving
-from collocation_sysid.runs.several_starts import NEARLY_INCOMPRESSIBLE, second_start
-from collocation_sysid.runs.solving import best_of_second_start
+from collocation_sysid.runs.searches import Searches
+from collocation_sysid.runs.several_starts import (
+    NEARLY_INCOMPRESSIBLE,
+    SECOND_STARTS,
+    other_exponents,
+    usual_poisson_start,
+)
 
 KNOWN = {"gamma_r_s": 0.01, "gamma_m_1_s": 1.0}
 TRUTH = {"young_pa": 600.0, "poisson": 0.46, **KNOWN}
@@ -30,7 +35,7 @@ def answer(*free: str) -> cs.Solution:
 def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
     first = answer("young_pa", "poisson", "gamma_r_s")
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
-    start = second_start(first)
+    start = usual_poisson_start(first)
     assert start is not None
     guesses = {item.name: item.guess for item in start.collocation.parameters.free}
     assert guesses["poisson"] == 0.3
@@ -39,15 +44,17 @@ def test_the_second_start_has_the_usual_ratio_and_the_same_stiffness():
 
 
 def test_a_ratio_that_is_known_gives_no_second_start():
-    assert second_start(answer("young_pa")) is None
+    assert usual_poisson_start(answer("young_pa")) is None
 
 
 def test_the_better_of_two_answers_counts():
     first = answer("young_pa", "poisson", "gamma_r_s")
-    same = best_of_second_start(cs.ReducedSpace(), first, None)
-    assert same is first
+    searches = Searches(cs.ReducedSpace())
+    same = searches.continued(first, SECOND_STARTS)
+    assert same.z is first.z
+    assert not same.notes
     worse = replace(first, history=(replace(first.history[-1], loss=first.history[-1].loss + 5),))
-    better = best_of_second_start(cs.ReducedSpace(), worse, None)
+    better = searches.continued(worse, SECOND_STARTS)
     assert "χ² lower by 5" in better.notes[0]
     assert better.parameters["poisson"] == pytest.approx(first.parameters["poisson"], rel=1e-3)
 
@@ -64,7 +71,7 @@ def test_a_second_start_keeps_a_parameter_at_its_bound():
     first = cs.solve(cs.Problem([cs.with_markers(swung, tracks_m)], {**TRUTH, **estimated}))
     assert first.parameters["gamma_m_1_s"] == pytest.approx(5.0)
     assert first.parameters["poisson"] > NEARLY_INCOMPRESSIBLE
-    start = second_start(first)
+    start = usual_poisson_start(first)
     assert start is not None
     assert start.collocation.parameters.guesses["gamma_m_1_s"] == pytest.approx(5.0)
 
@@ -87,7 +94,7 @@ def test_a_better_optimum_of_the_closed_forms_is_sought_from_bad_guesses(monkeyp
         methods={"reduced-space": cs.ReducedSpace(max_iterations=40)},
     )
     with monkeypatch.context() as patch:
-        patch.setattr(solving, "second_start", lambda _: None)
+        patch.setattr(solving, "SECOND_STARTS", ())
         first = cs.solve(problem)
     assert not first.status.converged or first.parameters["alpha_2"] > 0
     solution = cs.solve(problem)
@@ -95,7 +102,7 @@ def test_a_better_optimum_of_the_closed_forms_is_sought_from_bad_guesses(monkeyp
     assert solution.parameters["alpha_1"] == pytest.approx(2.0, abs=0.1)
     assert solution.parameters["alpha_2"] == pytest.approx(-2.0, abs=0.3)
     assert any("of the closed forms" in note for note in solution.notes)
-    assert second_start(solution) is None
+    assert other_exponents(solution) is None
 
 
 def rubber_tests(truth: dict[str, float]) -> list[cs.Experiment]:

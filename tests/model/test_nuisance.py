@@ -222,7 +222,7 @@ def test_deviations_must_be_positive():
 # Every kind by one method; by the others one that moves the body, by one of them what is read too.
 FOUND_BY = [
     *product(ONE_OF_EACH, ("reduced-space",)),
-    *product(("tilt",), ("interior-point", "shooting", "augmented-lagrangian", "continuation")),
+    *product(("tilt",), ("interior-point", "shooting", "augmented-lagrangian")),
     ("offset", "interior-point"),
 ]
 

@@ -35,7 +35,7 @@ from collocation_sysid.problem.loading import read_problem_file
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.recording import PoseSequence, read_markers, read_poses, write_poses_csv
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.derivatives import shortened_problem
+from collocation_sysid.runs.derivatives import shortened_problem
 
 POSES, MARKERS = "swing_motion.csv", "swing_markers.csv"
 BOX = "{ box_m = [[-1, -1, 0.089], [1, 1, 1]] }"

@@ -62,8 +62,8 @@ def test_tables_of_several_methods_stand_side_by_side():
         ladder = [0.5, 1]
         [solver."casadi:sqpmethod"]
         casadi = { min_iter = 1 }
-        [solver.continuation]
-        stage = { method = "shooting", gradient = "adjoint" }
+        [solver.shooting]
+        gradient = "adjoint"
         """
     )
     assert solver.method == "penalty"
@@ -71,7 +71,7 @@ def test_tables_of_several_methods_stand_side_by_side():
     assert "augmented-lagrangian" not in solver.methods
     assert solver.methods["reduced-space"].ladder == (0.5, 1.0)
     assert solver.methods["casadi:sqpmethod"].casadi == {"min_iter": 1}
-    assert solver.methods["continuation"].method == METHODS["shooting"](gradient="adjoint")
+    assert solver.methods["shooting"].gradient == "adjoint"
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
 from collocation_sysid.extras.studies.model_choice import reserve_test_data
-from collocation_sysid.methods.starts.continuation import first_samples
 from collocation_sysid.methods.starts.stiffness_scan import scan_stiffness
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
+from collocation_sysid.recording.measurement_selection import first_samples
 from collocation_sysid.result.run_record import replays
 from collocation_sysid.runs.check import check_problem
 

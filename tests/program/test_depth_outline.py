@@ -28,7 +28,7 @@ from collocation_sysid.recording.depth_camera import (
     points_from_image,
     samples_with_outlines,
 )
-from collocation_sysid.runs.several_starts import SAME_LOSS, robust_loss
+from collocation_sysid.runs.searches import SAME_LOSS, robust_loss
 
 UNKNOWN = cs.Nuisance.none(depth_turn_rad=0.09, depth_shift_m=0.02, depth_edge_px=1.0)
 CAMERA = cs.DepthCamera(MATRIX, pose=POSE)
@@ -240,8 +240,6 @@ def test_a_soft_bar_is_found_without_a_guess_from_a_camera_that_is_off():
     known = cs.solve(soft_problem(0, SOFT_TRUTH["young_pa"]))
     assert robust_loss(solution) < robust_loss(known) + SAME_LOSS
     assert solution.parameters["young_pa"] == pytest.approx(SOFT_TRUTH["young_pa"], rel=0.2)
-    (said,) = (note for note in solution.notes if "initial values of the scan" in note)
-    assert "were solved to the end" in said
     assert solution.scan is not None
 
 

@@ -20,7 +20,6 @@ from collocation_sysid.methods.comparison.penalty import AugmentedLagrangian, Pe
 from collocation_sysid.methods.interior_point import InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace
 from collocation_sysid.methods.solution import Solution
-from collocation_sysid.methods.starts.continuation import Continuation
 from collocation_sysid.program.collocation import Collocation, convert_variables
 from collocation_sysid.program.lifted.collocation import lifted_count
 from collocation_sysid.program.simulation import simulate, with_markers, with_wrenches
@@ -89,7 +88,6 @@ def problem(name: str) -> tuple[Collocation, Solution]:
 METHODS = [
     *((name, InteriorPoint(tolerance=1e-10), 1e-6) for name in PROBLEMS),
     ("memory", InteriorPoint(hessian="gauss-newton"), 1e-5),
-    ("density", Continuation(), 1e-4),
     ("sensor", SqpMethod(), 1e-5),
     ("density", AugmentedLagrangian(tolerance=1e-4), 1e-4),
     ("static", Penalty(inner="levenberg-marquardt", rho=1e6, tolerance=1e-4), 1e-2),

@@ -49,7 +49,7 @@ from collocation_sysid.recording import (
 from collocation_sysid.result.check_sections import full_check_tables
 from collocation_sysid.result.run_summary import run_summary
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.derivatives import derivative_errors
+from collocation_sysid.runs.derivatives import derivative_errors
 from collocation_sysid.runs.forward_simulation import ForwardSimulation
 from collocation_sysid.statistics.scale_identifiability import static_concerns
 

@@ -117,8 +117,8 @@ def test_the_core_is_loaded_without_the_packages_that_use_it():
     assert not loaded & {*OUTER, "problem"}
 
 
-def test_a_problem_is_solved_without_the_judge(tmp_path):
-    """No import of a search reaches the package that seeks likely mistakes."""
+def test_a_problem_is_solved_without_judge_and_checks(tmp_path):
+    """No import of a search reaches what seeks likely mistakes, nor that of commands the judge."""
     code = (
         "import sys\n"
         "class Blocker:\n"
@@ -129,11 +129,12 @@ def test_a_problem_is_solved_without_the_judge(tmp_path):
         "pull = cs.Specimen('uniaxial', [0.1, 0.2, 0.3], [1e4, 2e4, 3e4], 100.0).experiment()\n"
         "fixed = {'kappa_pa': 1e9, 'gamma_r_s': 0.0, 'gamma_m_1_s': 0.0}\n"
         "print(cs.solve(cs.Problem([pull], {'mu_pa': cs.Unknown()} | fixed)).status.converged)\n"
+        "print('collocation_sysid.runs.check' in sys.modules)\n"
         "import collocation_sysid.cli.problem_commands\n"
     )
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-    assert done.stdout.strip() == "True", done.stderr
+    assert done.stdout.split() == ["True", "False"], done.stderr
 
 
 def test_a_stored_result_is_read_with_all_messages():
@@ -158,6 +159,8 @@ LIFTING = (
     "methods.comparison",
     "problem.problem",
     "runs.check",
+    "runs.cost",
+    "runs.derivatives",
     "testing",
 )
 

@@ -46,7 +46,14 @@ from collocation_sysid.runs.check.body import (
     slenderness,
     worst_elements,
 )
-from collocation_sysid.runs.check.cost import (
+from collocation_sysid.runs.check.modes import (
+    ModeCheck,
+    ModesCheck,
+    check_modes,
+    mode_concerns,
+    numerical_mode,
+)
+from collocation_sysid.runs.cost import (
     FRICTION_FACTOR,
     STATIC_FACTOR,
     MethodCost,
@@ -55,14 +62,7 @@ from collocation_sysid.runs.check.cost import (
     nonzeros,
     search_factor,
 )
-from collocation_sysid.runs.check.derivatives import shortened_problem
-from collocation_sysid.runs.check.modes import (
-    ModeCheck,
-    ModesCheck,
-    check_modes,
-    mode_concerns,
-    numerical_mode,
-)
+from collocation_sysid.runs.derivatives import shortened_problem
 from collocation_sysid.statistics.concerns import Concern
 
 # The tiny problem's bar, stiff enough for 7.7 Hz and little damped, as silicone is.
@@ -387,7 +387,7 @@ def test_tracks_in_another_unit_are_warned_of(tiny: Path):
 
 @pytest.mark.parametrize("scheme", ["backward-euler", "midpoint", "bdf2"])
 def test_nonzeros_are_those_of_the_whole_program(tiny: Path, monkeypatch, scheme: str):
-    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 5)
+    monkeypatch.setattr("collocation_sysid.runs.derivatives.SAMPLES", 5)
     overrides = (f"transcription.scheme={scheme}", "transcription.substeps=2")
     findings = checked(tiny, *overrides)
     whole = Problem.read(tiny / "problem.toml", overrides).collocation()
@@ -457,7 +457,7 @@ def test_times_are_called_estimates_for_the_number_of_samples(tiny: Path):
 
 
 def test_a_method_that_does_not_fit_into_memory_is_warned_of(monkeypatch):
-    monkeypatch.setattr("collocation_sysid.runs.check.cost.machine_memory_mb", lambda: 8000.0)
+    monkeypatch.setattr("collocation_sysid.runs.cost.machine_memory_mb", lambda: 8000.0)
     small, large = (
         MethodCost("reduced-space", 500.0, 10.0),
         MethodCost("interior-point", 40000.0, 1000.0),
@@ -517,7 +517,7 @@ def test_grasps_in_the_same_words_are_shown_once():
 
 def test_a_long_simulation_is_left_out_and_told_unless_asked_for(tiny: Path, monkeypatch):
     monkeypatch.setattr("collocation_sysid.runs.check.LONGEST_SIMULATION_S", 0.0)
-    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.SAMPLES", 4)
+    monkeypatch.setattr("collocation_sysid.runs.derivatives.SAMPLES", 4)
     problem, told = Problem.read(tiny / "problem.toml"), []
     short = check_problem(problem, told.append)
     assert short.rms_at_guess_m is None

@@ -131,7 +131,7 @@ def test_check_counts_the_memory_variables_of_interior_point(tiny, monkeypatch):
     assert findings.derivatives_agree
     assert findings.hessian_error > 0
     assert {cost.method for cost in findings.costs} == {"reduced-space", "interior-point"}
-    monkeypatch.setattr("collocation_sysid.runs.check.derivatives.MOST_LIFTED_NONZEROS", 0)
+    monkeypatch.setattr("collocation_sysid.runs.derivatives.MOST_LIFTED_NONZEROS", 0)
     checked = run_command("check", tiny / "problem.toml", "--details", *settings(GUESSED))
     assert f"{findings.overstresses:,} additional variables and constraints" in checked.out
     assert "τ prony_1" in checked.out

@@ -26,7 +26,7 @@ from collocation_sysid.program.simulation import simulate, with_markers, with_wr
 from collocation_sysid.program.wrench_residual import WrenchResidual
 from collocation_sysid.recording import Experiment, Nuisance
 from collocation_sysid.runs.check import check_problem
-from collocation_sysid.runs.check.derivatives import derivative_errors, shortened_problem
+from collocation_sysid.runs.derivatives import derivative_errors, shortened_problem
 from collocation_sysid.statistics.linearised import linearise_fit
 from collocation_sysid.statistics.pose_noise import uncertainty_at
 from collocation_sysid.statistics.uncertainty import ErrorModel, uncertainty_from_fit

@@ -369,6 +369,20 @@ def test_other_blocks_fall_without_a_good_guess(
 
 
 @pytest.mark.slow
+def test_the_deepest_of_the_minima_of_an_impact_is_found():
+    """From the best stiffness of the scan the search ends in another one, 45 % too stiff."""
+    t_s = np.arange(round(DURATION_S * 120)) / 120
+    truth = TRUTH | {"young_pa": 2e5, "poisson": 0.3}
+    exact_m = cs.simulate(falling_block(4, t_s, "tet4"), truth, "bdf2", substeps=16).markers_m
+    fall = cs.with_markers(falling_block(3, t_s, "tet4"), exact_m + noise_of(1, exact_m.shape))
+    unknown = {name: cs.Unknown() for name in FREE}
+    problem = cs.Problem([fall], truth | unknown, scheme="bdf2", substeps=4)
+    answer = cs.solve(problem)
+    assert answer.parameters["young_pa"] == pytest.approx(2e5, rel=0.1)
+    assert any(note.startswith("the search from E = ") for note in answer.notes)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("young_pa", "are_placed", "seed"), [(8e3, True, 3), (8e3, False, 1), (5e3, False, 2)]
 )

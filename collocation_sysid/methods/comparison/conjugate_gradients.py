@@ -11,10 +11,6 @@ from ...common.array_types import Array
 from ...common.limits import require_time
 from .merit import MeritFunction, MeritPoint
 
-# The line search interpolates values, so that one out of the domain must be a number: this many
-# times the value so far.
-STEEP = 10.0
-
 
 def minimise_conjugate_gradients(
     merit: MeritFunction,
@@ -54,7 +50,8 @@ def minimise_conjugate_gradients(
             point = MeritPoint.evaluate(merit, at)
             if np.isfinite(point.value):
                 return point.value, np.where(at == beyond, unit * point.gradient, 0.0)
-        return STEEP * height + 1e-300, np.zeros(len(s))
+        # The line search interpolates values, so that one out of the domain must be a number.
+        return 10.0 * height + 1e-300, np.zeros(len(s))
 
     def callback(intermediate_result: scipy.optimize.OptimizeResult) -> None:
         nonlocal height, is_reached

@@ -30,16 +30,6 @@ from .merit import MeritFunction, MeritPoint, PenaltyProblem
 
 # The band and its factor may take this much memory [bytes].
 MOST_MEMORY = 8e9
-# First damping.
-DAMPING = 1e-3
-# Smallest damping.
-LEAST_DAMPING = 1e-13
-# Largest damping: beyond it the minimisation ends.
-MOST_DAMPING = 1e12
-# Smallest share of the predicted decrease with which a step is accepted.
-ACCEPTED = 1e-3
-# Longest step of a parameter (of φ, over its reach).
-REACH = 1.0
 # Longest step of a parameter after which the full Hessian is used.
 LOCAL = 0.1
 # Predicted decreases below this share of the merit's value are lost in its rounding.
@@ -71,7 +61,7 @@ def minimise_levenberg_marquardt(
     -------
     bool
         Whether the tolerance was reached; false after `max_iterations` steps, if rounding prevents
-        it, or if no step decreases the merit at the largest damping.
+        it, or if no step decreases the merit.
 
     Raises
     ------
@@ -80,7 +70,7 @@ def minimise_levenberg_marquardt(
     SimulationError
         If the body has no stress-free shape at the parameters of a trial.
     """
-    damping = DAMPING
+    damping = 1e-3
     growth = 2.0
     is_local = False
     order = []
@@ -108,15 +98,15 @@ def minimise_levenberg_marquardt(
                     ratio = 1.0
                     break
                 decrease = point.value - merit.value(trial)
-                if decrease >= ACCEPTED * predicted:
+                if decrease > 0:
                     after = MeritPoint.evaluate(merit, trial)
                     ratio = decrease / predicted
                     break
             damping = damping * growth
             growth = 2 * growth
-            if damping > MOST_DAMPING:
+            if not np.isfinite(damping):
                 return False
-        damping = max(damping * max(1 / 5, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING)
+        damping *= max(1 / 5, 1 - (2 * ratio - 1) ** 3)
         is_local = float(np.abs(step[merit.problem.parameter_indices]).max(initial=0.0)) <= LOCAL
         growth = 2.0
         point = after
@@ -215,8 +205,7 @@ class _QuadraticModel:
         """Return the steps d of the parameters that minimise ½ dᵀ S d + sᵀ d; None if S is not
         positive definite.
 
-        Each step stays within the bounds of its parameter, and is at most `REACH` times its entry
-        of `reach_p`.
+        Each step stays within the bounds of its parameter, and is at most its entry of `reach_p`.
         """
         try:
             factor = cholesky(schur, lower=True)
@@ -224,10 +213,15 @@ class _QuadraticModel:
             return None
         border = self.problem.parameter_indices
         problem = self.problem
-        reach = REACH * problem.reach_p
         # Rounding may leave a parameter on its bound by a hair.
-        low = np.minimum(np.maximum(problem.lower[border] - self.z[border], -reach), 0) - 1e-15
-        high = np.maximum(np.minimum(problem.upper[border] - self.z[border], reach), 0) + 1e-15
+        low = (
+            np.minimum(np.maximum(problem.lower[border] - self.z[border], -problem.reach_p), 0)
+            - 1e-15
+        )
+        high = (
+            np.maximum(np.minimum(problem.upper[border] - self.z[border], problem.reach_p), 0)
+            + 1e-15
+        )
         right = solve_triangular(factor, slope, lower=True)
         return SquareRootInformation(np.column_stack([factor.T, right])).minimiser(low, high)
 

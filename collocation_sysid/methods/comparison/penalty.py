@@ -7,11 +7,9 @@ and one ρ or an increasing sequence. A finite ρ always leaves a violation: for
 applied, which decrease as 1/ρ and bias the parameters.
 
 The augmented Lagrangian updates the multipliers, y ← y + ρ g, so that ρ need not become large: it
-increases only where the violation ‖g‖ did not decrease enough. Stages are solved to tolerances that
-decrease with the violation (J. Nocedal and S. Wright, Numerical Optimization, 2nd ed., framework
-17.3 and algorithm 17.4; the rule for ρ is that of ALGENCAN, R. Andreani et al., SIAM J. Optim. 18,
-2007: the fixed sequence of LANCELOT expects constraints of order one, and would make ρ larger than
-the multipliers need). It converges to the optimum of interior point and reduced space.
+increases only where the violation ‖g‖ did not decrease enough (ALGENCAN, R. Andreani et al., SIAM
+J. Optim. 18, 2007: the fixed sequence of LANCELOT expects constraints of order one, and would make
+ρ larger than the multipliers need). It converges to the optimum of interior point and reduced space.
 
 A solution is converged if the gradient is within `tolerance` and the violation within `violation`;
 the message states the violation.
@@ -41,10 +39,6 @@ from .merit import MeritFunction, PenaltyProblem
 FALL = 0.25
 # The augmented Lagrangian ends if the largest ρ leaves more than this share of the violation.
 STUCK = 0.9
-# Tolerance of its first stage: largest entry of the gradient.
-FIRST_GRADIENT = 1e-3
-# Tolerance of a later stage over that of the previous one.
-TIGHTER = 0.1
 # Iterations between entries of the history; those of conjugate gradients are many and cheap.
 EVERY = {"levenberg-marquardt": 1, "scipy-cg": 20}
 # Rounding leaves about this much of the gradient for every unit of curvature, of the loss or ρ.
@@ -69,8 +63,8 @@ class Stage:
     """One minimisation with fixed ρ and y: its merit function, and its result once it has ended."""
 
     merit: MeritFunction
-    tolerance: float  # tolerance: largest entry of the merit's projected gradient
-    gradient: float = np.inf  # the same at the end of the stage; infinite before
+    # Largest entry of the merit's projected gradient at the end of the stage; infinite before.
+    gradient: float = np.inf
     # Whether the minimum was reached, as far as rounding allows at large ρ.
     is_minimum: bool = False
     violation: ConstraintViolation = ConstraintViolation()  # violation at the end of the stage
@@ -149,11 +143,6 @@ class PenaltyOptions(MethodOptions):
         """Largest ρ of the solve, `rho_max`."""
         return self.rho_max
 
-    @property
-    def first_gradient(self) -> float:
-        """Tolerance of the first stage: largest entry of the merit's projected gradient."""
-        return self.tolerance
-
     def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage.
 
@@ -218,11 +207,11 @@ class Penalty(PenaltyOptions):
             raise SearchEnded(
                 Status.ITERATION_LIMIT,
                 f"The last stage ended before its minimum: its gradient is {stage.gradient:.2g}, above "
-                f"the tolerance {stage.tolerance:.2g}. Raise inner_iterations or choose another inner "
+                f"the tolerance {self.tolerance:.2g}. Raise inner_iterations or choose another inner "
                 "solver.",
             )
         rho = min(self.rho_factor * rho, self.last_rho)
-        return Stage(replace(stage.merit, rho=rho), self.tolerance)
+        return Stage(replace(stage.merit, rho=rho))
 
 
 @validated
@@ -231,11 +220,6 @@ class AugmentedLagrangian(PenaltyOptions):
 
     name: ClassVar[str] = "augmented-lagrangian"
 
-    @property
-    def first_gradient(self) -> float:
-        """Tolerance of the first stage: `FIRST_GRADIENT`, or that of the last if it is larger."""
-        return max(FIRST_GRADIENT, self.tolerance)
-
     def next_stage(self, stage: Stage, previous_violation: ConstraintViolation, z: Array) -> Stage:
         """Return the next stage with updated multipliers, and a larger ρ if much violation remains;
         see `PenaltyOptions.next_stage` for the arguments.
@@ -243,19 +227,14 @@ class AugmentedLagrangian(PenaltyOptions):
         Raises
         ------
         SearchEnded
-            With the status `STALLED`, if the tolerance is the last one, ρ is at its limit or the
-            violation within `violation`, and more than the share `STUCK` of it remained.
+            With the status `STALLED`, if ρ is at its limit or the violation within `violation`, and
+            more than the share `STUCK` of it remained.
         """
         rho = stage.merit.rho
-        tolerance = stage.tolerance
         slack = stage.violation
         is_feasible = slack.relative <= self.violation
         is_last = rho >= self.rho_max or is_feasible
-        if (
-            is_last
-            and tolerance <= self.tolerance
-            and slack.scaled > STUCK * previous_violation.scaled
-        ):
+        if is_last and slack.scaled > STUCK * previous_violation.scaled:
             if stage.is_minimum:
                 raise SearchEnded(
                     Status.STALLED,
@@ -265,13 +244,13 @@ class AugmentedLagrangian(PenaltyOptions):
             raise SearchEnded(
                 Status.STALLED,
                 f"The last stage ended with a gradient of {stage.gradient:.2g}, above its tolerance "
-                f"{tolerance:.2g}; choose another inner solver, which may reach the tolerance.",
+                f"{self.tolerance:.2g}; choose another inner solver, which may reach the tolerance.",
             )
         if not is_feasible and slack.scaled > FALL * previous_violation.scaled:
             rho = min(self.rho_factor * rho, self.rho_max)
         rows = stage.merit.problem.constraint_values(z)
         merit = replace(stage.merit, rho=rho, multipliers=stage.merit.multiplier_estimate(rows))
-        return Stage(merit, max(0.0 if is_feasible else TIGHTER * tolerance, self.tolerance))
+        return Stage(merit)
 
 
 class _PenaltySolve:
@@ -315,7 +294,7 @@ class _PenaltySolve:
             raise InputError("elements are inverted at the initial point; give another guess")
         no_weights = np.zeros(nlp.constraint_count)
         merit = MeritFunction(self.problem, options.rho, multipliers=no_weights)
-        self.stage = Stage(merit, options.first_gradient)
+        self.stage = Stage(merit)
         self.iterations = 0
         self.gradient = np.inf
         curvature = nlp.hessian(self.variables, 1.0, multipliers=no_weights).diagonal()
@@ -339,11 +318,7 @@ class _PenaltySolve:
         while True:
             ended_stage = self._minimise()
             is_feasible = ended_stage.violation.relative <= options.violation
-            if (
-                ended_stage.is_minimum
-                and is_feasible
-                and ended_stage.tolerance <= options.tolerance
-            ):
+            if ended_stage.is_minimum and is_feasible:
                 message = (
                     "Converged: the gradient and the violation of the equations of motion are within "
                     "their tolerances."
@@ -381,7 +356,7 @@ class _PenaltySolve:
         stage = self.stage
         options = self.options
         recorder = self.recorder
-        tolerance = max(stage.tolerance, ROUNDING * (stage.merit.rho + self._curvature))
+        tolerance = max(options.tolerance, ROUNDING * (stage.merit.rho + self._curvature))
         before = self.iterations
         done = 0
 

@@ -39,8 +39,6 @@ from ..starts.initial_trajectories import complete_variables, simulate_trajector
 ROUNDING = 1e-14
 # A line search that ends in rounding has found the optimum where no slope of the loss is larger.
 LEAST_GRADIENT_TOLERANCE = 1e-5
-# Pairs of steps and gradients that L-BFGS-B remembers.
-MEMORY = 20
 
 
 @validated
@@ -270,7 +268,6 @@ class _ShootingSearch:
             options={
                 "gtol": self.options.tolerance,
                 "ftol": ROUNDING,
-                "maxcor": MEMORY,
                 "maxiter": 10 * self.options.max_iterations + 10,  # shots are counted here
                 "maxfun": 10 * self.options.max_iterations + 10,
             },

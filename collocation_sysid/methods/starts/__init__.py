@@ -4,5 +4,4 @@
   from closed forms of specimens.
 - `initial_trajectories`: motions at the guess; `initial_point`: a coarse solution by reduced space, for
   interior point.
-- `continuation`: searches of the first samples, from which the search of all samples begins.
 """

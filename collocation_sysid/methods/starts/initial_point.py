@@ -3,10 +3,9 @@
 A step of interior point factorises the matrix of all positions and parameters, which takes as long
 as dozens of sweeps of reduced space. Far from the optimum its steps also move nuisance parameters
 by many prior deviations, because the equations of motion hold only at the end. So reduced space
-first brings the parameters near the optimum, along motions that satisfy the equations of motion,
-and then to its own tolerance, as long as that takes few sweeps. IPOPT solves the whole program from
-these positions, parameters and multipliers; where they satisfy its conditions it factorises
-nothing.
+first brings the parameters to the optimum, along motions that satisfy the equations of motion. IPOPT
+solves the whole program from these positions, parameters and multipliers; where they satisfy its
+conditions it factorises nothing.
 """
 
 from __future__ import annotations
@@ -25,15 +24,11 @@ from ..reduced_space import ReducedSpace
 from ..solution import Iteration, Solution, Status, constraint_multipliers
 from ..solve_recorder import Recorder, SearchEnded
 
-# Longest last step of a parameter's logarithm: Newton's method converges quadratically from there.
-LARGEST_CORRECTION = 1e-3
+# Longest last step of a parameter's logarithm, below the tolerance of reduced space: times the
+# curvature of the loss it is the error of IPOPT's conditions.
+LARGEST_CORRECTION = 1e-12
 # Sweeps after which the best point so far is taken: the work of a few iterations of IPOPT.
 MAX_SWEEPS = 100
-# Longest last step of the refinement, below the tolerance of reduced space: times the curvature of
-# the loss it is the error of IPOPT's conditions.
-REFINED_CORRECTION = 1e-12
-# Sweeps of the refinement: less work than the factorisations of one iteration of IPOPT.
-REFINING_SWEEPS = 20
 # How a coarse solve may end without a point that is worth starting from.
 UNUSABLE = (Status.NOT_SIMULABLE, Status.NUMERICAL_FAILURE, Status.DIVERGED)
 
@@ -47,7 +42,7 @@ class InitialPoint:
     coarse: Solution
     # Whether its variables satisfy the equations of motion to the end of the recordings.
     is_usable: bool
-    # Whether the optimum is within about `LARGEST_CORRECTION`, so that Newton's method converges.
+    # Whether it is an optimum, so that Newton's method converges.
     is_close: bool
     note: str  # explanation for the user how the point was computed
 
@@ -68,24 +63,16 @@ def compute_initial_point(
     max_time_s : float
         Time after which the search ends with `Status.TIME_LIMIT` [s].
     """
-    coarse = _search(
-        recorder,
-        recorder.collocation,
-        start=start,
-        method=ReducedSpace(tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS),
-        max_time_s=max_time_s,
-    )
+
+    def record(line: Iteration) -> None:
+        recorder.add(replace(line, time_s=recorder.measure_elapsed_s()))
+        if recorder.measure_elapsed_s() > max_time_s:
+            raise SearchEnded(Status.TIME_LIMIT)
+
+    method = ReducedSpace(tolerance=LARGEST_CORRECTION, max_iterations=MAX_SWEEPS)
+    coarse = method(recorder.collocation, record, start)
     is_usable = _reaches_end(coarse)
     is_close = is_usable and coarse.status is Status.CONVERGED
-    if is_close:
-        refined = _search(
-            recorder,
-            coarse.collocation,
-            start=coarse.z,
-            method=ReducedSpace(tolerance=REFINED_CORRECTION, max_iterations=REFINING_SWEEPS),
-            max_time_s=max_time_s,
-        )
-        coarse = _refined_solution(coarse, refined)
     count = coarse.iterations
     sweeps = (
         f"{count} sweep{'s' * (count != 1)} of reduced space"
@@ -100,27 +87,6 @@ def compute_initial_point(
     return InitialPoint(coarse, is_usable, is_close=is_close, note=note)
 
 
-def _search(
-    recorder: Recorder,
-    collocation: Collocation,
-    *,
-    start: Array | None,
-    method: ReducedSpace,
-    max_time_s: float,
-) -> Solution:
-    """Search, and add every iteration to the recorder, with its numbers continued."""
-    first_number = recorder.history[-1].number + 1 if recorder.history else 0
-
-    def record(line: Iteration) -> None:
-        recorder.add(
-            replace(line, number=first_number + line.number, time_s=recorder.measure_elapsed_s())
-        )
-        if recorder.measure_elapsed_s() > max_time_s:
-            raise SearchEnded(Status.TIME_LIMIT)
-
-    return method(collocation, record, start)
-
-
 def _reaches_end(solution: Solution) -> bool:
     """Return whether variables satisfy the equations of motion to the end of the recordings."""
     # Reduced space gives multipliers only where a part of the trajectory was not simulated.
@@ -128,23 +94,6 @@ def _reaches_end(solution: Solution) -> bool:
         solution.initial_multipliers is None
         and solution.status not in UNUSABLE
         and bool(np.isfinite(solution.z).all())
-    )
-
-
-def _refined_solution(coarse: Solution, refined: Solution) -> Solution:
-    """Return the refined solution, or the coarse one if it failed, with the work of both."""
-    # The status is that of the coarse solution, unless the refinement was interrupted or late.
-    both = refined.after(coarse, why="")
-    if refined.status in (Status.INTERRUPTED, Status.TIME_LIMIT):
-        return both
-    best = both if _reaches_end(refined) else coarse
-    return replace(
-        best,
-        status=coarse.status,
-        message=coarse.message,
-        iterations=both.iterations,
-        evaluations=both.evaluations,
-        timing=both.timing,
     )
 
 

@@ -25,17 +25,12 @@ from ...recording.specimen import RELAXED_STRAIN
 from ...recording.specimen_files import specimen_strains
 from .start import Start
 
-# Relaxation times of the grid for each decade, and how far it reaches beyond the measured times.
+# Relaxation times of the grid for each decade of the measured times.
 PER_DECADE = 4
-REACH = 10.0
-# Strength of a time of the grid, over the largest one, from which on it belongs to the spectrum.
+# Strength of a time of the grid, over the largest one, from which on it belongs to the spectrum, and
+# the smallest share of spring and branch over the others at the start.
 PRESENT = 1e-3
-# Evaluations of a fit, and of each start before the best one is continued.
-MOST_EVALUATIONS = 1000
-FEW = 60
 SMALL_STRAIN = ("uniaxial", "simple-shear")  # kinds of test of such a table
-# Smallest share of spring and branch over the others at the start.
-SOFTEST = 1e-3
 # Largest difference of a strain from that of a table, by rounding of the positions.
 CLOSE = 1e-9
 # Loss at the guesses over that of the closed form up to which guesses are kept.
@@ -164,8 +159,8 @@ class _MemoryFit:
         for times_s in [given, even, *([largest] if len(largest) == count else [])]:
             q = shifted.copy()
             q[[self.items[name] for name in order]] = np.log(times_s)
-            tried.append(self._fit(self._with_strengths(np.clip(q, self.lower, self.upper)), FEW))
-        best = self._fit(min(tried, key=lambda fit: fit.cost).x, MOST_EVALUATIONS)
+            tried.append(self._fit(self._with_strengths(np.clip(q, self.lower, self.upper))))
+        best = min(tried, key=lambda fit: fit.cost)
         at_guess = 0.5 * float(np.sum(self._residuals(first) ** 2))
         if not at_guess > AS_GOOD * best.cost:
             return None
@@ -177,11 +172,9 @@ class _MemoryFit:
             }
         )
 
-    def _fit(self, q: Array, evaluations: int) -> scipy.optimize.OptimizeResult:
+    def _fit(self, q: Array) -> scipy.optimize.OptimizeResult:
         bounds = (self.lower, self.upper)
-        return scipy.optimize.least_squares(
-            self._residuals, q, bounds=bounds, x_scale="jac", max_nfev=evaluations
-        )
+        return scipy.optimize.least_squares(self._residuals, q, bounds=bounds, x_scale="jac")
 
     def _in_order(self, q: Array, order: Sequence[str]) -> Array:
         """Exchange branches so that relaxation times ascend as the guesses do, if admissible."""
@@ -240,10 +233,8 @@ class _MemoryFit:
                     for t in self.tables
                 ]
             )
-            decades = np.log10(ends.max() / ends.min()) + 2 * np.log10(REACH)
-            return np.geomspace(
-                1 / (REACH * ends.max()), REACH / ends.min(), 1 + int(PER_DECADE * decades)
-            )
+            decades = np.log10(ends.max() / ends.min())
+            return np.geomspace(1 / ends.max(), 1 / ends.min(), 1 + int(PER_DECADE * decades))
 
         def misfit(of_shifts: Array) -> Array:
             at = q.copy()
@@ -265,11 +256,11 @@ class _MemoryFit:
         values = self.parameters.values(q)
         spring, *strengths = self._strengths(q, np.array([values[tau] for _, tau in self.names]))[0]
         # Shares of a liquid are as large as their bounds.
-        spring = max(spring, SOFTEST * (spring + sum(strengths)))
+        spring = max(spring, PRESENT * (spring + sum(strengths)))
         q = q.copy()
         for (share, _), strength in zip(self.names, strengths, strict=True):
             k = self.items[share]
-            q[k] = self.parameters.free[k].to_coordinate(max(strength / spring, SOFTEST))
+            q[k] = self.parameters.free[k].to_coordinate(max(strength / spring, PRESENT))
         q = np.clip(q, self.lower, self.upper)
         # The model is proportional to the modulus: w (c m − y) has its smallest norm at this c.
         data = np.concatenate([table.weights * table.moduli_pa for table in self.tables])

@@ -35,18 +35,13 @@ from .start import Start
 
 # Sizes of the exponents of the grid, each with both signs.
 GRID = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 18.0, 22.0)
-# Share of the largest exponent that counts as at its bound.
-AT_BOUND = 0.99
 # β of the grid; the largest one is nearly incompressible.
 BETA_GRID = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
 # Least distance of two exponents: nearer ones are one term and its derivative by the exponent,
 # with factors of opposite signs that grow without bound.
 SEPARATION = 0.5
-# Combinations of the grid that are improved, and their least relative distance.
+# Combinations of the grid that are improved.
 MOST_IMPROVED = 4
-DISTINCT = 0.4
-# Most evaluations of an improvement.
-MOST_EVALUATIONS = 1000
 # Difference of χ², over χ² of one measurement, up to which fits count as equal: smaller exponents
 # are then preferred.
 EQUAL_LOSS = 4.0
@@ -58,10 +53,6 @@ MOST_DEVIATIONS = 3.0
 # Largest χ² of one measurement with two exponents that run together: of a misfit of the law itself
 # they explain a little more with factors that cancel, and a search among such terms does not end.
 MOST_TOGETHER = 2.0
-# Exponents nearer to zero are replaced by this one: the quotients by α lose digits.
-SMALLEST_EXPONENT = 1e-5
-# Largest exponent of e in a power of a stretch.
-LARGEST_LOGARITHM = 300.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +268,7 @@ class _PowerLawFits:
     def _exponents(self, distances: Array) -> Array:
         """Return exponents from the first one and the distances of the others, none of them 0."""
         alpha = np.minimum(np.cumsum(distances), self.highest)
-        return np.where(np.abs(alpha) < SMALLEST_EXPONENT, SMALLEST_EXPONENT, alpha)
+        return np.where(np.abs(alpha) < 1e-5, 1e-5, alpha)  # quotients by α would lose digits
 
     # Fits ---------------------------------------------------------------------------------------
 
@@ -312,10 +303,7 @@ class _PowerLawFits:
             found += [(loss[k], grid[chosen[k]], beta) for k in best if np.isfinite(loss[k])]
         starts: list[tuple[Array, float | None]] = []
         for _, alpha, beta in sorted(found, key=lambda each: each[0]):
-            if all(
-                (np.abs(alpha - other) > DISTINCT * (1 + np.abs(other))).any()
-                for other, _ in starts
-            ):
+            if all((alpha != other).any() for other, _ in starts):
                 starts.append((alpha, beta))
         return starts[:MOST_IMPROVED]
 
@@ -505,7 +493,7 @@ class _PowerLawFits:
             lambda item: _started(self.items[item.name], guesses, fixed=fixed, tied=tied)
         )
         is_at_bound = not (
-            AT_BOUND * self.lowest < fit.alpha.min() and fit.alpha.max() < AT_BOUND * self.highest
+            0.99 * self.lowest < fit.alpha.min() and fit.alpha.max() < 0.99 * self.highest
         )
         return PowerLawStart(
             self.collocation.with_parameters(parameters),
@@ -584,9 +572,7 @@ def _least_squares(
     residuals: Callable[[Array], Array], start: Array, lower: Array, upper: Array
 ) -> scipy.optimize.OptimizeResult:
     inside = np.clip(start, lower, upper)
-    return scipy.optimize.least_squares(
-        residuals, inside, bounds=(lower, upper), x_scale="jac", max_nfev=MOST_EVALUATIONS
-    )
+    return scipy.optimize.least_squares(residuals, inside, bounds=(lower, upper), x_scale="jac")
 
 
 def _started(
@@ -666,7 +652,7 @@ def _nominal_stresses(
 
 def _power(logarithm: Array, exponent: Array) -> Array:
     """Return e^(l a) as (T, n) for logarithms (T,) and exponents (n,)."""
-    return np.exp(np.clip(np.outer(logarithm, exponent), -LARGEST_LOGARITHM, LARGEST_LOGARITHM))
+    return np.exp(np.clip(np.outer(logarithm, exponent), -300.0, 300.0))  # finite
 
 
 def _test(experiment: Experiment, is_foam: bool) -> _Test | None:

@@ -50,14 +50,8 @@ from .memory import memory_start
 from .power_law import power_law_start
 from .start import NO_GUESS, Scan, Start, beyond_default
 
-# Largest Young's modulus of the scan [Pa].
-STIFFEST_PA = 1e7
-# Smallest Young's modulus of the scan [Pa].
-SOFTEST_PA = 1e2
-# Number of moduli in the scan, equally spaced on a logarithmic scale.
-STEPS = 15
-# Largest and smallest modulus when the scan continues beyond an end [Pa].
-LIMITS_PA = 1e13, 1.0
+# Young's moduli of the scan, three in a decade [Pa].
+SCAN_PA: list[float] = np.geomspace(1e7, 1e2, 15).tolist()
 # Typical Young's modulus of a soft body, where nothing is known [Pa].
 SOFT_PA = 1e4
 # Factors of the usual stiffnesses of a section, which are those of a cable, and of the first modulus
@@ -88,9 +82,8 @@ CLEARLY_BETTER = 1.2
 # Largest error of a pose, clock or place in a scan, in standard deviations of its prior: larger ones
 # would fit wrong stiffnesses.
 LARGEST_ERROR = 3.0
-# Change of the errors, in the same unit, that ends the steps to those that fit best.
-SMALL_ERROR = 1e-3
-# Change of an error, in the same unit, for derivatives of distances without correspondences.
+# Change of an error, in the same unit, for derivatives of distances without correspondences, and the
+# smallest step to errors that fit better.
 DIFFERENCE = 1e-3
 # Most steps to the errors that fit best: a turned camera takes about six.
 NUISANCE_STEPS = 10
@@ -136,7 +129,7 @@ def start_problem(collocation: Collocation, is_complete: bool = False) -> Start:
         result = scan_stiffness(collocation, is_complete=is_complete)
         return Start(collocation.with_parameters(result.parameters), scan=result)
     if unguessed:
-        usual = typical_parameters(collocation.parameters, STIFFEST_PA)
+        usual = typical_parameters(collocation.parameters, SCAN_PA[0])
         collocation = _stiff_enough(collocation.with_parameters(usual), unguessed)
     if not _has_free_modulus(collocation):
         return Start(collocation)
@@ -289,16 +282,15 @@ def _tried(trial: TrialSimulation) -> ScanState:
     with a stiffer body if the first one cannot be simulated.
     """
     trials = ScanState(trial)
-    step = (SOFTEST_PA / STIFFEST_PA) ** (1 / (STEPS - 1))
-    young_pa = [STIFFEST_PA * step**k for k in range(STEPS)]
+    step = SCAN_PA[1] / SCAN_PA[0]
     low, high = trial.bounds_pa
-    within = [young for young in young_pa if low <= young <= high] or [math.sqrt(abs(low * high))]
+    within = [young for young in SCAN_PA if low <= young <= high] or [math.sqrt(abs(low * high))]
     raised = [within[0] * factor for factor in RAISED if within[0] * factor <= max(within[0], high)]
     with counted_phase(StepUnit.STIFFNESS, len(within)):
         for first in raised:
             trials.try_sequence([first])
             if np.isfinite(trials.misfits[first]):
-                softer = (first * step**k for k in range(1, 2 * STEPS))
+                softer = (first * step**k for k in range(1, 2 * len(SCAN_PA)))
                 within = [first, *(young for young in softer if young >= within[-1])]
                 break
         trials.try_sequence(within[1:])
@@ -435,7 +427,7 @@ def _misfit(collocation: Collocation, p: Array, positions: Sequence[Array]) -> f
         gain = loss - other.loss(other_phi)
         if gain > 0:
             fit, phi, loss = other, other_phi, loss - gain
-        if step < SMALL_ERROR or 0 <= gain < BETTER * loss:
+        if step < DIFFERENCE or 0 <= gain < BETTER * loss:
             break
         if not gain > 0:
             reach = step / 4
@@ -462,8 +454,8 @@ def _nuisance_fit(
 def _residuals(iterate: ExperimentIterate) -> Iterator[tuple[Array, Array]]:
     """Yield the residuals (m,) of each measurement, and their derivatives (m, k) by φ."""
     phi, grasp = iterate.phi, iterate.transcription.nuisance.grasp_indices
-    moved = _moved_in_grasp(iterate, phi)
-    others = [_moved_in_grasp(iterate, phi + one) for one in np.eye(len(phi))[grasp]]
+    changes = np.eye(len(phi))[grasp]
+    moved, *others = _moved_in_grasp(iterate, phi + np.vstack([0 * phi, changes]))
     for k, (residual, slope) in enumerate(moved.linearise_fixed_motion()):
         kind = iterate.transcription.residuals[k]
         # Cameras are compared by `rough_residuals`, which need no correspondences.
@@ -484,17 +476,18 @@ def _residuals(iterate: ExperimentIterate) -> Iterator[tuple[Array, Array]]:
         yield residual[is_compared], slope[is_compared]
 
 
-def _moved_in_grasp(iterate: ExperimentIterate, phi: Array) -> ExperimentIterate:
-    """Return a motion rigidly moved by the errors in φ (k,) of the pose in its grasp."""
+def _moved_in_grasp(iterate: ExperimentIterate, phis: Array) -> list[ExperimentIterate]:
+    """Return a motion rigidly moved by the errors in each φ (m, k) of the pose in its grasp."""
     transcription, nuisance = iterate.transcription, iterate.transcription.nuisance
-    if not phi[nuisance.grasp_indices].any():
-        return iterate
+    if not len(nuisance.grasp_indices):
+        return [iterate] * len(phis)
     t_s = transcription.dynamics.t_s[: len(iterate.x)]
     rotations, translations = transcription.experiment.rigid_motion(t_s)
     held = (iterate.x.reshape(len(t_s), -1, 3) - translations[:, None]) @ rotations
-    error = nuisance.grasp_motion_matrix(phi)
-    moved = (held @ error[:3, :3].T + error[:3, 3]) @ rotations.transpose(0, 2, 1)
-    return replace(iterate, x=(moved + translations[:, None]).reshape(len(t_s), -1))
+    errors = nuisance.grasp_motion_matrix(phis)[:, None, :3]
+    turns = (rotations @ errors[..., :3]).swapaxes(-1, -2)
+    shifts = translations[:, None] + (rotations @ errors[..., 3:]).swapaxes(-1, -2)
+    return [replace(iterate, x=each.reshape(len(t_s), -1)) for each in held @ turns + shifts]
 
 
 def _answer(collocation: Collocation, p: Array, positions: Sequence[Array]) -> Solution:
@@ -691,8 +684,8 @@ class ScanState:
 
     def extend_range(self, young_pa: float, factor: float) -> None:
         """Try moduli beyond an end of the range, as long as each decreases the misfit by more than
-        the share `BETTER`, or by more than the modulus before, within `LIMITS_PA`; their misfits
-        are stored, also that of the last one.
+        the share `BETTER`, or by more than the modulus before; their misfits are stored, also that
+        of the last one.
 
         Towards stiffer ones also `MOST_WORSE` in a row may be worse, as long as each moves otherwise
         than the one before: the misfit of a body that vibrates has local minima over the stiffness.
@@ -711,8 +704,7 @@ class ScanState:
         inside = min(self.misfits, key=lambda each: abs(np.log(each * factor / young_pa)))
         decrease = self.misfits[inside] - last
         beyond = young_pa * factor
-        softest = max(LIMITS_PA[1], self.trial.bounds_pa[0])
-        stiffest = min(LIMITS_PA[0], self.trial.bounds_pa[1])
+        softest, stiffest = self.trial.bounds_pa
         worse = 0
         while softest < beyond < stiffest and last > EXPLAINED:
             before = self.last_trajectories

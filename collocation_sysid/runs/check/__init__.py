@@ -1,8 +1,8 @@
 """Check of a problem before it is solved: contents, cost, and likely mistakes.
 
 `check_problem` does everything, `quick_check` what takes no simulation. The modules contribute
-`body` (meshes and grasps), `measurements`, `modes` (natural modes and the time grid), `cost` and
-`derivatives`. Every warning is one sentence that ends with the remedy.
+`body` (meshes and grasps), `measurements` and `modes` (natural modes and the time grid), and of
+`runs` `cost` and `derivatives`. Every warning is one sentence that ends with the remedy.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ from ...statistics.hypothesis import Hypothesis, rank
 from ...statistics.plausibility import size_and_density_hypotheses
 from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
+from ..cost import LONG_SOLVE_S, MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
+from ..derivatives import derivative_errors, shortened_problem
 from ..expected_precision import expected_precision, views_note, with_measurements
 from ..facts import facts, sentences
 from .body import (
@@ -56,8 +58,6 @@ from .body import (
     longest_edges,
     slenderness,
 )
-from .cost import LONG_SOLVE_S, MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
-from .derivatives import derivative_errors, shortened_problem
 from .measurements import MarkerCheck, RecordingCheck, check_recording, recording_concerns
 from .modes import ModeCheck, ModesCheck, check_modes, mode_concerns, mode_notes
 

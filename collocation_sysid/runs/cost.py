@@ -10,18 +10,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ...common.array_types import Array
-from ...common.limits import machine_memory_mb
-from ...errors import InputError, SimulationError
-from ...methods.interior_point import InteriorPoint
-from ...methods.reduced_space import ReducedSpace, memory_mb
-from ...problem import Problem
-from ...program.collocation import Collocation
-from ...program.lifted.collocation import lifted_nonzeros, with_lifted_variables
-from ...program.linear_algebra.factorisation import Choice
-from ...program.sweep import Sweep
-from ...recording.experiment import Experiment
-from ...statistics.concerns import Concern
+from ..common.array_types import Array
+from ..common.limits import machine_memory_mb
+from ..errors import InputError, SimulationError
+from ..methods.interior_point import InteriorPoint
+from ..methods.reduced_space import ReducedSpace, memory_mb
+from ..problem import Problem
+from ..program.collocation import Collocation
+from ..program.lifted.collocation import lifted_nonzeros, with_lifted_variables
+from ..program.linear_algebra.factorisation import Choice
+from ..program.sweep import Sweep
+from ..recording.experiment import Experiment
+from ..statistics.concerns import Concern
 from .derivatives import shortened_problem
 
 # Memory per nonzero [bytes]: IPOPT with MUMPS, midpoint, 60 to 170 nodes and 80 to 100 steps.

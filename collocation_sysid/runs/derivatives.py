@@ -9,12 +9,12 @@ from functools import partial
 
 import numpy as np
 
-from ...common.array_types import Array
-from ...model.contact.force import contact_terms
-from ...problem import Problem
-from ...program.collocation import Collocation, convert_variables
-from ...program.lifted.collocation import lifted_nonzeros, with_lifted_variables
-from ...recording.measurement_selection import shortened_experiment
+from ..common.array_types import Array
+from ..model.contact.force import contact_terms
+from ..problem import Problem
+from ..program.collocation import Collocation, convert_variables
+from ..program.lifted.collocation import lifted_nonzeros, with_lifted_variables
+from ..recording.measurement_selection import shortened_experiment
 
 # First samples of a motion that contain all kinds of equations; more would not change derivatives.
 SAMPLES = 12
