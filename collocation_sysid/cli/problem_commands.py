@@ -272,7 +272,7 @@ def check(
     with shown_progress("preparing the complete program", quiet=output.quiet) as progress:
         findings = check_problem(problem, progress.say, full=full)
     output.print_result(findings.as_dict(), full_check_tables(findings, details))
-    good = findings.derivatives_agree and not findings.causes
+    good = not (findings.derivative_fault or findings.causes)
     raise typer.Exit(0 if good else EXIT_NOT_CONVERGED)
 
 

@@ -523,16 +523,20 @@ class Body(Discretisation):
             tuple(replace(part, field=own) for part, own in zip(self.parts, fields, strict=True))
         )
 
-    def with_parts(self, parts: tuple[BodyPart, ...]) -> Body:
-        """Return a copy of this body with other parts, in the same number and with the same cells.
+    def with_parts(
+        self, parts: tuple[BodyPart, ...], forces: tuple[NodeForce, ...] | None = None
+    ) -> Body:
+        """Return a copy of this body with other parts, in the same number and with the same cells,
+        and other custom forces if they are given.
 
-        Custom forces and friction coefficients stay, and so do stated masses (`node_mass`) and
+        Friction coefficients stay, and so do stated masses (`node_mass`) and
         obstacle frames; θ and everything that depends on it follow the new parts.
         """
         other = copy(self)
         for name in self._list_cached_names() - {"pattern", "shape_gradients", "part_of_cells"}:
             vars(other).pop(name, None)
-        ConstantsModel.__init__(other, parts, forces=self.forces, frictions=self.frictions)
+        forces = self.forces if forces is None else forces
+        ConstantsModel.__init__(other, parts, forces=forces, frictions=self.frictions)
         other._evaluators = {}
         other._framed = {}
         return other

@@ -179,6 +179,8 @@ class ReducedSearch:
     ended_by_association : bool
         Whether the last `minimise` ended because new correspondences changed the loss by more than
         short steps did, while a full step was longer than a standard error of a parameter.
+    trust, noise : float
+        Trust region of the last trial, and noise of the loss, see `Iteration`.
     indefinite_steps : int
         Time steps with an indefinite matrix at the best point.
     edge_m, size_m : float
@@ -353,12 +355,9 @@ class ReducedSearch:
         assert self.trajectories is not None
         self.ended_by_association = False
         start = horizon.evaluate(self.p, self.trajectories, known_iterate=self.point)
+        self.trust, self.noise = min(self.options.trust, self.largest_trust), 0.0
         point = self._accept(self._reassociate(horizon, start))
-        state = SearchState(
-            point,
-            np.zeros((len(point.p), len(point.p))),
-            trust=min(self.options.trust, self.largest_trust),
-        )
+        state = SearchState(point, np.zeros((len(point.p), len(point.p))), trust=self.trust)
         while True:
             step = self._next_step(state, state.trust)
             status = self._outcome(horizon, state, step, is_last)
@@ -437,6 +436,7 @@ class ReducedSearch:
         """Return the state after the trial of a step (np,), which is accepted or not."""
         point = state.point
         length = self._step_length(step)
+        self.trust = state.trust
         trial, swept = self._try(horizon, state, step)
         state = replace(state, swept=swept)
         predicted = self._predicted(state, step)
@@ -465,6 +465,8 @@ class ReducedSearch:
                     rises=state.rises + has_risen,
                 )
             self._set_collocation(horizon, *known)
+        self.noise = abs(actual - predicted)
+        self._record(point.p, point.trajectories, loss=point.loss, reached=point.reports)
         if not state.rejections and point.feasibility_m > POLICY.feasible * self.size_m:
             point = self._make_feasible(horizon, point)
         return replace(
@@ -472,7 +474,7 @@ class ReducedSearch:
             point=point,
             trust=POLICY.shrink * length,
             rejections=state.rejections + 1,
-            noise=abs(actual - predicted),
+            noise=self.noise,
         )
 
     def _is_near(self, point: Iterate, step: Array, share: float) -> bool:
@@ -624,5 +626,7 @@ class ReducedSearch:
                 parameters=values,
                 time_s=time_s,
                 share=share,
+                trust=self.trust,
+                noise=self.noise,
             )
         )

@@ -132,6 +132,11 @@ class Iteration:
         Time since the solve began [s].
     share : float
         Share of the time steps that are solved, at most 1.
+    trust : float
+        Trust region of the last trial of reduced space, as in `SearchOptions.trust`; NaN for methods
+        without one.
+    noise : float
+        Noise of the loss: actual less predicted decrease of the trial that was rejected last; 0 before.
     """
 
     number: int
@@ -141,6 +146,8 @@ class Iteration:
     parameters: dict[str, float]
     time_s: float
     share: float = 1.0
+    trust: float = field(default=np.nan, repr=False)
+    noise: float = field(default=np.nan, repr=False)
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,8 @@ PICTURE_CAPTIONS = {
     "combinations. Blue: narrower than the value; orange: not determined.",
     "correlation": "Correlation of the estimates, for the same uncertainty.",
     "budget": "Contributions to the variance of each estimate.",
-    "convergence": "Loss, violation of the dynamics and parameters over the iterations.",
+    "convergence": "Loss, violation of the dynamics, trust region, noise of the loss and parameters "
+    "over the iterations.",
     "scan": "Scan of the stiffness for an initial guess: misfit of the first part of the "
     "recordings.",
     "elements": "Size and quality of the elements.",

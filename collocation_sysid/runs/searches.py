@@ -98,8 +98,8 @@ class Searches:
         Another solution is better if it converges, and the best one before did not, or has a loss
         that is higher by more than `LEAST_GAIN`. A search ends early where it cannot become better:
         if a part of the recordings has a higher loss than the best solution, or where that was
-        found. The history, counts and times are those of all searches; the last part of the history
-        is that of the returned solution.
+        found. The history and the times are those of all searches, with that of the returned solution
+        last; the counts are its own.
         """
         searched = [best.collocation.parameters]
         for next_start in further_starts:
@@ -189,8 +189,14 @@ def _better(best: Solution, other: Solution, name: str) -> Solution:
         )
         is_noted = best.status.converged and not has_converged and gain > LEAST_GAIN
         notes = (*best.notes, worse) if is_noted else best.notes
-        return replace(best.after(other, ""), notes=notes, scan=best.scan)
-    return replace(other.after(best, ""), notes=(note, *other.notes), scan=other.scan)
+        return replace(after(best, other), notes=notes)
+    return replace(after(other, best), notes=(note, *other.notes))
+
+
+def after(solution: Solution, earlier: Solution) -> Solution:
+    """Return a solution with history and times of an earlier search before its own; counts are its own."""
+    both = solution.after(earlier, "")
+    return replace(solution, history=both.history, timing=both.timing)
 
 
 def _search(

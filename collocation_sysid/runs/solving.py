@@ -30,7 +30,7 @@ from .branch_order import with_ascending_times, without_limitless_shares
 from .cost import require_memory
 from .facts import facts, sentences
 from .forward_simulation import fit_misfits
-from .searches import Searches
+from .searches import Searches, after
 from .several_starts import FAILED_STATUSES, SECOND_STARTS, after_failure, of_scan
 from .smaller_problem import CoarseStart, NoStartError, SmallerProblem, ThinnedStart
 from .warm_start import WarmStart
@@ -66,9 +66,8 @@ def solve(
     There may be several searches, one after another, see `searches`: of smaller problems first, see
     `smaller_problem`; from other starts, where the first may have ended in a worse optimum or on the
     way, see `several_starts`; and with other correlation lengths of fields. `watch` receives the
-    iterations of all of them. The solution is the best one; its history and counts are of its own
-    program with the last correlation lengths, its times with those of a smaller problem. Nothing is
-    written.
+    iterations of all of them. The solution is the best one, with history and times of all searches with
+    the last correlation lengths, and counts of its own. Nothing is written.
 
     Parameters
     ----------
@@ -244,7 +243,7 @@ def _solve_from_smaller(
     own = [*solution.notes, *_feature_notes(solution)]
     known = {*own, *_feature_notes(first)}
     notes = [note for note in smaller.notes(first, solution) if note not in known]
-    return replace(solution.after(first, ""), notes=(*notes, *own))
+    return replace(after(solution, first), scan=first.scan, notes=(*notes, *own))
 
 
 def _solve_once(problem: Problem, warm_start: WarmStart | None, searches: Searches) -> Solution:

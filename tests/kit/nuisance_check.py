@@ -18,7 +18,7 @@ from collocation_sysid.recording.nuisance import KINDS
 from collocation_sysid.testing.property_check import PropertyCheck
 from collocation_sysid.testing.small_problems import DENSITY_KG_M3, program_of, swung_experiment
 from kit.problems import uneven_box
-from kit.program_derivatives import check_program
+from kit.program_derivatives import require_derivatives
 
 # Standard deviation of a kind that has none by default.
 USUAL_SIGMA = 0.01
@@ -35,7 +35,7 @@ def check_nuisance(row: Deviation, *, experiment: Experiment | None = None) -> N
     Zero changes nothing; the reading's first and second derivatives agree with central
     differences. In a small recording the predicted markers are the reading of those without the
     parameter, or the markers at the later time of its clock; gradient, Jacobian and Hessian of
-    the program agree with central differences.
+    the program pass a Taylor test.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def check_nuisance(row: Deviation, *, experiment: Experiment | None = None) -> N
         _check_reading(check, row, collocation=collocation)
     if row.clock is not None:
         _check_clock(check, row, collocation=collocation)
-    check_program(check, collocation)
+    require_derivatives(check, collocation)
 
 
 def _with_row(experiment: Experiment, row: Deviation) -> Experiment:

@@ -22,7 +22,7 @@ from collocation_sysid.testing.small_problems import (
     usual_constants,
 )
 from kit.checks import observed_order
-from kit.program_derivatives import check_program
+from kit.program_derivatives import require_derivatives
 
 # Rounding of sums of coefficients.
 ROUNDING = 1e-12
@@ -50,7 +50,7 @@ def check_scheme(scheme: str | Scheme) -> None:
     use no point before the start. An undamped oscillation does not grow. The error of an
     oscillator, computed in plain NumPy from the table, decreases with the stated order. A
     simulated motion of a small body satisfies every row of the table, evaluated in plain NumPy,
-    and gradient, Jacobian and Hessian of its program agree with central differences. An unknown
+    and gradient, Jacobian and Hessian of its program pass a Taylor test. An unknown
     start rule is refused by its name. The scheme can be pickled.
 
     Parameters
@@ -209,7 +209,7 @@ def _check_order(check: PropertyCheck, scheme: Scheme) -> None:
 
 def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
     """Require that a simulated motion of a small body, swung by a grasp from its undeformed shape,
-    satisfies every row of the table at its free dofs; check its program by `check_program`.
+    satisfies every row of the table at its free dofs; check its program by `require_derivatives`.
     """
     body = Body(box_mesh((0.05, 0.05, 0.1), (1, 1, 2)), density_kg_m3=DENSITY_KG_M3)
     values = usual_constants(tuple(body.constants.values()), None)
@@ -240,4 +240,4 @@ def _check_simulation(check: PropertyCheck, scheme: Scheme) -> None:
             scale=scale,
         )
     made = program_of(experiment, values)
-    check_program(check, replace(made, scheme=scheme))
+    require_derivatives(check, replace(made, scheme=scheme))

@@ -227,6 +227,7 @@ def valid(name: str) -> dict[str, Any]:
         "testing.check_force": {"force": None},
         "testing.check_material": {"material": "neo-hookean"},
         "testing.check_method": {"method": None},
+        "testing.check_program": {"problem": None},
         "testing.check_sensor": {"sensor": None},
         "with_markers": {"experiment": experiment, "positions_m": TRACKS_M},
         "with_readings": {"experiment": experiment, "values": []},

@@ -255,6 +255,9 @@ def test_a_search_ends_at_the_noise_of_its_loss(monkeypatch: pytest.MonkeyPatch)
     assert solution.iterations < exact.iterations + 5
     count = collocation.nq
     assert (np.abs(solution.q - exact.q) < errors.fit.standard_errors[:count]).all()
+    *_, rejected, feasible = solution.history
+    assert feasible.noise == rejected.noise > 0
+    assert feasible.violation_n < rejected.violation_n
 
 
 def test_a_trial_outside_the_funnel_is_simulated(monkeypatch: pytest.MonkeyPatch):

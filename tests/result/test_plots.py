@@ -82,6 +82,8 @@ def history(count=5):
             violation_n=0.0 if k == 0 else 10.0**-k,
             parameters={**TRUTH, "lambda_pa": 200.0 * 2 ** (count - 1 - k)},
             time_s=float(k),
+            trust=2.0**k,
+            noise=1e-3 * k,
         )
         for k in range(count)
     ]
@@ -124,22 +126,27 @@ def test_margins_do_not_depend_on_the_layout_that_matplotlib_is_configured_with(
     assert framed.subplotpars.left == pytest.approx(10 / 80)
 
 
-def test_convergence_draws_the_misfit_in_deviations_and_newtons_on_logarithmic_axes():
-    misfit, loss, violation, _ = convergence(history()).axes
-    assert {axes.get_yscale() for axes in (misfit, loss, violation)} == {"log"}
-    np.testing.assert_allclose(misfit.lines[0].get_ydata(), [10.0 ** (1 - k) for k in range(5)])
-    np.testing.assert_allclose(loss.lines[0].get_ydata(), [10.0 ** (3 - k) for k in range(5)])
-    assert "σ" in misfit.get_ylabel()
-    assert "N" in violation.get_ylabel()
+def test_convergence_draws_the_quantities_of_the_search_on_logarithmic_axes():
+    lines = history()
+    *panels, parameters = convergence(lines).axes
+    assert {axes.get_xlim() for axes in panels} == {parameters.get_xlim()}
+    assert {axes.get_yscale() for axes in panels} == {"log"}
+    labels = ["loss", "violation [N]", "trust region", "noise of loss"]
+    assert [axes.get_ylabel() for axes in panels] == labels
+    for axes, name in zip(panels, ("loss", "violation_n", "trust", "noise"), strict=True):
+        values = np.array([getattr(line, name) for line in lines])
+        (curve,) = axes.lines
+        np.testing.assert_array_equal(curve.get_xdata(), [line.number for line in lines])
+        np.testing.assert_array_equal(curve.get_ydata(), np.where(values > 0, values, np.nan))
 
 
 def test_zeros_leave_gaps_on_a_logarithmic_axis():
-    violation = convergence(history()).axes[2].lines[0].get_ydata()
+    violation = convergence(history()).axes[1].lines[0].get_ydata()
     np.testing.assert_allclose(violation, [np.nan, 0.1, 0.01, 1e-3, 1e-4])
 
 
 def test_parameters_are_drawn_relative_to_their_final_values():
-    _, first, *others = convergence(history()).axes[3].lines
+    _, first, *others = convergence(history()).axes[-1].lines
     np.testing.assert_allclose(first.get_ydata(), [16, 8, 4, 2, 1])
     assert len(others) == 3
     assert "200 Pa" in str(first.get_label())
@@ -151,7 +158,7 @@ def test_parameters_to_draw_can_be_chosen_and_are_labelled_with_their_values():
         replace(line, parameters={"young_pa": 720.0, "poisson": 0.2, "core.mu_pa": 450.0})
         for line in history()
     ]
-    lines = convergence(named, ("poisson", "core.mu_pa")).axes[3].lines
+    lines = convergence(named, ("poisson", "core.mu_pa")).axes[-1].lines
     assert len(lines) == 3
     assert "0.2" in str(lines[1].get_label())
     assert "450" in str(lines[2].get_label())

@@ -36,19 +36,21 @@ def require_inside(figure: Figure) -> None:
 
 
 @pytest.mark.parametrize(
-    ("misfit", "violation_n", "labels"),
+    ("trust", "violation_n", "labels"),
     [
-        (3.0, 1.0, ["misfit [σ]", "loss", "violation [N]", "θ / final θ"]),
-        (0.0, 1.0, ["loss", "violation [N]", "θ / final θ"]),
+        (3.0, 1.0, ["loss", "violation [N]", "trust region", "θ / final θ"]),
+        (np.nan, 1.0, ["loss", "violation [N]", "θ / final θ"]),
         (np.nan, 0.0, ["loss", "θ / final θ"]),
     ],
 )
-def test_convergence_has_no_empty_axes(misfit, violation_n, labels):
+def test_convergence_has_no_empty_axes(trust, violation_n, labels):
     history = [
         Iteration(
             number=k,
             loss=10.0**-k,
-            misfit=misfit / (k + 1),
+            misfit=1.0,
+            trust=trust,
+            noise=0.0,
             violation_n=violation_n / (k + 1),
             parameters={"mu_pa": 2.0 + k},
             time_s=float(k),

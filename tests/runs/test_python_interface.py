@@ -313,7 +313,7 @@ def test_a_body_that_was_only_predicted_is_drawn_with_its_regions():
 
 def test_a_check_looks_at_every_body():
     findings = check_problem(two_specimens())
-    assert findings.derivatives_agree
+    assert not findings.derivative_fault
     assert [body.experiments for body in findings.bodies] == [("cube",), ("bar", "again")]
     whole = two_specimens().collocation()
     assert findings.jacobian_nonzeros == len(whole.jacobian_structure[1])

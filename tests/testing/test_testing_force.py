@@ -8,7 +8,7 @@ import casadi as ca
 import pytest
 from kit.forces import breath, foundation
 from kit.problems import uneven_box
-from kit.program_derivatives import check_program
+from kit.program_derivatives import require_derivatives
 
 import collocation_sysid as cs
 from collocation_sysid.fem.node_force import unit_drag
@@ -69,11 +69,11 @@ def test_every_kind_of_force_passes(name: str):
     made = force if isinstance(force, cs.NodeForce) else cs.NodeForce.from_law(force)
     constants = options.get("constants", {})
     body = cs.Body(uneven_box(1), density_kg_m3=DENSITY_KG_M3, forces=[replace(made, nodes=None)])
-    check_program(PropertyCheck(name), program_of(swung_experiment(body), constants))
+    require_derivatives(PropertyCheck(name), program_of(swung_experiment(body), constants))
 
 
 def test_programs_of_a_force_on_quadratic_faces_pass():
-    check_program(PropertyCheck("breath"), program_of(swung_experiment(quadratic_body()), {}))
+    require_derivatives(PropertyCheck("breath"), program_of(swung_experiment(quadratic_body()), {}))
 
 
 def pushed(x, v, at, push_n_m):

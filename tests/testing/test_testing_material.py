@@ -7,7 +7,7 @@ import pytest
 from kit.internal_force_check import check_compiled_forces
 from kit.materials import COMPILED, CONSTANTS, ELASTIC
 from kit.problems import uneven_box
-from kit.program_derivatives import check_program
+from kit.program_derivatives import require_derivatives
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.elements import ELEMENTS
@@ -50,7 +50,7 @@ def test_limits_of_exponents_pass(name: str, limit: dict):
 def test_programs_of_a_material_with_memory_pass(name: str):
     constants = CONSTANTS.get(name, ELASTIC)
     body = Body(uneven_box(1), name, density_kg_m3=DENSITY_KG_M3, prony=["prony_1"])
-    check_program(PropertyCheck(name), program_of(swung_experiment(body), constants))
+    require_derivatives(PropertyCheck(name), program_of(swung_experiment(body), constants))
 
 
 def test_the_message_of_a_principal_stretch_that_is_not_smooth():

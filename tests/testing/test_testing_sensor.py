@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from kit.program_derivatives import check_program
+from kit.program_derivatives import require_derivatives
 
 import collocation_sysid as cs
 from collocation_sysid.program.custom_sensor_residual import CustomSensorResidual
@@ -57,7 +57,7 @@ def test_every_kind_of_sensor_passes(name: str):
     box = cs.box_mesh((0.1, 0.1, 0.12), (1, 1, 2))
     body = cs.Body(cs.TetMesh(box.points_m - 0.02, box.tetrahedra), density_kg_m3=DENSITY_KG_M3)
     recorded = swung_experiment(body, readings=[sensor.with_samples(TIMES_S[:5] + 0.013, None)])
-    check_program(PropertyCheck(name), program_of(recorded, {}))
+    require_derivatives(PropertyCheck(name), program_of(recorded, {}))
 
 
 def one_sided(at, scale):

@@ -246,7 +246,7 @@ def test_an_eighth_of_a_cylinder_stands_for_the_whole_and_its_friction_resists(t
 @pytest.mark.slow
 def test_one_silicone_and_one_friction_press_to_a_third_of_the_height():
     problem = measured("phantom_compression", "PHANTOM_DATA", "whole_stroke.toml")
-    assert check_problem(problem).derivatives_agree
+    assert not check_problem(problem).derivative_fault
     alone = solve(replace(problem, experiments=problem.experiments[:1]))
     assert alone.status.converged
     wrench = alone.collocation.transcriptions[0].experiment.obstacles[0].wrench

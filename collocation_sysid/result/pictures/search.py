@@ -45,9 +45,9 @@ _STAGE_COLOUR = "#808080"
 
 
 def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None) -> Figure:
-    """Return a figure of misfit, loss, violation of the equations of motion, and parameters
-    against the iteration number; values that are not positive are left out, and quantities without
-    any others, such as the violation of a specimen.
+    """Return a figure of loss, violation of the equations of motion, trust region, noise of the
+    loss, and parameters against the iteration number; values that are not positive are left out, and
+    quantities without any others, such as the trust region of a method that has none.
 
     Parameters
     ----------
@@ -65,18 +65,21 @@ def convergence(history: Sequence[Iteration], names: Sequence[str] | None = None
     curves = [
         (label, values, colour)
         for label, values, colour in (
-            ("misfit [σ]", [i.misfit for i in history], BLUE),
             ("loss", [i.loss for i in history], BLUE),
             ("violation [N]", [i.violation_n for i in history], VERMILION),
+            ("trust region", [i.trust for i in history], ORANGE),
+            ("noise of loss", [i.noise for i in history], BLACK),
         )
         if label == "loss" or np.isfinite(_positive_or_nan(values)).any()
     ]
     count = len(curves)
-    height_mm = 48 + 28 * count
+    height_mm = 48 + 22 * count
     figure = framed_figure(COLUMN_MM, height_mm, left_mm=14, right_mm=2, foot_mm=9.5, top_mm=5)
     heights = (*[1.0] * count, 0.2, 1.4)  # a gap for the legend
     grid = figure.add_gridspec(count + 2, 1, height_ratios=heights, hspace=0.12)
     panels = [figure.add_subplot(grid[row]) for row in (*range(count), count + 1)]
+    for axes in panels[1:]:
+        axes.sharex(panels[0])
     rungs = _continuation_stages(history)
     for axes, (label, values, colour) in zip(panels, curves, strict=False):
         for part in rungs:
