@@ -1248,6 +1248,16 @@ def test_obstacles_stay_at_their_pose_at_the_first_sample_also_in_an_execution()
         assert places == pytest.approx(np.zeros((11, 3)), abs=1e-12)
 
 
+@pytest.mark.parametrize("shift_m", [3e-4, -3e-4])
+def test_a_planned_point_stays_where_the_run_estimated_its_marker(shift_m):
+    """Inside or outside of the body, less than 5 % of an edge from a node."""
+    body = PlannedBody.read(hung_bar())
+    place_m = body.template.body.nodes_m[0] + shift_m
+    planned = body.experiment(None, body.template.t_s, {"tip": place_m})
+    (found_m,) = planned.markers.predict_positions(planned.body.nodes_m)
+    assert found_m == pytest.approx(place_m, abs=1e-12)
+
+
 # Uncertainty --------------------------------------------------------------------------------------
 
 

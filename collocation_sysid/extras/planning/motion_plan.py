@@ -21,7 +21,7 @@ from ...errors import InputError, SimulationError
 from ...problem import Problem
 from ...problem.code_loader import CodeLoader
 from ...program.simulation import Trajectory, simulate
-from ...recording import Experiment, Markers, PoseSequence
+from ...recording import Experiment, PoseSequence
 from ...runs.solved_problem import SolvedProblem
 from ...statistics.budget.combined_intervals import NORMAL_95
 from .band import point_deviations
@@ -212,9 +212,7 @@ class MotionPlan:
         fine_s = np.linspace(times[0], times[-1], POSES_PER_SAMPLE * (len(times) - 1) + 1)
         commands = {name: (fine_s, values) for name, values in self.commands(fine_s).items()}
         experiment = body.experiment(moved, times, places, commands)
-        seen = Markers(
-            times, tracks_m, markers.sigma_m, markers.names, np.array([*places.values()])
-        )
+        seen = replace(experiment.markers, positions_m=tracks_m, sigma_m=markers.sigma_m)
         return replace(experiment, name="execution", markers=seen)
 
     @cached_property

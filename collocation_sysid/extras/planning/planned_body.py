@@ -237,6 +237,7 @@ class PlannedBody:
             1e-3,
             [*points],
             np.array([*points.values()]).reshape(-1, 3),
+            attach="embedded",  # estimated places are not moved to nodes
         )
         return replace(
             template,
