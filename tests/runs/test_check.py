@@ -410,7 +410,7 @@ def test_only_some_of_many_recordings_are_examined(tiny: Path, monkeypatch):
     assert one.jacobian_nonzeros is not None
     assert some.jacobian_nonzeros == pytest.approx(4 * one.jacobian_nonzeros, rel=0.01)
     assert some.memory_mb == pytest.approx(whole.memory_mb, rel=0.1)
-    said = "3 recordings were read, but the description was only examined in the longest 2"
+    said = "5 recordings were read, but the description was only examined in the longest 2"
     assert any(said in note for note in some.notes)
     assert not any("only examined" in note for note in whole.notes)
 

@@ -214,14 +214,9 @@ class _QuadraticModel:
         border = self.problem.parameter_indices
         problem = self.problem
         # Rounding may leave a parameter on its bound by a hair.
-        low = (
-            np.minimum(np.maximum(problem.lower[border] - self.z[border], -problem.reach_p), 0)
-            - 1e-15
-        )
-        high = (
-            np.maximum(np.minimum(problem.upper[border] - self.z[border], problem.reach_p), 0)
-            + 1e-15
-        )
+        reach = problem.reach_p
+        low = np.minimum(np.maximum(problem.lower[border] - self.z[border], -reach), 0) - 1e-15
+        high = np.maximum(np.minimum(problem.upper[border] - self.z[border], reach), 0) + 1e-15
         right = solve_triangular(factor, slope, lower=True)
         return SquareRootInformation(np.column_stack([factor.T, right])).minimiser(low, high)
 

@@ -555,7 +555,6 @@ class Factoriser:
         threads: int,
         buffers: Sequence[FactorMemory | None] = (),
         is_single: bool = False,
-        accuracy: float = ACCURACY,
     ) -> list[Factor]:
         """Return the factors of several matrices, in their order, computed in parallel.
 
@@ -567,8 +566,6 @@ class Factoriser:
             Memory for each factor; empty to allocate. It may be longer than `count`.
         is_single : bool
             Whether the matrices are well conditioned, see `factorise`.
-        accuracy : float
-            Relative accuracy of solutions that are refined.
 
         Raises
         ------
@@ -585,13 +582,8 @@ class Factoriser:
                     continue
                 with suppress(_NotOnThisThreadError):
                     values, skew = matrix(k)
-                    factors[k] = self.factorise(
-                        values,
-                        skew,
-                        buffer=buffers[k] if buffers else None,
-                        is_single=is_single,
-                        accuracy=accuracy,
-                    )
+                    buffer = buffers[k] if buffers else None
+                    factors[k] = self.factorise(values, skew, buffer=buffer, is_single=is_single)
 
         run_in_slices(run, count, threads=threads if self.is_banded or self.is_supernodal else 1)
         run(0, count)  # those that other threads left

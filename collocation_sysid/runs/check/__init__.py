@@ -266,7 +266,7 @@ def check_problem(
     whole = collocation
     if others := len(problem.experiments) - len(examined.experiments):
         whole = problem.collocation()
-        notes.append(EXAMPLES_NOTE.format(others, len(examined.experiments)))
+        notes.append(EXAMPLES_NOTE.format(len(problem.experiments), len(examined.experiments)))
     report_progress("simulating the first samples at the guess")
     started_s = time.perf_counter()
     first = shortened_problem(examined).collocation()
