@@ -21,17 +21,13 @@ from ..fem.body import Body
 from ..fem.laws.materials import MATERIALS, Material
 from ..fem.meshes.mesh import TetMesh
 from ..fem.rest_shape import UnderGravity
+from ..kinds.rod.effects import end_mass_effect, free_end
 from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
 from ..recording.loads import PointMass
+from ..statistics.budget.effect import Effect, ExperimentAtAnswer
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
-from ..statistics.budget.systematic_effects import (
-    Effect,
-    ExperimentAtAnswer,
-    end_mass_effect,
-    free_end,
-    section_effect,
-)
+from ..statistics.budget.systematic_effects import section_effect
 from .doubt import Correction, Doubt
 
 AXES = "xyz"

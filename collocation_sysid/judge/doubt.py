@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.array_types import Array, Index
-from ..statistics.budget.systematic_effects import Effect, ExperimentAtAnswer
+from ..statistics.budget.effect import Effect, ExperimentAtAnswer
 from ..statistics.hypothesis import Hypothesis
 from ..statistics.thresholds import LEAST_IMPROVEMENT
 

@@ -39,7 +39,8 @@ from collocation_sysid.fem.node_force import AIR_KG_M3
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.simulation import Trajectory
 from collocation_sysid.statistics.budget.consider_analysis import changed_residuals
-from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS, ExperimentAtAnswer
+from collocation_sysid.statistics.budget.effect import ExperimentAtAnswer
+from collocation_sysid.statistics.budget.systematic_effects import ASSUMPTIONS
 
 VALUES = {"young_pa": 8e3, "poisson": 0.3, "gamma_r_s": 6e-3, "gamma_m_1_s": 0.0}
 BY_NAME = {row.name: row for row in ASSUMPTIONS}

@@ -27,7 +27,8 @@ from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...recording.nuisance import KINDS
 from ..linearised import LinearisedFit, linearise_fit
-from .systematic_effects import ASSUMPTIONS, Effect, ExperimentAtAnswer
+from .effect import Effect, ExperimentAtAnswer
+from .systematic_effects import ASSUMPTIONS
 
 # A threshold of Huber's loss that no residual reaches.
 UNWEIGHTED = 1e9

@@ -57,7 +57,7 @@ from ...recording.experiment import Experiment
 from ...recording.experiment_refinement import refined_experiment
 from ..linearised import known_at_last
 from .consider_analysis import changed_residuals
-from .systematic_effects import SMALL, Effect, ExperimentAtAnswer
+from .effect import SMALL, Effect, ExperimentAtAnswer
 
 # Largest number of nodes of a body whose error of the mesh is estimated in every solve: with more,
 # the search starts on a coarser mesh, and a note compares both meshes.

@@ -1,17 +1,16 @@
 """Systematic effects (type B): assumptions that are not estimated, and what changes if they are
 wrong.
 
-An assumption is a `Deviation` of the table `ASSUMPTIONS` with an effect on the equations of motion,
-c = Σ w F − M a, or on the prescribed displacements; `consider_analysis` propagates effects to the
-residuals. Deviations that change only the measurements (cameras, clocks) are in `recording.nuisance`.
+An assumption is a `Deviation` of the table `ASSUMPTIONS` with an `Effect`; those of one kind of body,
+measurement or force are in its room of `kinds/`. Deviations that change only the measurements
+(cameras, clocks) are in `recording.nuisance`.
 `Assumptions` is the table of the problem file in which users state standard deviations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -19,42 +18,38 @@ from numpy.typing import NDArray
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
-from ...common.array_types import Array, Index
+from ...common.array_types import Array
 from ...common.field_descriptions import FieldOfRow, sentence, with_fields
 from ...common.schema_tables import ByForm, Section
 from ...common.validated_classes import validated
 from ...common.validated_types import Positive
 from ...fem.body import Body
-from ...fem.laws.constants import GAMMA_M, GAMMA_R, TORSION, without_region
+from ...fem.laws.constants import GAMMA_M, GAMMA_R
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
-from ...fem.meshes.checks import boundary_of
 from ...fem.rods import ROD_CURVATURE, RodMesh
-from ...model.contact.summary import surface_gaps_and_pressures
-from ...model.dynamics import Dynamics
-from ...model.force_term import States
+from ...kinds.registry import KINDS
 from ...model.parameters import Parameters
-from ...program.collocation import ExperimentIterate
-from ...program.reactions.forces import forces_on_dofs, reaction_forces
+from ...recording import nuisance
 from ...recording.deviation import Deviation
-from ...recording.experiment import Experiment
-from ...recording.grasp import free_rigid_motions
 from ...recording.homogeneous_deformation import (
     CELL_SIZE_M,
     STRESS_PER_FORCE,
     HomogeneousDeformation,
 )
-from ...recording.nuisance import KINDS
 from ...recording.placement import place_markers
 from ...recording.specimen import RELAXED_STRAIN
 from ...recording.specimen_files import specimen_strains
-from .memory_effect import (
-    RELAXATION_TIME,
-    RELAXATION_TIMES_S,
-    is_distinguishable,
-    memory_forces_n,
-    supports_memory,
+from .effect import (
+    AXES,
+    SMALL,
+    Effect,
+    ExperimentAtAnswer,
+    effect_of_constants,
+    shape_effect,
+    stated_names,
 )
+from .memory_effect import RELAXATION_TIME, RELAXATION_TIMES_S
 from .obstacle_effects import (
     contact_changes_by_size_n,
     obstacle_shifts_m,
@@ -62,24 +57,14 @@ from .obstacle_effects import (
     scaled_start_m,
 )
 from .platen_slip import slip_displacements_m, sticking_change_n
-from .shape_error import (
-    SURFACE_MODES,
-    other_section,
-    sag_m,
-    standing_nodes,
-    surface_modes,
-    thickness_m,
-)
+from .shape_error import SURFACE_MODES, other_section, sag_m
 
-# Differences by a scale.
-SMALL = 1e-4
 # Relative standard deviation of the density of the air: weather and room temperature, at the stated
 # altitude. At 2000 m the density is 18 % lower, and has to be stated.
 AIR_DENSITY_DEVIATION = 0.03
 # Relative standard deviation of the added mass and of the drag coefficient of a given body: they
 # depend on its shape, on edges, on amplitude and on frequency.
 AIR_COEFFICIENT_DEVIATION = 0.4
-_AXES = "xyz"
 # Shape factor of a pressed specimen of unknown size: four times as wide as high.
 FLAT_SHAPE_FACTOR = 1.0
 # Strains within which the slope of a toe approaches that of the law, two of which describe those
@@ -93,308 +78,7 @@ INCOMPRESSIBLE_POISSON = 0.5
 UNKNOWN_ORIENTATION = 0.58
 # Laws of damping that a real material may obey: Rayleigh's resists rotation, as no material does.
 OBJECTIVE_DAMPINGS = ("kelvin-voigt", "material")
-# Differences by a displacement: its largest entry over the length of an edge.
-SMALL_STRAIN = 1e-4
 _MODES = " ".join(str(number) for number in range(1, SURFACE_MODES + 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Effect:
-    """Change of the equations of motion if an assumption is off by one unit."""
-
-    # (N, 3n) or None: change of the forces at the evaluations [N]; None means no change.
-    force_n: Array | None = None
-    # (3n,) or None: change of the inertial masses, whose weight is not in `force_n` [kg]; None
-    # means no change.
-    mass_kg: Array | None = None
-    time_stretch: float = 0.0  # relative change of the times in the inertia
-    # (N, g) or None: change of the prescribed positions of the grasped dofs [m]; None means no
-    # change.
-    displacement_m: Array | None = None
-    # (3n,) or None: change of given start positions [m]; None means no change. Equilibria follow
-    # the forces.
-    start_m: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ExperimentAtAnswer:
-    """One experiment at the answer, as the effects of assumptions need it."""
-
-    iterate: ExperimentIterate
-    parameters: Parameters  # shared parameters
-
-    @property
-    def body(self) -> Body:
-        """Body of the experiment."""
-        return self.iterate.transcription.body
-
-    @property
-    def dynamics(self) -> Dynamics:
-        """Equations of motion at the answer."""
-        return self.iterate.equations.dynamics
-
-    @property
-    def theta(self) -> Array:
-        """Constants θ of the body (k,)."""
-        return self.dynamics.theta
-
-    @cached_property
-    def own_mass_kg(self) -> Array:
-        """Masses (3n,) of the dofs of the body at the answer, without point masses and air [kg]."""
-        return self.body.mass_of_dofs(self.theta)
-
-    @cached_property
-    def acceleration(self) -> Array:
-        """Accelerations (N, 3n) that the scheme assigns to the rows [m/s²]."""
-        return self.dynamics.acceleration(self.iterate.x)
-
-    @cached_property
-    def states(self) -> tuple[Array, Array]:
-        """States ξ [m] and velocities ν [m/s] at the evaluations of the forces, (N, 3n) each,
-        padded by zeros before the first evaluation.
-        """
-        xi, nu = self.dynamics.evaluation_states(self.iterate.x)
-        return self.pad_rows(xi), self.pad_rows(nu)
-
-    def pad_rows(self, evaluated: Array) -> Array:
-        """Return values (N, 3n) of all rows from those of the evaluations (N − first row, 3n), zero
-        before the first; a new array.
-        """
-        return np.concatenate([np.zeros((self.dynamics.first_row, evaluated.shape[1])), evaluated])
-
-    def internal_n(
-        self,
-        length_factor: float = 1.0,
-        time_factor: float = 1.0,
-        theta: Array | None = None,
-        body: Body | None = None,
-    ) -> Array:
-        """Return the material's forces (N, 3n) at scaled lengths or times, without γ_m [N].
-
-        Parameters
-        ----------
-        length_factor : float
-            Factor of lengths: positions and velocities are divided by it.
-        time_factor : float
-            Factor of times: velocities are divided by it.
-        theta : (k,) array, optional
-            Constants of the body; those of the answer by default.
-        body : Body, optional
-            Body with another stress-free shape; that of the experiment by default.
-
-        Notes
-        -----
-        Damping by γ_r and the memory of the answer's motion are contained; the memory is that at
-        unscaled lengths.
-        """
-        undamped = (self.theta if theta is None else theta).copy()
-        undamped[list(self.body.tied_shares)] = 0.0
-        dynamics = self.dynamics.with_theta(undamped)
-        histories = dynamics.forces_with_histories(dynamics.histories(self.iterate.x)).memory_state
-        xi, nu = dynamics.evaluation_states(self.iterate.x)
-        evaluated = self.body if body is None else body
-        return self.pad_rows(
-            evaluated.force(
-                xi / length_factor,
-                nu / (length_factor * time_factor),
-                theta=undamped,
-                memory_input=histories,
-            )
-        )
-
-    @cached_property
-    def internal_force_n(self) -> Array:
-        """Forces (N, 3n) of the material at the answer with its stress-free shape, without
-        γ_m [N].
-        """
-        return self.internal_n(body=self.stress_free_body)
-
-    @cached_property
-    def stress_free_body(self) -> Body:
-        """The body with its stress-free shape at the answer, also of a mesh made under gravity."""
-        return self.body.with_stress_free(self.stress_free_m)
-
-    @cached_property
-    def stress_free_m(self) -> Array:
-        """Stress-free positions (n, 3) of the nodes, without nodes of obstacle frames [m]: those of
-        the mesh, or those that follow from a mesh made under gravity.
-        """
-        scan = self.body.inverse_equilibrium
-        return self.body.nodes.points_m if scan is None else scan.solve(self.theta).positions_m
-
-    def force_change_by_reference(self, moved_m: Array) -> Array:
-        """Return the first-order change (N, 3n) [N] of the material's forces if the stress-free
-        positions change by `moved_m` (n, 3) [m], by a difference; zero if nothing moves. Rows of
-        obstacle frames are ignored.
-        """
-        largest = float(np.abs(moved_m).max(initial=0.0))
-        if not largest:
-            return np.zeros_like(self.iterate.x)
-        step = SMALL_STRAIN * self.iterate.transcription.length_m / largest
-        own = self.stress_free_m + step * moved_m[: len(self.stress_free_m)]
-        other = self.body.with_stress_free(own)
-        return (self.internal_n(body=other) - self.internal_force_n) / step
-
-    def force_change_by_scan_weight(self) -> Array:
-        """Return the change (N, 3n) [N] of the material's forces per relative change of the weight
-        during the scan; zero unless the mesh was made under gravity.
-        """
-        if self.body.inverse_equilibrium is None:
-            return np.zeros_like(self.iterate.x)
-        return self.force_change_by_reference(
-            self.body.inverse_equilibrium.weight_sensitivity(self.theta)
-        )
-
-    @cached_property
-    def surface_modes_m(self) -> Array:
-        """Modes (modes, n, 3) of an error of the surface along its normal: displacements [m] of the
-        nodes if the standard deviation of the error is the thickness of the body.
-
-        Places of the surface that are in contact with an obstacle are known and do not move.
-        """
-        transcription = self.iterate.transcription
-        known = np.zeros(0, dtype=int)
-        if transcription.experiment.obstacles:
-            gaps_m, _ = surface_gaps_and_pressures(
-                transcription.experiment, self.theta, x=self.iterate.x
-            )
-            nearest = np.fmin.reduce(gaps_m, axis=0)
-            is_in_contact = np.nan_to_num(nearest, nan=np.inf) < transcription.length_m
-            known = np.unique(self.body.mesh.surface[is_in_contact])
-        modes = surface_modes(self.body, known)
-        return thickness_m(self.body) * modes
-
-    @cached_property
-    def forces_of_memory_n(self) -> dict[float, Array]:
-        """Forces (N, 3n) [N] of a branch of memory that the model lacks, with the share one, by the
-        relaxation time [s]; without relaxation times that the recording cannot distinguish from
-        other effects, and empty if memory cannot be added, see `memory_effect`.
-        """
-        experiment = self.iterate.transcription.experiment
-        if not supports_memory(self.body, experiment.is_static):
-            return {}
-        distinguishable = [
-            tau_s
-            for tau_s in RELAXATION_TIMES_S
-            if is_distinguishable(tau_s, experiment.timestep_s, experiment.duration_s)
-        ]
-        forces_n = memory_forces_n(
-            self.stress_free_body, self.dynamics, self.iterate.x, relaxation_times_s=distinguishable
-        )
-        return dict(zip(distinguishable, forces_n, strict=True))
-
-    @cached_property
-    def likely_support_dofs(self) -> Index:
-        """Dofs (k,) that were probably supported while the mesh was made: those prescribed in the
-        recording, without obstacles, or, if these leave rigid motions, all three of each of the
-        lowest nodes.
-        """
-        prescribed = self.iterate.equations.prescribed.dofs
-        own = prescribed[prescribed < self.body.nodes.points_m.size]
-        points_m = self.body.nodes.points_m
-        if len(free_rigid_motions(points_m, _dof_mask(own, len(points_m)))):
-            gravity = self.iterate.transcription.experiment.gravity_m_s2
-            nodes = standing_nodes(self.body, gravity)
-            return (3 * nodes[:, None] + np.arange(3)).ravel()
-        return own
-
-    def weight_and_drag(self, mass_kg: Array) -> Array:
-        """Return the weight and the mass-proportional damping −γ_m m v at the evaluations (N, 3n)
-        [N] of masses (3n,) or (N, 3n) [kg], without air.
-        """
-        return mass_kg * (
-            self.dynamics.forces.weight.gravity
-            - self.body.tied_damping_rate(self.theta) * self.states[1]
-        )
-
-    @property
-    def buoyancy_n(self) -> Array:
-        """Buoyancy (N, 3n) in the model [N]; zero in a vacuum."""
-        lifted = -self.dynamics.mass.displaced_kg * self.dynamics.forces.weight.gravity
-        return np.broadcast_to(lifted, self.iterate.x.shape)
-
-    @cached_property
-    def air_drag_n(self) -> Array:
-        """Drag of the air (N, 3n) in the model [N]; zero in a vacuum and where nothing moves."""
-        term = self.dynamics.forces.air_drag
-        if term is None:
-            return np.zeros_like(self.states[1])
-        drag = term.force(States(*self.states, self.theta))
-        drag[: self.dynamics.first_row] = 0.0
-        return drag
-
-    @cached_property
-    def grasp_force_n(self) -> Array:
-        """Reaction forces (N, g) of the grasps on the g prescribed dofs of the body [N]; zero while
-        they are not prescribed.
-        """
-        dofs = self.iterate.equations.prescribed.dofs
-        x = self.iterate.x
-        force = forces_on_dofs(self.dynamics, x, dofs=dofs)
-        mass = self.dynamics.mass.inertia_kg[:, dofs]
-        reaction_n = reaction_forces(
-            self.dynamics, mass, force=force, acceleration=self.acceleration[:, dofs]
-        )
-        return np.where(np.isnan(self.iterate.equations.prescribed.positions_m), 0.0, reaction_n)
-
-    @cached_property
-    def effect_of_grips(self) -> Effect | None:
-        """Effect of grippers that hold the body at one metre outside the faces that they hold; None
-        without such faces. The body is longer there before and after they hold it, too.
-
-        A grasp that prescribes some axes only is a platen or a plane of symmetry, not a gripper, and
-        measured displacements are those of the body.
-        """
-        gripped = [
-            grasp.nodes
-            for grasp in self.iterate.transcription.experiment.body_grasps
-            if len(grasp.axes) == len(_AXES) and grasp.poses.deformation is None
-        ]
-        if not gripped:
-            return None
-        body = self.body
-        is_held = np.isin(np.arange(len(body.nodes_m)), np.concatenate(gripped))
-        if isinstance(body.mesh, RodMesh):
-            outward = body.mesh.directions_beyond_clamps(is_held[: len(self.stress_free_m)])
-            return shape_effect(self, outward) if outward.any() else None
-        cells = body.mesh.tetrahedra
-        faces, _ = boundary_of(cells[~is_held[cells].all(axis=1)])
-        faces = faces[is_held[faces].all(axis=1)]
-        a, b, c = np.moveaxis(self.stress_free_m[faces], 1, 0)
-        normals = np.zeros_like(body.nodes_m)
-        np.add.at(normals, body.nodes.nodes_of_faces(faces), np.cross(b - a, c - a)[:, None])
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        if not length.any():
-            return None
-        return shape_effect(self, np.divide(normals, length, out=normals, where=length > 0))
-
-    @cached_property
-    def proportional_s(self) -> Array:
-        """Damping times γ_r (E,) of elements with Rayleigh damping γ_r K(x) v [s], zero of
-        others.
-        """
-        gamma_r_s = np.zeros(len(self.body.cells))
-        for part, start in zip(self.body.parts, self.body.starts, strict=False):
-            if GAMMA_R in part.damping.constants and part.damping.stress is None:
-                gamma_r_s[part.cells] = self.theta[start + part.constants.index(GAMMA_R)]
-        return gamma_r_s
-
-    @cached_property
-    def young_pa(self) -> float:
-        """Young's modulus of the softest part at small strain, at the answer [Pa]."""
-        return min(
-            engineering_constants(*moduli)[0] for moduli in self.body.lame(self.theta).values()
-        )
-
-
-def _dof_mask(dofs: Index, nodes: int) -> NDArray[np.bool_]:
-    """Return the mask (n, 3) of dofs (k,); dof 3 i + axis belongs to node i."""
-    mask = np.zeros(3 * nodes, dtype=bool)
-    mask[dofs] = True
-    return mask.reshape(nodes, 3)
-
-
-# What each changes ------------------------------------------------------------------------------
 
 
 def _size(at: ExperimentAtAnswer, _: int) -> Effect:
@@ -552,23 +236,13 @@ def _time_scale(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect((faster - slower) / (2 * SMALL) - drag + air, time_stretch=-1.0)
 
 
-def _stated_names(parameters: Parameters, constant: str) -> set[str]:
-    items = {item.name: item for item in parameters.components}
-    return {
-        name
-        for name, item in items.items()
-        if without_region(name) == constant
-        and (items[item.tied.to] if item.tied else item).is_fixed
-    }
-
-
 def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float:
     """Return the standard deviation of stated Poisson's ratios on the scale ln(1 − 2ν), which ends
     at the incompressible body, per unit of ν: a value that is lower by `deviation` is one standard
     deviation away on this scale. It is that of the largest stated ratio below ½.
     """
     items = {item.name: item for item in parameters.components}
-    tied = {name: items[name].tied for name in _stated_names(parameters, "poisson")}
+    tied = {name: items[name].tied for name in stated_names(parameters, "poisson")}
     stated = [items[name if to is None else to.to].guess for name, to in tied.items()]
     below = [nu for nu in stated if nu is not None and nu < INCOMPRESSIBLE_POISSON]
     if not below:
@@ -579,35 +253,14 @@ def limited_poisson_deviation(deviation: float, parameters: Parameters) -> float
 
 def _poisson(at: ExperimentAtAnswer, _: int) -> Effect | None:
     """Return the effect of all ratios together that are fixed or tied to a fixed one."""
-    constants = _stated_names(at.parameters, "poisson")
+    constants = stated_names(at.parameters, "poisson")
     if not constants:
         return None
     # Both differences stay below ½, where the bulk modulus would be infinite.
     values = at.parameters.values(at.iterate.q)
     largest = max(values[name] for name in constants)
     step = min(SMALL, (INCOMPRESSIBLE_POISSON - largest) / 2)
-    return _effect_of_constants(at, dict.fromkeys(constants, 1.0), step)
-
-
-def _torsion(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a relative error of the torsional stiffnesses that are stated."""
-    values = at.parameters.values(at.iterate.q)
-    units = {name: values[name] for name in _stated_names(at.parameters, TORSION.name)}
-    return _effect_of_constants(at, units, SMALL) if units else None
-
-
-def _effect_of_constants(at: ExperimentAtAnswer, units: Mapping[str, float], step: float) -> Effect:
-    """Return the effect of constants that are all larger by their units, by central differences."""
-    values = at.parameters.values(at.iterate.q)
-    larger, smaller = (
-        at.internal_n(
-            theta=at.body.theta_from_values(
-                {name: value + way * units.get(name, 0.0) for name, value in values.items()}
-            )
-        )
-        for way in (step, -step)
-    )
-    return Effect((larger - smaller) / (2 * step))
+    return effect_of_constants(at, dict.fromkeys(constants, 1.0), step)
 
 
 def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -632,37 +285,6 @@ def _marker_mass(at: ExperimentAtAnswer, _: int) -> Effect | None:
     return Effect(at.weight_and_drag(mass_kg), mass_kg)
 
 
-def end_mass_effect(at: ExperimentAtAnswer, _: int) -> Effect:
-    """Return the effect per kilogram at the free end of a rod, see `free_end`."""
-    mass_kg = np.zeros(at.body.nodes_m.size)
-    mass_kg[3 * free_end(at.iterate.transcription.experiment)[:, None] + np.arange(3)] = 1 / 3
-    return Effect(at.weight_and_drag(mass_kg), mass_kg)
-
-
-def free_end(experiment: Experiment) -> Index:
-    """Return the three nodes of the end of a rod that is farther from what holds it."""
-    held = np.concatenate([grasp.nodes for grasp in experiment.body_grasps])
-    mesh = experiment.body.mesh
-    count = len(mesh.points_m)
-    return np.arange(3) if held.mean() > count / 2 else np.arange(count - 3, count)
-
-
-def _length(at: ExperimentAtAnswer, _: int) -> Effect | None:
-    """Return the effect of a rod that is longer by a share, with the places on it; None for another
-    body.
-    """
-    mesh = at.body.mesh
-    if not isinstance(mesh, RodMesh):
-        return None
-    centres_m = mesh.centres_of_sections_m
-    moved_m = np.zeros_like(at.body.nodes_m)
-    moved_m[: 3 * len(centres_m)] = np.repeat(centres_m - centres_m[0], 3, axis=0)
-    longer = shape_effect(at, moved_m)
-    assert longer.force_n is not None
-    weight_n = at.weight_and_drag(at.own_mass_kg)
-    return replace(longer, force_n=longer.force_n + weight_n, mass_kg=at.own_mass_kg)
-
-
 def _grip_turn(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     """Return the effect of a gripper that gives way about an axis of the world in proportion to the
     torque of the body on it, by one radian at the largest torque; None for a bench.
@@ -673,7 +295,7 @@ def _grip_turn(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     prescribed = at.iterate.equations.prescribed
     displacement_m = np.zeros_like(prescribed.positions_m)
     for grasp in experiment.body_grasps:
-        if len(grasp.axes) < len(_AXES):
+        if len(grasp.axes) < len(AXES):
             continue
         columns = np.searchsorted(prescribed.dofs, 3 * grasp.nodes[:, None] + np.arange(3))
         places_m = np.nan_to_num(prescribed.positions_m[:, columns])
@@ -738,7 +360,7 @@ def _machine_of_specimen(
     if not deformation.area_over_length_m:
         return None
     dofs = at.iterate.equations.prescribed.dofs
-    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    direction, normal = (AXES.index(axis) for axis in deformation.first_stress)
     loaded = np.searchsorted(dofs, 3 * (1 + normal) + direction)
     stress_pa = STRESS_PER_FORCE * at.grasp_force_n[:, loaded]
     strain_m_n = -deformation.area_over_length_m * stress_pa
@@ -816,7 +438,7 @@ def _specimen_sticking(at: ExperimentAtAnswer, _: int) -> Effect | None:
     deformation = at.iterate.transcription.experiment.specimen
     if deformation is None or deformation.test != "uniaxial":
         return None
-    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    direction, normal = (AXES.index(axis) for axis in deformation.first_stress)
     is_pressed = at.iterate.x[:, 3 * (1 + normal) + direction] < CELL_SIZE_M
     ((lame_pa, shear_pa),) = at.body.lame(at.theta).values()
     young_pa, poisson = engineering_constants(lame_pa, shear_pa)
@@ -849,7 +471,7 @@ def _initial_slope(at: ExperimentAtAnswer, index: int) -> Effect | None:
     widths = TOE_STRAINS * min(1.0, largest / TOE_RANGE)
     excess = widths * (np.exp(-size[:, None] / widths) - np.exp(-size.min() / widths))
     slope_pa = float(np.nanmax(np.abs(stress_pa))) / largest
-    direction, normal = (_AXES.index(axis) for axis in deformation.first_stress)
+    direction, normal = (AXES.index(axis) for axis in deformation.first_stress)
     force_n = np.zeros_like(at.iterate.x)
     strain_of_force = np.sign(strain) * (excess @ [0.5 - index, 0.5])
     force_n[:, 3 * (1 + normal) + direction] = slope_pa * strain_of_force / STRESS_PER_FORCE
@@ -867,15 +489,15 @@ def _platen_friction(at: ExperimentAtAnswer, _: int) -> Effect | None:
     prescribed = at.iterate.equations.prescribed
     if not experiment.is_static:
         return None
-    pressed = {_AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
+    pressed = {AXES[k] for k in np.unique(prescribed.dofs[_is_driven(at)] % 3)}
     platens = [g for g in experiment.grasps if len(g.axes) < 3 and pressed & set(g.axes)]
     force = np.zeros_like(at.iterate.x)
     x = at.iterate.x
     start = at.body.nodes_m.ravel()
     for grasp in platens:
-        across = [k for k, name in enumerate(_AXES) if name not in grasp.axes]
+        across = [k for k, name in enumerate(AXES) if name not in grasp.axes]
         for node in grasp.nodes:
-            normal = np.isin(prescribed.dofs, [3 * node + _AXES.index(a) for a in grasp.axes])
+            normal = np.isin(prescribed.dofs, [3 * node + AXES.index(a) for a in grasp.axes])
             press = np.linalg.norm(at.grasp_force_n[:, normal], axis=1)
             dofs = [3 * node + k for k in across]
             way = x[:, dofs] - start[dofs]
@@ -984,21 +606,6 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
         at.force_change_by_reference(
             sag_m(at.body, at.theta, support_dofs=at.likely_support_dofs, axis=axis)
         )
-    )
-
-
-def shape_effect(at: ExperimentAtAnswer, moved_m: Array) -> Effect:
-    """Return the effect of stress-free positions that are off by `moved_m` (n, 3) [m], with which the
-    grasped nodes move.
-    """
-    prescribed_motion = at.iterate.transcription.prescribed_motion
-    rotations: Array = np.nan_to_num(prescribed_motion.pose_rows[0])
-    offsets_m = moved_m.ravel()[
-        3 * (at.iterate.equations.prescribed.dofs // 3)[:, None] + np.arange(3)
-    ]
-    return Effect(
-        at.force_change_by_reference(moved_m),
-        displacement_m=np.einsum("tgj,gj->tg", rotations, offsets_m),
     )
 
 
@@ -1197,14 +804,6 @@ ASSUMPTIONS = (
         of_specimens=True,
     ),
     Deviation(
-        "torsion",
-        "1",
-        considered=0.2,
-        description="relative error of a stated torsional stiffness of a rod",
-        remedy="estimate the torsional stiffness from a motion out of a plane, or measure it",
-        effect=_torsion,
-    ),
-    Deviation(
         "damping_law",
         "1",
         considered=1.0,
@@ -1224,14 +823,6 @@ ASSUMPTIONS = (
         remedy="compare the laws with compare-models --damping on motions that rotate the body",
         effect=_rayleigh_damping,
         redefines=(GAMMA_R.name, GAMMA_M.name),
-    ),
-    Deviation(
-        "length",
-        "1",
-        wide=0.05,
-        description="relative error of the length of a rod and of all places along it",
-        remedy="measure the length of the rod and the places of the markers along it",
-        effect=_length,
     ),
     Deviation(
         "grip_turn_rad",
@@ -1409,6 +1000,7 @@ ASSUMPTIONS = (
         largest=10.0,
         effect=_air_drag,
     ),
+    *(row for kind in KINDS for row in kind.effects),
 )
 
 # Errors of the discretisation, whose mean is the estimated change; the order of convergence, and with
@@ -1430,9 +1022,9 @@ DISCRETISATION = (
     ),
 )
 # Every deviation, by its name.
-DEVIATIONS = {row.name: row for row in (*ASSUMPTIONS, *KINDS, *DISCRETISATION)}
+DEVIATIONS = {row.name: row for row in (*ASSUMPTIONS, *nuisance.KINDS, *DISCRETISATION)}
 # Those of the budget; other nuisance parameters are estimated or exact.
-CONSIDERED = (*ASSUMPTIONS, *(row for row in KINDS if row.considered is not None))
+CONSIDERED = (*ASSUMPTIONS, *(row for row in nuisance.KINDS if row.considered is not None))
 
 
 def usual_deviations(bodies: Iterable[Body]) -> dict[str, float | None]:
