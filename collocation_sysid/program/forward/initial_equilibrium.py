@@ -97,7 +97,7 @@ def _solve_equilibrium(
         held = solver.is_prescribed
         if np.abs(goals_m[held] - shape.ravel()[held]).max(initial=0.0) <= ON_PLACE * solver.size_m:
             guess = follow_loads(solver, forces, shape.ravel(), equations)
-    path = SolutionPath(separate.ravel(), halvings=solver.options.max_halvings, guess=guess)
+    path = SolutionPath(separate.ravel(), halvings=solver.options.max_load_halvings, guess=guess)
     while path.share < 1.0:
         x, share = path.next_guess()
         residual, linearise = equations(share)

@@ -82,6 +82,9 @@ class NewtonOptions:
     max_halvings : int
         Largest number of halvings of a time step (Newmark) or of the increment of forces and grasps
         in it (schemes).
+    max_load_halvings : int
+        The same of the increment of loads and grasps towards an equilibrium: a rope turns by a right
+        angle under a thousandth of its weight.
     checks_stability : bool
         Whether the stiffness of an equilibrium is factorised at the equilibrium itself. If false,
         it may be known to be positive definite only at a near state, from which chord steps led
@@ -92,6 +95,7 @@ class NewtonOptions:
     max_iterations: int = 30
     max_backtracks: int = 25
     max_halvings: int = 8
+    max_load_halvings: int = 20
     checks_stability: bool = True
 
 

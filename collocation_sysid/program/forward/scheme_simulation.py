@@ -136,12 +136,17 @@ def continue_simulation(
     # Total force at every evaluation so far.
     forces, previous_histories = forces_and_histories(dynamics, x, row_count=done)
     intervals = dynamics.intervals_to_next_s
+    # Equilibria that depend on no history, nor on the side from which an obstacle was approached.
+    is_any_order = dynamics.is_static and not previous_histories and not experiment.obstacles
     guesses: list[Array] = []
     nearest = 1  # guess that missed least at the row before
     for t in range(done, dynamics.row_count):
-        row = RowEquations(dynamics, x, forces=forces, t=t, previous=previous_histories)
         solver = solvers.for_prescribed(is_prescribed[t])
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
+        before = _nearest(dynamics, t) if is_any_order else t - 1
+        row = RowEquations(
+            dynamics, x, forces=forces, t=t, previous=previous_histories, before=before
+        )
         if not dynamics.is_static:
             guesses = [extrapolate(x[:t], dynamics.step_s * v0)]
             if approximate_solution is not None:
@@ -151,13 +156,13 @@ def continue_simulation(
                 guesses += [approximate_solution[t] + distance_m]
             guess = guesses[min(nearest, len(guesses) - 1)]
         elif approximate_solution is None:
-            guess = _extrapolate_static(x[:t], solver.is_prescribed, goal=goal)
+            guess = _extrapolate_static(x[: before + 1], solver.is_prescribed, goal=goal)
         else:
             # What was missed at the row before is missed here too.
-            guess = approximate_solution[t] + x[t - 1]
-            guess -= approximate_solution[t - 1]
+            guess = approximate_solution[t] + x[before]
+            guess -= approximate_solution[before]
         try:
-            x[t] = solve_row(solver, row, guess=guess, previous=x[t - 1], prescribed_m=goal)
+            x[t] = solve_row(solver, row, guess=guess, previous=x[before], prescribed_m=goal)
         except NewtonFailure as failure:
             return x[:t], simulation_error(
                 solver,
@@ -216,6 +221,15 @@ def extrapolate(x: Array, first_step: Array) -> Array:
     return x[-1] + next_value(np.diff(x[-1 - MOST_VALUES :], axis=0))
 
 
+def _nearest(dynamics: Dynamics, t: int) -> int:
+    """Return the row before t whose prescribed positions are nearest to its own, the last of equal
+    ones.
+    """
+    apart_m = np.nan_to_num(dynamics.prescribed_m[:t] - dynamics.prescribed_m[t])
+    distance = np.linalg.norm(apart_m, axis=1)
+    return t - 1 - int(np.argmin(distance[::-1]))
+
+
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:
     """Return the last equilibrium plus the last increment, scaled by the prescribed dofs."""
     if len(x) < 2:
@@ -239,6 +253,8 @@ class RowEquations(StepEquations):
         Index of the row, at least 1.
     previous : sequence of PreviousState
         History variables after row t − 1; empty if there are none.
+    before : int, optional
+        Row from which the equilibrium of row t is sought; by default t − 1.
     """
 
     def __init__(
@@ -248,6 +264,7 @@ class RowEquations(StepEquations):
         forces: Array,
         t: int,
         previous: Sequence[PreviousState] = (),
+        before: int | None = None,
     ) -> None:
         self.dynamics = dynamics
         self.row = StencilRow.from_dynamics(dynamics, t)
@@ -257,8 +274,9 @@ class RowEquations(StepEquations):
                 self.forces, previous, interval_s=float(dynamics.intervals_to_next_s[t - 1])
             )
         self.rest = self.forces.without_local_forces()
+        before = t - 1 if before is None else before
         self.rest_before = (
-            at_times(dynamics.forces, slice(t - 1, t)).without_local_forces()
+            at_times(dynamics.forces, slice(before, before + 1)).without_local_forces()
             if dynamics.is_static
             else None
         )
@@ -364,7 +382,9 @@ def solve_row(
     origin = previous[solver.is_prescribed]
     is_static = row.dynamics.is_static
     first = previous if is_static else row.without_forces(solver.free, previous)
-    path = SolutionPath(first, halvings=solver.options.max_halvings, guess=guess)
+    options = solver.options
+    halvings = options.max_load_halvings if is_static else options.max_halvings
+    path = SolutionPath(first, halvings=halvings, guess=guess)
     while path.share < 1.0:
         start, share = path.next_guess()
         # Exact at the end, because bounds of the collocation program are.
