@@ -45,6 +45,9 @@ from .meshes.mesh import ElementNodes, TetMesh
 # Stiffness of a section against changes of its shape, in units of EA. A moment M stretches directors
 # by about EI κ²/(10 EA), 0.01 % where the radius of curvature is 20 times that of the section.
 SECTION_STIFFNESS = 10.0
+# Part of the length of a rod by which a place may be beyond its end: a curve through measured points
+# is no longer known.
+KNOWN_LENGTH = 5e-3
 # Angle by which a rod that was not stated to be straight may be bent by itself [rad].
 ROD_CURVATURE = 0.5
 _ANGLES = 2 * np.pi / 3 * np.arange(3)
@@ -170,9 +173,9 @@ class RodMesh(TetMesh):
         Raises
         ------
         InputError
-            If the arc length is not on the rod.
+            If the arc length is not on the rod, whose end is known to `KNOWN_LENGTH`.
         """
-        if not 0 <= s_m <= self.s_m[-1] * (1 + 1e-9):
+        if not 0 <= s_m <= self.s_m[-1] * (1 + KNOWN_LENGTH):
             raise InputError(
                 f"found the arc length {s_m:g} m; expected 0 to {self.s_m[-1]:g} m, the length of the "
                 "rod"
@@ -666,6 +669,8 @@ def _stations(length_m: float, count: int, stated_m: Sequence[float]) -> Array:
     knots = knots[np.concatenate([[True], np.diff(knots) > 1e-6 * length_m])]  # or one section
     spans = np.diff(knots)
     counts = np.maximum(1, np.round((count - 1) * spans / length_m)).astype(int)
+    while counts.sum() < count - 1:  # many short spans
+        counts[np.argmax(spans / counts)] += 1
     parts = [
         knots[k] + span * np.arange(number) / number
         for k, (span, number) in enumerate(zip(spans, counts, strict=True))

@@ -320,6 +320,13 @@ def test_sections_are_along_the_centreline_and_orthonormal():
     assert np.abs(mesh.s_m - 0.0333).min() < 1e-12
 
 
+def test_many_stated_arc_lengths_do_not_reduce_the_number_of_sections():
+    stated_m = np.linspace(0.011, 0.95, 49)
+    mesh = rod_mesh([[0, 0, 0], [1, 0, 0]], CrossSection.round(0.002), 61, list(stated_m))
+    assert len(mesh.s_m) >= 61
+    assert np.abs(mesh.s_m[:, None] - stated_m).min(axis=0).max() < 1e-12
+
+
 def test_arc_length_of_a_circle():
     angle = np.linspace(0, 1.5 * np.pi, 25)
     circle = 0.2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)

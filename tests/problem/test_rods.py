@@ -40,6 +40,16 @@ def test_a_grasp_holds_the_sections_between_two_arc_lengths(problem):
     assert np.array_equal(held, mesh.s_m[mesh.s_m <= 0.05 + 1e-9])
 
 
+def test_a_place_may_be_a_little_beyond_the_end_of_a_measured_curve(problem):
+    """A curve of 598.7 mm through measured points, and a tip at 600 mm by a ruler."""
+    changed(problem, "length_m = 0.6  ", "length_m = 0.5987  ")
+    experiment = cs.Problem.read(problem).experiments[0]
+    tip_m = experiment.markers.predict_positions(experiment.body.nodes_m)[
+        experiment.markers.names.index("tip")
+    ]
+    assert np.allclose(tip_m, [0.5987, 0, 0])
+
+
 def test_the_mass_is_that_per_length(problem):
     assert cs.Problem.read(problem).bodies[0].mass_kg == pytest.approx(0.034 * 0.6)
 

@@ -325,6 +325,23 @@ def test_a_unit_is_asked_for_and_never_guessed(file, name, old, new):
     np.testing.assert_allclose(read_markers(path, length_unit="mm").positions_m, TRACKS_M)
 
 
+@pytest.mark.parametrize("missing", "xy")
+def test_a_plain_wide_file_of_a_plane_has_no_column_across_it(missing, file):
+    axes = [axis for axis in "xyz" if axis != missing]
+    names = ",".join(f"{marker}_{axis}" for marker in "ab" for axis in axes)
+    table = read_markers(file(f"t_s,{names}\n0,1,2,3,4\n1,5,6,7,8\n"))
+    measured = table.positions_m[..., ["xyz".index(axis) for axis in axes]]
+    assert measured.reshape(2, 4).tolist() == [[1, 2, 3, 4], [5, 6, 7, 8]]
+    assert np.isnan(table.positions_m[..., "xyz".index(missing)]).all()
+
+
+@pytest.mark.parametrize("columns", ["a_x,a_y,b_x,b_y", "a_x,a_z,b_x,b_y,b_z"])
+def test_columns_that_may_be_pixels_or_are_missing_of_one_marker_are_refused(columns, file):
+    count = columns.count(",") + 1
+    row = ",".join(["0"] * (count + 1))
+    assert "missing" in refusal(file(f"t_s,{columns}\n{row}\n"))
+
+
 def test_a_plain_wide_file_is_in_metres_unless_a_unit_is_stated(file):
     table = read_markers(file(WIDE), length_unit="mm")
     np.testing.assert_allclose(table.positions_m, TRACKS_M / 1000)

@@ -4,7 +4,8 @@ Wide: t_s, then <name>_x, <name>_y, <name>_z for each marker, in metres, and opt
 the standard deviation of its coordinates in each sample. Long: t_s, marker, and x_m,
 y_m, z_m (or _cm, _mm, _in; or x, y, z and a given unit); a marker without a row at a time is
 missing there. In both, the unit may stand in brackets behind the names, as in "tip_x (mm)" or "tip X
-(mm)", a blank cell or NaN is a missing sample, and (0, 0, 0) is a measured place. A column "Frame" of
+(mm)", a blank cell or NaN is a missing sample, as is a coordinate x or y of which no marker has a column,
+and (0, 0, 0) is a measured place. A column "Frame" of
 a wide table is ignored.
 """
 
@@ -84,6 +85,7 @@ def _without_units(table: Table) -> tuple[Table, str | None, float]:
 
 def _read_wide(table: Table, choose: LabelChooser, to_seconds: float) -> RawTracks:
     """Read a table with three columns for each marker, in metres unless another unit is stated."""
+    table = _with_blank_axis(table)
     labels = _wide_labels(table)
     place = {column: k for k, column in enumerate(table.columns)}
     places = [[place[f"{label}_{axis}"] for axis in "xyz"] for label in labels]
@@ -104,6 +106,19 @@ def _read_wide(table: Table, choose: LabelChooser, to_seconds: float) -> RawTrac
         if column is not None:
             sigmas[:, k] = numeric_cells(table, [column], blank_allowed=True)[:, 0]
     return replace(tracks, sigmas=sigmas)
+
+
+def _with_blank_axis(table: Table) -> Table:
+    """Return the table with blank columns for x or y if no marker has it: what was measured in the
+    plane across this axis. Columns of x and y alone may be pixels.
+    """
+    of_z = [column[:-2] for column in table.columns if column.endswith("_z")]
+    missing = [axis for axis in "xy" if not any(c.endswith(f"_{axis}") for c in table.columns)]
+    if not of_z or len(missing) != 1:
+        return table
+    blank = np.full((len(table.cells), len(of_z)), "", dtype=object)
+    columns = [*table.columns, *(f"{label}_{missing[0]}" for label in of_z)]
+    return replace(table, columns=columns, cells=np.hstack([table.cells, blank]))
 
 
 def _wide_labels(table: Table) -> list[str]:
