@@ -217,14 +217,14 @@ def uncertainty_from_fit(
             "more than the parameters that they determine; state the standard deviation of the noise "
             "(sigma_m) and noise = 'given'"
         )
-    covariance, determined, of_noise, basis = _error_bars(fit, factored, requested=error_model)
+    covariance, determined, quantiles, basis = _error_bars(fit, factored, requested=error_model)
     of_effects = factored.fit.root @ factored.fit.root[len(fit.names) - fit.effect_count :].T
     determined = determined - of_effects @ of_effects.T
     of_effects[fit.shared_count :] = 0.0  # nuisance parameters and effects keep the complete one
     covariance = covariance - of_effects @ of_effects.T
     of_all, bounded = _reported_covariance(covariance, fit, parameters=parameters, q=q)
     scatter = _compare_recordings(fit.with_known_effects, parameters, q=q, errors=error_model)
-    of_q, quantiles, widening = _widen_by_scatter(of_all[:shared, :shared], of_noise, scatter)
+    of_q, widening = _widen_by_scatter(of_all[:shared, :shared], scatter)
     estimates = user_estimates(
         parameters, q, covariance_q=of_q, at_bound=bounded, quantiles=quantiles
     )
@@ -240,7 +240,7 @@ def uncertainty_from_fit(
     sizes = relative_derivatives(parameters, q)
     deviations = np.sqrt(np.diag(of_all)[shared:]).tolist()
     # One factor for all: different ones would widen combinations that are known well.
-    factor = np.nanmax(of_noise, initial=normal_isf(0.025)) / normal_isf(0.025)
+    factor = np.nanmax(quantiles, initial=normal_isf(0.025)) / normal_isf(0.025)
     open_ways = UNDETERMINED * factored.fit.null_space
     of_noise_alone = factor**2 * determined + open_ways @ open_ways.T
     return Uncertainty(
@@ -337,19 +337,17 @@ def _reported_covariance(
 
 
 def _widen_by_scatter(
-    covariance_q: Array, quantiles: Array, scatter: RecordingComparison | None
-) -> tuple[Array, Array, Array]:
-    """Return the covariance (nq, nq), the half widths (nq,) of the 95 % intervals in standard
-    deviations, and by what they are wider (nq,), where recordings disagree.
+    covariance_q: Array, scatter: RecordingComparison | None
+) -> tuple[Array, Array]:
+    """Return the covariance (nq, nq), and by what the 95 % intervals are wider (nq,), where recordings
+    disagree.
     """
     if scatter is None:
-        return covariance_q, quantiles, np.ones(len(quantiles))
+        return covariance_q, np.ones(len(covariance_q))
     with np.errstate(invalid="ignore"):
         factors = np.sqrt(scatter.widen(np.diag(covariance_q)) / np.diag(covariance_q))
     factors = np.where(scatter.find_disagreements(), factors, 1.0)
-    of_few = np.maximum(quantiles, student_95(np.maximum(scatter.degrees_of_freedom, 1)))
-    wide = np.where(scatter.find_disagreements(), of_few, quantiles)
-    return covariance_q * np.outer(factors, factors), wide, factors * wide / quantiles
+    return covariance_q * np.outer(factors, factors), factors
 
 
 def _compare_recordings(

@@ -8,9 +8,11 @@ parameter
     χ² = Σ (x_e − x̄)² / v_e,   x̄ = Σ x_e / v_e / Σ 1 / v_e,
 
 has one degree of freedom less than there are recordings that determine it. If it is larger than
-chance allows, model error differs among recordings. Error bars are then √(χ² / f) times as large
-(Birge 1932), and intervals are Student's. The joint fit may contain that error in its residuals
-already; not to count it twice, 1 / Σ 1 / v_e widened so is enough.
+chance allows, recordings differ by an error of the model with the standard deviation τ, of which two
+recordings say little: its prior is half normal (Gelman, Bayesian Analysis 1, 2006). The mean at given
+τ is normal with the weights 1 / (v_e + τ²), and its interval holds 95 % over the posterior of τ. The
+joint fit may contain that error in its residuals already; not to count it twice, the interval of the
+mean is enough.
 
 A parameter that hardly any recording determines alone may look certain because all together
 determine it. So each parameter k in turn may differ between recordings, while all others are
@@ -34,7 +36,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ...common.array_types import Array, Index
-from ..distributions import chi2_sf
+from ..distributions import chi2_sf, normal_isf
 from ..linearised import (
     LinearisedFit,
     ResidualBlock,
@@ -45,6 +47,8 @@ from ..linearised import (
 
 # Probability that consistent recordings are reported to disagree, for all parameters together.
 SIGNIFICANT = 0.01
+# Scale of the half normal prior of τ, in q: how much temperature, clamps and age change a modulus.
+PRIOR_SPREAD = 0.2
 # Standard deviation of q below which a recording determines a parameter; otherwise a linear step is
 # meaningless.
 TELLING = 0.5
@@ -91,14 +95,41 @@ class RecordingComparison:
 
     def widen(self, variances: Array) -> Array:
         """Return the variances (nq,) of q of the joint fit, increased for parameters on which the
-        recordings disagree: to χ²/f times the lesser of the variance and that of the mean of the
-        recordings, if that is more. The argument is not modified.
+        recordings disagree: to that of a normal distribution with the interval of their mean, less
+        by the part of the variance in that of the mean without τ, if that is more. The argument is
+        not modified.
         """
-        ratio = self.chi_squared / np.maximum(self.degrees_of_freedom, 1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            of_all = 1 / np.nansum(1 / self.deviations**2, axis=0)
-            enough = np.maximum(variances, ratio * np.minimum(variances, of_all))
-        return np.where(self.find_disagreements(), enough, variances)
+        wide = variances.copy()
+        for k in np.flatnonzero(self.find_disagreements()):
+            known = np.isfinite(self.deviations[:, k])
+            deviations = self.deviations[known, k]
+            half_width = half_width_of_mean(self.differences[known, k], deviations)
+            part = min(1.0, float(variances[k] * np.sum(1 / deviations**2)))
+            wide[k] = max(variances[k], part * (half_width / normal_isf(0.025)) ** 2)
+        return wide
+
+
+def half_width_of_mean(differences: Array, deviations: Array) -> float:
+    """Return half the width of the interval about zero that has 95 % of the posterior of the mean of
+    recordings (n,), with their standard deviations (n,) and an unknown spread τ between them.
+    """
+    tau = PRIOR_SPREAD * np.linspace(0, 5, 501)[:, None]
+    weights = 1 / (deviations**2 + tau**2)
+    information = weights.sum(axis=1)
+    mean = weights @ differences / information
+    misfit = np.sum(weights * (differences - mean[:, None]) ** 2, axis=1)
+    logarithm = np.log(weights).sum(axis=1) - np.log(information) - misfit
+    logarithm -= (tau[:, 0] / PRIOR_SPREAD) ** 2
+    share = np.exp((logarithm - logarithm.max()) / 2)
+    share /= share.sum()
+
+    def outside(half_width: float) -> float:
+        ends = (np.array([[half_width], [-half_width]]) - mean) * np.sqrt(information)
+        above, below = scipy.special.ndtr(ends)
+        return float(share @ (1 - above + below)) - 0.05
+
+    largest = np.abs(mean).max() + 10 / np.sqrt(information.min())
+    return float(scipy.optimize.brentq(outside, 0, largest))
 
 
 def blocks_by_recording(fit: LinearisedFit) -> dict[str, list[int]]:
