@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from .extras.planning.path_terms import PathCost, PathLimit, PathQuantities
     from .extras.planning.task import Task
     from .extras.studies.model_comparison import ModelComparison, compare_models
-    from .features.image_tracks.tracks import ImageTracks, PoseSigma
-    from .features.outlines.outlines import Outlines
     from .fem.body import Body
     from .fem.laws.constants import Constant
     from .fem.laws.fibres import Fibres
@@ -39,9 +37,11 @@ if TYPE_CHECKING:
     from .fem.node_force import NodeForce
     from .fem.regions import Region
     from .fem.rest_shape import UnderGravity
-    from .fem.rods import CrossSection, RodMesh, rod_mesh
     from .fem.schemes import Scheme, Stencil
     from .fem.spatial_field import Field
+    from .kinds.image_tracks.tracks import ImageTracks, PoseSigma
+    from .kinds.outlines.outlines import Outlines
+    from .kinds.rod.element import CrossSection, RodMesh, rod_mesh
     from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
     from .methods.comparison.penalty import AugmentedLagrangian, Penalty
     from .methods.comparison.shooting import Shooting

@@ -21,8 +21,8 @@ from .common.limits import TimeLimitReached, time_limit
 from .common.step_counting import StepUnit, counted_phase
 from .common.validated_classes import validated
 from .errors import InputError, SimulationError
-from .features.specimens.notes import one_kind_notes, stress_offset_notes
 from .fem.schemes import as_scheme
+from .kinds.specimen.notes import one_kind_notes, stress_offset_notes
 from .methods.experiment_executors import connect_executor
 from .methods.reduced_space import ReducedSpace
 from .methods.solution import Method, Solution, Status, Watch

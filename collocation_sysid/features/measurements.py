@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,22 +40,6 @@ MOST_SHOWN = 3
 ONE = np.ones((1, 1))
 
 Predictions = Sequence[Predicted | None]
-
-
-class OfKind(Protocol):
-    """What belongs to one kind of measurements, of obstacles or of specimens."""
-
-    @property
-    def kind(self) -> type: ...
-
-
-Contribution = TypeVar("Contribution", bound=OfKind)
-
-
-def present(among: Iterable[Contribution], experiments: Iterable[Experiment]) -> list[Contribution]:
-    """Return those whose kind of measurement, obstacle or specimen the experiments have."""
-    parts = [each for e in experiments for each in (*e.measurements, *e.obstacles, e.specimen)]
-    return [one for one in among if any(isinstance(each, one.kind) for each in parts)]
 
 
 def _predicted_numbers(

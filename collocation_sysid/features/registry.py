@@ -1,15 +1,21 @@
-"""Registry of the features that contribute to checks, runs and reports."""
+"""Kinds of the measurements, obstacles and specimens of experiments, with their messages."""
 
 from __future__ import annotations
 
-from ..statistics.concerns import declare_messages, declare_topics
-from .cameras.feature import CAMERAS
-from .contact.feature import CONTACT
-from .feature import Feature
-from .image_tracks.feature import IMAGE_TRACKS
-from .outlines.feature import OUTLINES
+from collections.abc import Iterable
 
-FEATURES: tuple[Feature, ...] = (CONTACT, CAMERAS, IMAGE_TRACKS, OUTLINES)
-for _feature in FEATURES:
-    declare_topics(_feature.topics)
-    declare_messages(_feature.messages)
+from ..kinds.kind import Kind
+from ..kinds.registry import KINDS, kind_of
+from ..recording.experiment import Experiment
+from ..statistics.concerns import declare_messages, declare_topics
+
+for _kind in KINDS:
+    declare_topics(_kind.topics)
+    declare_messages(_kind.messages)
+
+
+def present(experiments: Iterable[Experiment]) -> list[Kind]:
+    """Return the kinds of which experiments have a measurement, an obstacle or a specimen."""
+    declared = (each for e in experiments for each in (*e.measurements, *e.obstacles, e.specimen))
+    found = {kind_of(each) for each in declared}
+    return [kind for kind in KINDS if kind in found]

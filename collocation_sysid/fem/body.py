@@ -33,7 +33,6 @@ from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .discretisation import Discretisation
-from .elements import ROD, element_named
 from .laws.constants import DENSITY, NATURAL_STRAINS, Constant
 from .laws.fibres import Fibres
 from .laws.materials import DampingLaw, Energy, Material, Prony
@@ -45,7 +44,6 @@ from .node_force import LocatedForce, NodeForce, placed_unit_drag
 from .pattern import JointPattern, SymmetricPattern
 from .regions import BodyPart, ConstantsModel, Region, Theta, parts_from_regions
 from .rest_shape import InverseEquilibrium, RestShapeError, UnderGravity, require_supported
-from .rods import STRAINS, RodMaterial, RodMesh, rod_law, rod_material, strains_in_shape
 from .schemes import Scheme, as_scheme
 from .spatial_field import Field
 from .step_function import element_forces, step_function
@@ -110,7 +108,7 @@ def _require_origin(made: object, mesh_from: object, rest_shape: object) -> None
         )
 
 
-def _require_rod(
+def _require_elastic(
     regions: Sequence[Region],
     prony: Sequence[object],
     field: object,
@@ -144,7 +142,7 @@ class Body(Discretisation):
     Parameters
     ----------
     mesh : TetMesh
-        Or a `RodMesh`, of a slender body.
+        Also one of `rod_mesh`, of a slender body.
     material : str, Material or callable, default "neo-hookean"
         Name in `materials.MATERIALS`, or energy function ``(F, **constants) -> ψ`` in CasADi SX,
         see `Material.from_energy`. Of a rod "rod" (the default) or "cable", see `rods`.
@@ -242,15 +240,9 @@ class Body(Discretisation):
         evaluator: str = "auto",
         threads: AtLeastOne | None = None,
     ) -> None:
-        kind = ROD if isinstance(mesh, RodMesh) else element_named(element)
-        if isinstance(mesh, RodMesh):
-            material = rod_law(material, mesh.section, natural_curvature)
-            _require_rod(regions, prony, field, fibres, rest_shape, damping)
-        elif natural_curvature:
-            raise InputError(
-                "found natural_curvature for a body of tetrahedra; expected a mesh by cs.rod_mesh",
-                where="natural_curvature",
-            )
+        kind, material = mesh.element_and_law(element, material, natural_curvature)
+        if not mesh.kind.is_solid:
+            _require_elastic(regions, prony, field, fibres, rest_shape, damping)
         parts = parts_from_regions(
             mesh,
             material,
@@ -276,7 +268,7 @@ class Body(Discretisation):
                 where="material_density_kg_m3",
             )
         # A rod is generated, but a real cable is seldom straight by itself.
-        is_drawn = (mesh.is_generated and not isinstance(mesh, RodMesh)) or mesh_from == "cad"
+        is_drawn = (mesh.is_generated and mesh.kind.is_solid) or mesh_from == "cad"
         generated: Literal["stress_free"] | None = "stress_free" if is_drawn else None
         self.rest_shape: UnderGravity | Literal["stress_free"] | None = (
             generated if rest_shape is None else rest_shape
@@ -354,7 +346,7 @@ class Body(Discretisation):
         positions_m : (n, 3)
             Stress-free positions of all nodes [m], mid nodes included.
         """
-        other = self._with_geometry(self._geometry_at(positions_m))
+        other = self.with_geometry(self._geometry_at(positions_m))
         other.rest_shape = "stress_free"
         return other
 
@@ -366,25 +358,7 @@ class Body(Discretisation):
         """
         geometry = self.geometry.copy()
         geometry[..., -1] *= factors[:, None]
-        return self._with_geometry(geometry)
-
-    def with_section_scale(self, factor: float) -> Body:
-        """Return a copy of this rod with the same masses and a section that is larger by a factor."""
-        parts = [
-            replace(
-                part,
-                material=rod_material(
-                    part.material.name,
-                    part.material.section.scaled(factor),
-                    part.material.has_natural_curvature,
-                ),
-            )
-            for part in self.parts
-            if isinstance(part.material, RodMaterial)
-        ]
-        geometry = self.geometry.copy()
-        geometry[..., -1] *= factor**2
-        return self.with_parts(tuple(parts))._with_geometry(geometry)
+        return self.with_geometry(geometry)
 
     @cached_property
     def natural_strain_indices(self) -> list[int]:
@@ -392,29 +366,14 @@ class Body(Discretisation):
         names = {constant.name for constant in NATURAL_STRAINS}
         return [k for k, name in enumerate(self.constants) if name.split(".")[-1] in names]
 
-    def with_natural_curvature(self, strains_1_m: Array) -> Body | None:
-        """Return a copy of this rod whose stress-free shape has a further natural curvature and
-        twist (3,) [1/m]; None if they are constants of the body.
-        """
-        if any(getattr(p.material, "has_natural_curvature", False) for p in self.parts):
-            return None
-        geometry = self.geometry.copy()
-        geometry[..., -4:-1] += strains_1_m
-        return self._with_geometry(geometry)
-
     def partly_straightened(self, share: float) -> Body:
         """Return a rod that is straight at rest with a share of the change of its rest shape from the
         shape of its nodes, in which it has no stress at the share 0; other bodies as they are.
         """
-        mesh = self.mesh
-        if share == 1 or not (isinstance(mesh, RodMesh) and mesh.is_straight_at_rest):
-            return self
-        geometry = self.geometry.copy()
-        strains = strains_in_shape(mesh.points_m, self.cells, geometry)
-        geometry[..., -1 - STRAINS : -1] += (1 - share) * strains
-        return self._with_geometry(geometry)
+        geometry = self.mesh.partly_straightened(self.cells, self.geometry, share)
+        return self if geometry is self.geometry else self.with_geometry(geometry)
 
-    def _with_geometry(self, geometry: Array) -> Body:
+    def with_geometry(self, geometry: Array) -> Body:
         """Return a copy of this body with the same masses and another geometry (E, q, 3·nodes + 1)."""
         other = copy(self)
         other.geometry = geometry
@@ -426,16 +385,7 @@ class Body(Discretisation):
 
     def _geometry_at(self, positions_m: Array) -> Array:
         """Shape gradients and volumes (E, q, 3·nodes + 1) with nodes at other positions (n, 3)."""
-        if isinstance(self.mesh, RodMesh):
-            return self.mesh.geometry_at(positions_m, self.cells)
-        count, points = self.geometry.shape[:2]
-        slopes = self.geometry[..., :-1].reshape(count, points, -1, 3)
-        G = np.einsum("ean,eqai->eqni", positions_m[self.cells], slopes)
-        gradients = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(
-            count, points, -1
-        )
-        volumes = self.geometry[..., -1:] * np.linalg.det(G)[..., None]
-        return np.concatenate([gradients, volumes], axis=2)
+        return self.mesh.geometry_at(positions_m, self.cells, self.geometry)
 
     def stress_free_mesh(self, theta: Theta) -> TetMesh:
         """Return the mesh in its stress-free shape at θ (k,), without mid nodes; `mesh` itself if

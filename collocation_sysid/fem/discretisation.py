@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..common.array_types import Array, Index
 from ..errors import InputError
+from ..kinds.kind import Kind
 from .elements import ELEMENTS, Element
 from .expressions import KERNELS, PointLaw, energy_kernel
 from .kernel import ElementKernel
@@ -28,7 +29,6 @@ from .node_force import NodeForce
 from .pattern import SymmetricPattern, dofs_of, element_destinations, with_ascending_nodes
 from .regions import BodyPart, ConstantsModel, Theta
 from .rest_shape import InverseEquilibrium
-from .rods import RESULTANTS
 from .spatial_field import FieldAssembly
 
 # Outputs with columns for θ; a field adds derivatives by the logarithm of each cell.
@@ -379,21 +379,26 @@ class Discretisation(ConstantsModel):
         return element_destinations(self.pattern, self.cells)[1][:, of_cell].ravel()
 
     @property
-    def is_slender(self) -> bool:
-        """Whether the body is a rod."""
-        return self.element.columns > 3
+    def kind(self) -> Kind:
+        """Record of the kind of the body."""
+        return self.mesh.kind
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether the body is a solid of tetrahedra, see `Kind.is_solid`."""
+        return self.kind.is_solid
 
     @property
     def place_element(self) -> Element:
-        """Element that interpolates positions at places on the body: that of the body itself, or of
-        a rod the linear tetrahedron.
+        """Element that interpolates positions at places on the body: that of the body itself, or
+        unless it is a solid the linear tetrahedron.
         """
-        return ELEMENTS["tet4"] if self.is_slender else self.element
+        return self.element if self.is_solid else ELEMENTS["tet4"]
 
     @property
     def place_cells(self) -> Index:
         """Nodes (k, any) of the elements that interpolate positions, see `place_element`."""
-        return self.mesh.tetrahedra if self.is_slender else self.cells
+        return self.cells if self.is_solid else self.mesh.tetrahedra
 
     @property
     def part_of_place_cells(self) -> Index:
@@ -517,7 +522,7 @@ class Discretisation(ConstantsModel):
             "element_force": 3 * self.cells.size,
             "linearisation": (1 + k) * size + entries,
             "curvature": 2 * k * size + entries + k * (k + 1),
-            "resultants": RESULTANTS * len(self.cells),
+            "resultants": self.element.stresses * len(self.cells),
             "resultant_stiffness": self.pattern.entry_count,
         }[name]
 
@@ -557,7 +562,8 @@ class Discretisation(ConstantsModel):
             dofs = 3 * self.element.nodes
             nodal = dofs * part.cells[:, None] + np.arange(dofs), self._width(name)
         matrix = lower, self.pattern.entry_count
-        of_cells = RESULTANTS * part.cells[:, None] + np.arange(RESULTANTS)
+        stresses = self.element.stresses
+        of_cells = stresses * part.cells[:, None] + np.arange(stresses)
         nodal_by_theta = by_theta, total * self.pattern.size
         theta = np.broadcast_to(columns, (count, len(columns))), total
         theta_theta = np.broadcast_to(square, (count, len(square))), total**2
@@ -603,7 +609,8 @@ class Discretisation(ConstantsModel):
         count = len(part.cells)
         columns = [np.zeros((count, points, 0), dtype=np.int64)]
         if name == "resultant_stiffness":
-            return (RESULTANTS * part.cells[:, None] + np.arange(RESULTANTS))[:, None]
+            of_cell = np.arange(self.element.stresses)
+            return (len(of_cell) * part.cells[:, None] + of_cell)[:, None]
         width = 0
         if part.prony and name != "energy":
             own = self.memory.part_columns(number)

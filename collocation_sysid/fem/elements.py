@@ -77,6 +77,8 @@ class Element:
     # Number of columns c of the gradient (3, c) at a point: 3 for the deformation gradient; more if
     # further derivatives of the positions, such as those of directors, follow it.
     columns: int = 3
+    # Number of stresses at a point, of a law with strains of its own.
+    stresses: int = 0
     # Number of values of the rest shape, which a point has beside shape gradients and volume.
     rest_values: int = 0
     # For each node after the corners, the two corners between which it lies halfway.
@@ -129,6 +131,7 @@ ROD = Element(
     mass_shares=np.full(6, 1 / 6),
     meshio_type="wedge",
     columns=5,
+    stresses=12,
     rest_values=7,
 )
 

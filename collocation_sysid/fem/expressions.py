@@ -34,10 +34,9 @@ import casadi as ca
 
 from .elements import Element
 from .kernel import Derivative, ElementKernel, Outputs, Pieces, QuadraturePoint
-from .laws.materials import DampingLaw, Material, damped_psi
+from .laws.materials import DampingLaw, Material, StrainMaterial, damped_psi
 from .laws.mean_dilatation import averaging_kernel
 from .rest_point_layout import RestPointLayout
-from .rods import RESULTANTS, RodMaterial
 
 # Number of kernels of each kind kept in memory, shared by bodies of the same law and element.
 CACHED_KERNELS = 64
@@ -106,7 +105,7 @@ class PointLaw:
         """
         if not self.damping.stress:
             return None
-        if isinstance(self.material, RodMaterial):
+        if isinstance(self.material, StrainMaterial):
             values = ca.vertcat(theta[: len(self.material.constants)], rest_values)
             gradient = ca.SX.sym("G", F.numel())
             stress, slope = self.material.viscous_stress(
@@ -372,8 +371,8 @@ def curvature_kernel(element: Element, law: PointLaw) -> ElementKernel:
 
 
 def _resultants(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX]:
-    """Return the strains and stresses per volume of a rod, see `RodMaterial.resultants`."""
-    assert isinstance(law.material, RodMaterial)
+    """Return the strains and stresses per volume, see `StrainMaterial.resultants`."""
+    assert isinstance(law.material, StrainMaterial)
     rate = (
         point.gradients["v"] if "v" in point.gradients else ca.SX(point.gradients["x"].numel(), 1)
     )
@@ -385,7 +384,7 @@ def _resultants(point: QuadraturePoint, law: PointLaw) -> tuple[ca.SX, ca.SX]:
 
 @lru_cache(CACHED_KERNELS)
 def resultants_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of the stresses times volume [J] of an element of a rod."""
+    """Return the kernel of the stresses times volume [J] of an element whose law has strains of its own."""
     point = quadrature_point(element, law, "x", "v")
     _, stress = _resultants(point, law)
     outputs: Outputs = {"resultants": (Derivative(point.compute_volume() * stress, ()),)}
@@ -394,10 +393,10 @@ def resultants_kernel(element: Element, law: PointLaw) -> ElementKernel:
 
 @lru_cache(CACHED_KERNELS)
 def resultant_stiffness_kernel(element: Element, law: PointLaw) -> ElementKernel:
-    """Return the kernel of Σ s ∂²ε/∂x² of an element of a rod, with stresses times volume s that
+    """Return the kernel of Σ s ∂²ε/∂x² of such an element, with stresses times volume s that
     are data of its point.
     """
-    point = quadrature_point(element, law, "x", internal_variable_count=RESULTANTS)
+    point = quadrature_point(element, law, "x", internal_variable_count=element.stresses)
     strain, _ = _resultants(point, law)
     outputs: Outputs = {"by_position": (Derivative(ca.dot(point.point_data, strain), ("x", "x")),)}
     return kernel_from_outputs("resultant_stiffness", point, outputs)

@@ -28,6 +28,7 @@ from .laws.materials import (
     Energy,
     Material,
     Prony,
+    StrainMaterial,
     as_branches,
     as_damping,
     as_material,
@@ -37,7 +38,6 @@ from .laws.time_shift import TimeShift
 from .meshes.mesh import TetMesh
 from .meshes.selection import Selection
 from .node_force import NodeForce
-from .rods import RodMaterial
 from .spatial_field import Field, FieldModes
 
 
@@ -240,7 +240,7 @@ def parts_from_regions(
 
 
 def _require_damping(damping: DampingLaw, material: Material) -> None:
-    if not isinstance(material, RodMaterial) and damping not in DAMPINGS.values():
+    if not isinstance(material, StrainMaterial) and damping not in DAMPINGS.values():
         require_admissible_damping(damping, material)
 
 

@@ -21,10 +21,8 @@ from ..fem.body import Body
 from ..fem.laws.materials import MATERIALS, Material
 from ..fem.meshes.mesh import TetMesh
 from ..fem.rest_shape import UnderGravity
-from ..kinds.rod.effects import end_mass_effect, free_end
 from ..program.collocation import ExperimentIterate
 from ..recording.experiment import Experiment
-from ..recording.loads import PointMass
 from ..statistics.budget.effect import Effect, ExperimentAtAnswer
 from ..statistics.budget.shape_error import GRAVITY_M_S2, other_section, sag_m
 from ..statistics.budget.systematic_effects import section_effect
@@ -79,8 +77,7 @@ def body_rows(part: ExperimentIterate) -> Iterator[Doubt]:
     is_strained = np.abs(moved_m / rest_m - 1).max() > LEAST_STRAIN
     for material in other_materials(body) if is_strained else ():
         yield _other_law(material)
-    if body.is_slender:
-        yield END_MASS
+    yield from body.kind.doubts
     if not _is_uniform(body):
         return
     if other_section(body.mesh, body.nodes.points_m) is not None:
@@ -127,15 +124,6 @@ def _of_other_section(experiment: Experiment, _: Array) -> Correction:
     return other, {"real": real, "meshed": meshed}
 
 
-def _with_end_mass(experiment: Experiment, size: Array) -> Correction:
-    mass_kg = float(size[0])
-    if mass_kg <= 0:
-        return None
-    end = PointMass(free_end(experiment), mass_kg)
-    return replace(experiment, masses=[*experiment.masses, end]), {"mass_g": 1e3 * mass_kg}
-
-
-END_MASS = Doubt("end-mass", "kg", _with_end_mass, effect=end_mass_effect, mean=0.0, wide=0.1)
 SECTION = Doubt(
     "mesh-section", "1", effect=lambda at, _: section_effect(at), correct=_of_other_section
 )

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..common.step_counting import search_activity
 from ..errors import InputError, SimulationError
-from ..features.measurements import present
+from ..features.registry import present
 from ..methods.reduced_space import ReducedSpace
 from ..methods.solution import Solution, Status
 from ..methods.starts.initial_trajectories import associated_at_guess
@@ -24,7 +24,6 @@ from ..statistics.thresholds import BETTER, CERTAIN, INDISTINGUISHABLE, PARTIAL
 from .fit import Corrected, TestedFit, discrepancy, has_trend, least_loss, thinned, with_corrected
 from .modes import find_misspecifications_by_modes
 from .motion import motion_candidates, motion_rows
-from .registry import SOURCES
 from .tracks import exchanged_places, filtered_tracks, same_tracks
 
 # Largest number of samples of a refit.
@@ -77,7 +76,7 @@ def find_misspecifications(
     (`CERTAIN`), or if the residuals are noise.
     """
     deviations = deviations or {}
-    sources = present(SOURCES, [part.transcription.experiment for part in solution.parts])
+    sources = present([part.transcription.experiment for part in solution.parts])
     if is_consistent:
         return rank(e for source in sources for e in source.consistent(solution, deviations))
     found = [each for source in sources for each in source.fitted(solution)]
@@ -133,7 +132,7 @@ def _tested(
     if stated is None:
         return []
     fit = TestedFit(solution, stated)
-    sources = present(SOURCES, [each.experiment for each in solution.collocation.transcriptions])
+    sources = present([each.experiment for each in solution.collocation.transcriptions])
     candidates = [each for source in sources for each in source.candidates(fit)]
     if not is_specimen:
         candidates += [*fit.screened(motion_rows(fit)), *motion_candidates(fit)]

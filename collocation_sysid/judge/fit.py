@@ -20,7 +20,7 @@ from ..recording.measurement import Measurement, root_mean
 from ..statistics.budget.consider_analysis import changed_residuals, changes_of_assumptions
 from ..statistics.distributions import largest_deviation, normal_isf
 from ..statistics.hypothesis import Hypothesis
-from ..statistics.linearised import LinearisedFit, linearise_fit
+from ..statistics.linearised import LinearisedFit, least_squares_of_fit, linearise_fit
 from ..statistics.thresholds import CHANCE, LEAST_DECREASE, MISFIT, NOISE, RARE, UNCORRELATED
 from .doubt import Doubt
 
@@ -186,20 +186,11 @@ def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
     """Return the Gram matrix (1 + c, 1 + c) of the residuals of a fit and of c changes of them, less
     what a step of its parameters explains.
     """
-    free = ~fit.at_bound
-    stacked = []
-    slopes = []
-    for block, change in zip(fit.blocks, blocks, strict=True):
-        weight = (block.compute_root_weight() * block.is_measured)[..., None]
-        both = np.concatenate([block.residual[..., None], change * weight], axis=3)
-        stacked.append(both.reshape(-1, both.shape[-1]))
-        slopes.append(block.jacobian.reshape(len(stacked[-1]), block.jacobian.shape[-1]))
-    values = np.concatenate(stacked)
-    jacobian = np.concatenate(slopes)[:, free]
-    of_prior = np.zeros((len(fit.prior_residual), values.shape[1]))
-    of_prior[:, 0] = fit.prior_residual
-    values = np.concatenate([values, of_prior])
-    jacobian = np.concatenate([jacobian, np.diag(fit.prior_jacobian)[:, free]])
+    count = blocks[0].shape[-1]
+    wide = fit.with_columns(blocks, [""] * count, np.zeros(count), is_known=False)
+    triangle = least_squares_of_fit(wide).triangle
+    values = triangle[:, [-1, *range(len(fit.names), triangle.shape[1] - 1)]]
+    jacobian = triangle[:, np.flatnonzero(~fit.at_bound)]
     explained = np.linalg.lstsq(jacobian, values, rcond=1e-10)[0]
     return (remaining := values - jacobian @ explained).T @ remaining
 

@@ -69,7 +69,7 @@ def find_misspecifications_by_modes(
     Without markers, and of rods, only signs of loads are tested; in a static experiment, or where modes
     are of no use (`ModalComparison.from_experiment`), no modes are used.
     """
-    if not experiment.markers.names or experiment.body.is_slender:
+    if not (experiment.markers.names and experiment.body.is_solid):
         return rank(load_sign_hypotheses(experiment))
     if experiment.is_static:
         return rank([*load_sign_hypotheses(experiment), *_rigid_axes(experiment)])
@@ -142,7 +142,7 @@ class ModalComparison:
             samples of markers, tendons or pressures drive it, or it is a rod, whose deflections are far
             from linear.
         """
-        is_left_out = experiment.actuators or experiment.body.is_slender
+        is_left_out = experiment.actuators or not experiment.body.is_solid
         declared = None if is_left_out else DeclaredMotion.from_experiment(experiment)
         if declared is None or np.isfinite(declared.tracks_m[..., 0]).sum() < 3:
             return None

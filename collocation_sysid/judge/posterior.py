@@ -167,20 +167,7 @@ class Effects:
         """Return the fit with the effects as its last parameters, and their definition: the matrix
         (p + a, p + a) that turns these parameters into those of the body.
         """
-        blocks = []
-        for block, change in zip(fit.blocks, self.blocks, strict=True):
-            more = change * (block.compute_root_weight() * block.is_measured)[..., None]
-            blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
-        count = len(self.names)
-        wide = replace(
-            fit,
-            blocks=tuple(blocks),
-            names=(*fit.names, *self._unique_names),
-            prior_residual=np.append(fit.prior_residual, -self.means),
-            prior_jacobian=np.append(fit.prior_jacobian, np.ones(count)),
-            at_bound=np.append(fit.at_bound, np.zeros(count, dtype=bool)),
-            effect_count=count,
-        )
+        wide = fit.with_columns(self.blocks, self._unique_names, self.means)
         definition = self._definition(wide, parameters)
         changed = [
             replace(b, jacobian=b.jacobian @ definition) if self._redefining else b

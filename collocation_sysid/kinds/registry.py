@@ -13,3 +13,10 @@ KINDS: tuple[Kind, ...] = tuple(
     for each in sorted(iter_modules(_folders), key=lambda each: each.name)
     if each.ispkg
 )
+_BY_CLASS = {kind.declares: kind for kind in KINDS}
+
+
+def kind_of(declared: object) -> Kind | None:
+    """Return the kind of a measurement, an obstacle or a specimen, by its class or a base class."""
+    names = (each.__name__ for each in type(declared).__mro__)
+    return next((_BY_CLASS[name] for name in names if name in _BY_CLASS), None)

@@ -93,7 +93,7 @@ class IpoptPolicy:
     row_pivot: float = 1e-11
     # That of slender bodies, whose rows of strains are steeper: with 1e-11 the growth of the factor
     # leaves the inertia wrong in nearly every iteration.
-    slender_row_pivot: float = 1e-8
+    thin_row_pivot: float = 1e-8
     # Pivot tolerance of MUMPS: below the pivots that this diagonal gives, above those that rounding
     # gives in place of zero.
     pivot_tolerance: float = 1e-12
@@ -110,7 +110,7 @@ class IpoptPolicy:
     warm_barrier: float = 0.1
     # Least tolerance for slender bodies: rounding errors of their positions, which the rigid sections
     # multiply, change the gradient by about 2e-8.
-    slender_tolerance: float = 1e-7
+    thin_tolerance: float = 1e-7
     # Eigenvalues of the reduced Hessian below this share of the largest are rounding.
     smallest_curvature: float = 1e-12
 
@@ -290,8 +290,8 @@ class InteriorPoint(MethodOptions):
         self, functions: NlpFunctions, program: Collocation, *, is_warm: bool
     ) -> dict[str, Any]:
         """Return the options except the time limit; those of the user replace the others."""
-        is_slender = any(each.body.is_slender for each in program.transcriptions)
-        tolerance = max(self.tolerance, POLICY.slender_tolerance * is_slender)
+        is_solid = all(each.body.is_solid for each in program.transcriptions)
+        tolerance = self.tolerance if is_solid else max(self.tolerance, POLICY.thin_tolerance)
         settings = nlpsol.ipopt_settings(
             functions, self.linear_solver, tolerance, self.max_iterations
         )
@@ -309,8 +309,8 @@ class InteriorPoint(MethodOptions):
             }
         if self.linear_solver == "mumps":  # the matrix as it is: IPOPT refines
             settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_pivtol": POLICY.pivot_tolerance}
-            settings["ipopt.mumps_pivot_order"] = AMD if is_slender else METIS
-            if not (is_warm or is_slender or "mumps_pivot_order" in self.ipopt):
+            settings["ipopt.mumps_pivot_order"] = METIS if is_solid else AMD
+            if is_solid and not (is_warm or "mumps_pivot_order" in self.ipopt):
                 with_hessian = self.hessian != "limited-memory"
                 settings["ipopt.mumps_pivot_order"] = cheaper_ordering(program, with_hessian)
         if self.hessian == "limited-memory":
@@ -321,9 +321,9 @@ class InteriorPoint(MethodOptions):
             if lifted_count(complete_program(program), "pressure")
             else "yes",
             "ipopt.jacobian_regularization_exponent": 0.0,
-            "ipopt.jacobian_regularization_value": POLICY.slender_row_pivot
-            if is_slender
-            else POLICY.row_pivot,
+            "ipopt.jacobian_regularization_value": POLICY.row_pivot
+            if is_solid
+            else POLICY.thin_row_pivot,
         }
         return settings | {f"ipopt.{name}": value for name, value in self.ipopt.items()}
 

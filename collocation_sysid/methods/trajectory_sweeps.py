@@ -34,7 +34,7 @@ MARCHED = NewtonOptions(tolerance=1e-6)
 COMPARED = NewtonOptions(tolerance=1e-8)
 # Of equilibria near known ones. Those that are not found at once are too far for it.
 # Their stability is decided by the sweep along them, which factorises the same matrices.
-SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, max_load_halvings=0, checks_stability=False)
+SETTLED = NewtonOptions(tolerance=1e-9, max_halvings=0, checks_stability=False)
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def sweep_after_step(
 
     if not dynamics.is_static:
         resultants = None
-        if dynamics.body.is_slender:
+        if not dynamics.body.is_solid:
             dynamics = dynamics.truncated_to(len(part.x))
             stress = LaggedStress(dynamics.forces, dynamics.evaluation_states)
             resultants = stress.after(previous.x, part.x - previous.x) - stress.at(part.x)

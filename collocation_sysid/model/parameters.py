@@ -927,8 +927,8 @@ def _derived_moduli(
     derived: dict[str, ca.SX] = {}
     shares = body.split_theta(theta)
     for part, share, source in zip(body.parts, shares, body.constant_sources(names), strict=True):
-        if body.is_slender:
-            continue  # stiffnesses of a section follow from no modulus, or E and ν are stated
+        if not body.is_solid:
+            continue  # stiffnesses follow from no modulus, or E and ν are stated
         lame = part.material.lame(share[: len(part.material.constants)])
         young, poisson = engineering_constants(lame[0], lame[1])
         moduli = {"young_pa": young, "poisson": poisson, "lambda_pa": lame[0], "mu_pa": lame[1]}

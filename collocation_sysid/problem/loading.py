@@ -40,8 +40,8 @@ from ..fem.meshes.structured import (
 )
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
-from ..fem.rods import ROD_CURVATURE, CrossSection, RodMesh, rod_mesh
 from ..fem.spatial_field import Field
+from ..kinds.rod.element import ROD_CURVATURE, CrossSection, RodMesh, rod_mesh
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Specimen
 from ..recording.homogeneous_deformation import DEFORMATIONS

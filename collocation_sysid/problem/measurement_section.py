@@ -24,18 +24,14 @@ from ..common.schema_tables import Section
 from ..common.validated_types import FileName
 from ..errors import InputError, hint_at, located
 from ..fem.body import Body
-from ..fem.rods import RodMesh
+from ..kinds.registry import KINDS
+from ..kinds.rod.element import RodMesh
 from ..recording.sources.logs import stored_files
 from ..recording.time_tables import is_within_experiment, read_custom_sensor
 
 # Group of the entry points of other packages: the key of a list of tables within
 # [[experiment]], and the class of the tables, a `MeasurementSection`.
 ENTRY_POINTS = "collocation_sysid.measurements"
-# The same of the features of this package, which it imports when a table is read.
-OWN_TABLES = {
-    "image_tracks": "collocation_sysid.features.image_tracks.table:ImageTracksSection",
-    "outlines": "collocation_sysid.features.outlines.table:OutlinesSection",
-}
 
 
 class NamedSection(Section):
@@ -141,15 +137,14 @@ class MeasurementSection(NamedSection):
 @cache
 def registered_tables() -> type[Section]:
     """Return a table of the lists of tables of features and of other packages, by their keys."""
-    own = [EntryPoint(name, value, ENTRY_POINTS) for name, value in OWN_TABLES.items()]
-    entries = [*own, *entry_points(group=ENTRY_POINTS)]
-    lists: dict[str, Any] = {entry.name: (_type_of(entry), []) for entry in entries}
+    lists: dict[str, Any] = {name: (list[table], []) for name, table in own_tables().items()}
+    lists |= {entry.name: (_type_of(entry), []) for entry in entry_points(group=ENTRY_POINTS)}
     return create_model("RegisteredTables", __base__=Section, **lists)
 
 
 def own_tables() -> dict[str, type[MeasurementSection]]:
     """Return the classes of the tables of features of this package by their keys."""
-    return {name: EntryPoint(name, value, "").load() for name, value in OWN_TABLES.items()}
+    return {kind.name: table for kind in KINDS if (table := kind.table)}
 
 
 def _type_of(entry: EntryPoint) -> Any:

@@ -245,10 +245,7 @@ class Problem:
             return self.substeps
         fitted = (each for each in self.experiments if not each.validation)
         return max(
-            (
-                max(impact_steps(e), 2 if e.body.is_slender and not e.is_static else 1)
-                for e in fitted
-            ),
+            (max(impact_steps(e), 1 if e.body.is_solid or e.is_static else 2) for e in fitted),
             default=1,
         )
 

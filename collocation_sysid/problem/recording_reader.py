@@ -110,7 +110,7 @@ class RecordingReader:
             Names the file and line, or the key within the experiment's table. Also if all nodes are
             grasped, or if the problem exceeds this machine's memory.
         """
-        if self.body.is_slender:
+        if not self.body.is_solid:
             of_surface = [
                 key for key in ("obstacle", "tendon", "pressure") if getattr(self.section, key)
             ]

@@ -23,9 +23,9 @@ from ..fem.body import Made, MeshOrigin
 from ..fem.elements import ELEMENTS
 from ..fem.laws.fibres import Fibres
 from ..fem.laws.materials import DAMPINGS, MATERIALS
-from ..fem.rods import LAWS as ROD_LAWS
 from ..fem.schemes import MOST_STEPS, SCHEMES
 from ..fem.spatial_field import Field as SpatialField
+from ..kinds.rod.element import LAWS as ROD_LAWS
 from ..model.parameters import Unknown
 from ..recording.experiment import usual_air_density
 from ..recording.node_selection import Nodes

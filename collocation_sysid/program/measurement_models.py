@@ -1,9 +1,10 @@
-"""The kinds of measurements: which `MeasurementModel` belongs to which `Measurement`."""
+"""Which `MeasurementModel` belongs to which `Measurement`, unless its kind has one."""
 
 from __future__ import annotations
 
 from collections import Counter
 
+from ..kinds.registry import kind_of
 from ..recording.custom_sensor import CustomSensor, FollowingSensor
 from ..recording.depth_camera import Depth
 from ..recording.experiment import Experiment
@@ -12,7 +13,6 @@ from ..recording.measured_wrench import Wrench
 from ..recording.measurement import Measurement
 from .association import Association
 from .custom_sensor_residual import CustomSensorModel
-from .depth.model import DepthModel
 from .following_sensor import FollowingSensorModel
 from .markers.association import MarkerAssociation
 from .markers.residual import MarkerModel
@@ -24,7 +24,6 @@ MODELS: dict[type[Measurement], type[MeasurementModel]] = {
     Wrench: WrenchModel,
     CustomSensor: CustomSensorModel,
     FollowingSensor: FollowingSensorModel,
-    Depth: DepthModel,
 }
 # Kinds whose measurements are numbered together.
 NUMBERED = (Markers, Wrench, CustomSensor, Depth)
@@ -32,6 +31,9 @@ NUMBERED = (Markers, Wrench, CustomSensor, Depth)
 
 def model_of(measurement: Measurement) -> type[MeasurementModel]:
     """Return the model of the kind of a measurement, or of the nearest base class that has one."""
+    kind = kind_of(measurement)
+    if kind is not None:
+        return kind.model
     return next(MODELS[kind] for kind in type(measurement).__mro__ if kind in MODELS)
 
 

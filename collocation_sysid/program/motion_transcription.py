@@ -30,7 +30,6 @@ from ..model.inputs import Inputs, inputs_from_experiment, with_inputs
 from ..model.internal_variables import AnyHistory
 from ..model.nuisance_map import NuisanceIndices, NuisanceMap
 from ..model.parameters import Parameters, ThetaMap
-from ..model.rod_stresses import bending_moment_n_m
 from ..recording.experiment import Experiment
 from .linear_algebra.block_band import (
     BandBlock,
@@ -275,13 +274,14 @@ class MotionTranscription:
 
     @cached_property
     def force_n(self) -> float:
-        """Unit of equations of motion [N]: `stiffness_n`; of a rod, whose rigid sections would leave
-        no other force visible, the force whose moment at one edge length bends it by 1 rad.
+        """Unit of equations of motion [N]: `stiffness_n`; of a body that hardly stretches, whose
+        stiffness would leave no other force visible, the force whose moment at one edge length bends
+        it by 1 rad.
         """
-        if not self.body.is_slender:
+        if self.body.is_solid:
             return self.stiffness_n
         theta = self.constants.theta(self.parameters.guess_q)
-        return bending_moment_n_m(self.body, theta) / self.length_m
+        return self.body.kind.given_stresses.unit_moment_n_m(self.body, theta) / self.length_m
 
     @cached_property
     def stiffness_n(self) -> float:

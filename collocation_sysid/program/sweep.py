@@ -314,8 +314,8 @@ class Sweep:
         )
         self.of_sensed = Submatrix(self.pattern, self.sensed)
         self._has_temporary_grasps = bool(self.dynamics.is_temporarily_prescribed.any())
-        # It moves surfaces off the obstacles that hold them, and rods are not solids.
-        self.has_retraction = not (transcription.experiment.obstacles or self.body.is_slender)
+        # It moves surfaces off the obstacles that hold them, and is that of solids.
+        self.has_retraction = self.body.is_solid and not transcription.experiment.obstacles
 
     @cached_property
     def retraction(self) -> Retraction:

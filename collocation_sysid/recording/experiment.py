@@ -229,7 +229,7 @@ class Experiment:
     def __post_init__(self) -> None:
         """Append the frames of the obstacles to the body, put obstacles last, and resolve nodes."""
         loads = ("masses", "forces", "tendons", "pressures")
-        if self.body.is_slender:
+        if not self.body.is_solid:
             self._require_no_surface()
         if self.obstacles or len(self.body.frames):
             vars(self)["body"] = with_obstacle_frames(

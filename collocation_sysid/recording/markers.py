@@ -204,10 +204,10 @@ class Markers(Measurement):
         return f"Markers({', '.join(shown)}: {self.sample_count} samples{gaps})"
 
     def place_dimension(self, body: Body) -> int:
-        """Return the number of coordinates of an estimated place: 1 along the centreline of a rod,
-        2 on a surface, else 3.
+        """Return the number of coordinates of an estimated place: 3 in a solid, less 1 on its surface;
+        those of the kind of another body.
         """
-        return 1 if body.is_slender else 2 if self.on_surface else 3
+        return body.kind.place_dimension - (self.on_surface and body.is_solid)
 
     def on_body(self, body: Body, undeformed_places: UndeformedPlaces | None = None) -> Markers:
         """Return the markers with their placement on a body, without `places_m`; self if they have

@@ -17,7 +17,6 @@ from ..common.array_types import Array, Index
 from ..common.checked_arrays import point_text, read_only_floats, read_only_nodes
 from ..common.validated_classes import validated
 from ..errors import InputError
-from ..fem.rods import centres_of_sections, nearest_on_centreline
 
 if TYPE_CHECKING:
     from ..fem.body import Body
@@ -257,21 +256,15 @@ class LocatedBody:
 
     def nearest_surface_point(self, point: Array) -> tuple[Array, Array]:
         """Return the nearest point (3,) [m] of the surface of straight triangles, and two
-        orthogonal unit tangents of its face as columns (3, 2); of a rod the nearest point of the
-        centreline, and its tangent (3, 1).
+        orthogonal unit tangents of its face as columns (3, 2); unless the body is a solid,
+        `Kind.nearest_place`.
         """
-        if self.body.is_slender:
-            return self._nearest_point_of_centreline(point)
+        if not self.body.is_solid:
+            return self.body.kind.nearest_place(self.nodes_m, point)
         nearest = nearest_points_of_triangles(point, self.triangles)
         face = int(np.linalg.norm(point - nearest, axis=1).argmin())
         sides = self.triangles[face, 1:] - self.triangles[face, 0]
         return nearest[face], np.asarray(np.linalg.qr(sides.T)[0], dtype=np.float64)
-
-    def _nearest_point_of_centreline(self, point: Array) -> tuple[Array, Array]:
-        centres = centres_of_sections(self.nodes_m)
-        (k,), (share,) = nearest_on_centreline(centres, point[None])
-        step = centres[k + 1] - centres[k]
-        return centres[k] + share * step, (step / np.linalg.norm(step))[:, None]
 
     def barycentric(self, points: Array, cells: slice | Index) -> Array:
         """Return barycentric coordinates (k, 4) of points (k, 3), or of one point (3,), in the

@@ -44,7 +44,7 @@ class ElementFields:
         kernels. A rod has none of these fields.
         """
         evaluators = []
-        for number, part in enumerate(() if body.is_slender else body.parts):
+        for number, part in enumerate(body.parts if body.is_solid else ()):
             kernel = field_kernel(body.element, body.law(number))
             # Every element has a place of its own, where its points add up.
             places = len(FIELD_NAMES) * part.cells[:, None] + np.arange(len(FIELD_NAMES))
@@ -84,7 +84,7 @@ class ElementFields:
             where ln J does not exist, the values that need it are NaN.
         """
         body = self.body
-        if body.is_slender:
+        if not body.is_solid:
             return {}
         x = np.ascontiguousarray(positions_m, dtype=float).reshape(-1, body.nodes_m.size)
         sums = np.empty((len(x), len(FIELD_NAMES) * len(self._volumes)))

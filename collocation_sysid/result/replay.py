@@ -246,7 +246,7 @@ class MotionRecord:
             *(simulated or (None, None)),
             natural_hz,
             static=experiment.is_static,
-            slender=body.is_slender,
+            slender=not body.is_solid,
             tendons_m=_join_polylines([tendon.points_m for tendon in experiment.tendons]),
             obstacles_m=_obstacle_outlines(experiment),
             reading_units={gauge.name: gauge.unit for gauge in experiment.readings if gauge.unit}

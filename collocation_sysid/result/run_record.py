@@ -23,12 +23,12 @@ from ..common.files import RESULT_FILE, write_text_file
 from ..common.serialisation import as_json
 from ..common.written_files import listed_hashes
 from ..errors import InputError
-from ..features.contact.feature import contact_fields
-from ..features.image_tracks.residual import ImageTrackResidual
 from ..features.measurements import recorded_series
-from ..features.outlines.outlines import edge_pixels
-from ..features.outlines.residual import OutlinesResidual
 from ..fem.body import Body
+from ..kinds.contact.feature import contact_fields
+from ..kinds.image_tracks.residual import ImageTrackResidual
+from ..kinds.outlines.outlines import edge_pixels
+from ..kinds.outlines.residual import OutlinesResidual
 from ..methods.reduced_space import ReducedSpace
 from ..recording.experiment import Experiment
 from ..runs.forward_simulation import ForwardSimulation

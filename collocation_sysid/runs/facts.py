@@ -18,12 +18,11 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..errors import InputError, located
-from ..features.image_tracks.tracks import ImageTracks
 from ..features.measurements import lost_samples, titles
 from ..fem.meshes.checks import boundary_of, connected_parts
 from ..fem.meshes.mesh import TetMesh
 from ..fem.meshes.selection import Box, rows_of_faces
-from ..fem.rods import RodMesh
+from ..kinds.image_tracks.tracks import ImageTracks
 from ..problem import Problem
 from ..recording.experiment import Experiment
 from ..recording.grasp import Grasp, prescribed_nodes
@@ -208,11 +207,11 @@ def grasp_gaps(experiment: Experiment, grasp: Grasp) -> Iterator[tuple[str, floa
                 yield axis, float(gap_m), float(free_m)
 
 
-def _ends_of_held(mesh: TetMesh | RodMesh, grasp: Grasp) -> tuple[Array, Array]:
+def _ends_of_held(mesh: TetMesh, grasp: Grasp) -> tuple[Array, Array]:
     """Return centres (F, 3) [m] and areas with normals (F, 3) [m²] of the faces between the elements
     of which all corners are held, and others.
     """
-    if isinstance(mesh, RodMesh):
+    if not mesh.kind.is_solid:
         return np.zeros((0, 3)), np.zeros((0, 3))
     is_held = np.isin(mesh.tetrahedra, grasp.nodes).all(axis=1)
     faces, _ = boundary_of(mesh.tetrahedra[is_held])

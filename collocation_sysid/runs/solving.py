@@ -13,8 +13,7 @@ from ..common.limits import TimeLimitReached, time_limit
 from ..common.step_counting import search_activity
 from ..common.validated_classes import validated
 from ..errors import InputError
-from ..features.measurements import present
-from ..features.registry import FEATURES
+from ..features.registry import present
 from ..fem.laws.constants import symbol_of, unit_of, without_region
 from ..methods.experiment_executors import connect_executor
 from ..methods.interior_point import InteriorPoint
@@ -294,7 +293,7 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
     """Return the start of the search in the nonlinear program of a problem."""
     collocation = problem.collocation()
     for experiment in collocation.experiments:
-        for feature in present(FEATURES, [experiment]):
+        for feature in present([experiment]):
             feature.require_valid(experiment)
     if warm_start is not None and problem.substeps == "auto":
         collocation = replace(collocation, substeps=warm_start.substeps)
@@ -322,5 +321,5 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
 
 def _feature_notes(solution: Solution) -> list[str]:
     parts = solution.parts
-    features = present(FEATURES, [part.transcription.experiment for part in parts])
+    features = present([part.transcription.experiment for part in parts])
     return [note for part in parts for feature in features for note in feature.notes(part)]

@@ -8,11 +8,10 @@ import numpy as np
 
 from ..common.array_types import Array
 from ..errors import SimulationError
-from ..features.measurements import present
-from ..features.registry import FEATURES
-from ..features.specimens.concerns import as_specimen_concerns
+from ..features.registry import present
 from ..fem.schemes import as_scheme
 from ..judge.posterior import Posterior
+from ..kinds.specimen.concerns import as_specimen_concerns
 from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
 from ..methods.solve_recorder import misfit_of
@@ -125,13 +124,13 @@ def solution_concerns(
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)
     yield from branch_concerns(solution.parts)
-    for feature in present(FEATURES, fitted_experiments):
+    for feature in present(fitted_experiments):
         yield from feature.concerns(solution.parts)
     fitted = fit_misfits(solution)
     static = [each.experiment.name for each in transcriptions if each.experiment.is_static]
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation):
-            for feature in present(FEATURES, [rollout.trajectory.experiment]):
+            for feature in present([rollout.trajectory.experiment]):
                 yield from feature.simulation_concerns(name, rollout)
         is_static = name in static
         is_contained = is_step_known and not is_static

@@ -289,6 +289,35 @@ class LinearisedFit:
         at_best = self.prior_residual + self.prior_jacobian * step
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
+    def with_columns(
+        self, changes: Sequence[Array], names: Sequence[str], means: Array, is_known: bool = True
+    ) -> LinearisedFit:
+        """Return the fit with further parameters, which are its effects.
+
+        Parameters
+        ----------
+        changes : sequence of (T, M, 3, a) arrays
+            Changes of the residuals of each block by the parameters, in σ.
+        means : (a,) array
+            Means of their priors, of which the standard deviation is 1.
+        is_known : bool
+            Whether they have these priors.
+        """
+        blocks = []
+        for block, change in zip(self.blocks, changes, strict=True):
+            more = change * (block.compute_root_weight() * block.is_measured)[..., None]
+            blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
+        slopes = np.full(len(names), float(is_known))
+        return replace(
+            self,
+            blocks=tuple(blocks),
+            names=(*self.names, *names),
+            prior_residual=np.append(self.prior_residual, -slopes * means),
+            prior_jacobian=np.append(self.prior_jacobian, slopes),
+            at_bound=np.append(self.at_bound, np.zeros(len(names), dtype=bool)),
+            effect_count=len(names),
+        )
+
     @property
     def with_known_effects(self) -> LinearisedFit:
         """The fit without the effects among its parameters."""

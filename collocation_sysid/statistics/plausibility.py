@@ -146,7 +146,7 @@ def material_hypothesis(body: Body, theta: Array) -> Hypothesis | None:
 
     Motion determines the stiffness over the density only, so a wrong density leaves no other trace.
     """
-    if body.is_slender:
+    if not body.is_solid:
         return None
     density_kg_m3 = float(body.mass_of_dofs(theta).sum()) / 3 / body.mesh.volume_m3
     young_pa = max(float(engineering_constants(*lame)[0]) for lame in body.lame(theta).values())

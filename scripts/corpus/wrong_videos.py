@@ -15,7 +15,7 @@ from wrong_cameras import OPENGL, with_axes_of_robot, with_inverse_pose, with_tr
 from wrong_twins import ExperimentChange, Fault, Rng
 
 from collocation_sysid.common.array_types import Array
-from collocation_sysid.features.image_tracks.tracks import ImageTracks
+from collocation_sysid.kinds.image_tracks.tracks import ImageTracks
 from collocation_sysid.recording import Experiment
 from collocation_sysid.recording.camera import Camera
 

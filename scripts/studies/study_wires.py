@@ -26,7 +26,7 @@ from script_arguments import make_parser
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.selection import Along
-from collocation_sysid.fem.rods import centres_of_sections
+from collocation_sysid.kinds.rod.element import centres_of_sections
 from collocation_sysid.result.figure_style import RESOLUTION_DPI
 
 Array = NDArray[np.float64]

@@ -28,7 +28,7 @@ from PIL import Image
 from script_arguments import make_parser
 
 from collocation_sysid import cli
-from collocation_sysid.features.outlines.masks import encoded
+from collocation_sysid.kinds.outlines.masks import encoded
 from collocation_sysid.problem.new import create_problem
 
 Generator = np.random.Generator

@@ -14,7 +14,7 @@ import pytest
 from kit.problem_files import Outcome, run_command
 
 from collocation_sysid.extras.tracking import tag_centres, video
-from collocation_sysid.features.image_tracks.files import read_tracks
+from collocation_sysid.kinds.image_tracks.files import read_tracks
 from collocation_sysid.recording import PoseSequence, write_poses_csv
 
 cv2 = pytest.importorskip("cv2")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
-from collocation_sysid.fem.rods import CrossSection, RodMesh, rod_mesh
+from collocation_sysid.kinds.rod.element import CrossSection, RodMesh, rod_mesh
 from collocation_sysid.testing.property_check import PropertyCheck
 
 ROUND = CrossSection.round(0.01)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.pattern import dofs_of
-from collocation_sysid.fem.rods import CrossSection, RodMesh, rod_mesh
+from collocation_sysid.kinds.rod.element import CrossSection, RodMesh, rod_mesh
 from collocation_sysid.program.forward.initial_equilibrium import equilibrium
 from collocation_sysid.program.modes.natural import Modes, natural_modes
 from collocation_sysid.recording import Experiment, Force, Grasp, PoseSequence

@@ -15,7 +15,7 @@ from twins import SOFT, twin
 from wrong_twins import FAULTS
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
+from collocation_sysid.kinds.image_tracks.stated_cameras import hypotheses
 from collocation_sysid.runs.check import misspecification_hypotheses
 
 Tracks = cs.ImageTracks

@@ -35,7 +35,7 @@ from synthetic import Swing
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
-from collocation_sysid.fem.rods import CrossSection
+from collocation_sysid.kinds.rod.element import CrossSection
 from collocation_sysid.methods.condensed_program import condense
 from collocation_sysid.methods.interior_point import IPOPT_STATUS, InteriorPoint
 from collocation_sysid.methods.reduced_space import ReducedSpace

@@ -30,14 +30,14 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.feature import notes
-from collocation_sysid.features.image_tracks.rays import (
+from collocation_sysid.kinds.image_tracks.feature import notes
+from collocation_sysid.kinds.image_tracks.rays import (
     is_behind,
     is_occluded,
     points_on_surface,
     poses_from_points,
 )
-from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
+from collocation_sysid.kinds.image_tracks.residual import ImageTrackResidual
 from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.observables import ObservableDerivatives
 

@@ -17,7 +17,7 @@ from collocation_sysid import (
     box_mesh,
     simulate,
 )
-from collocation_sysid.fem.rods import CrossSection
+from collocation_sysid.kinds.rod.element import CrossSection
 from collocation_sysid.model.parameters import Parameters
 from collocation_sysid.program.collocation import Collocation
 from collocation_sysid.program.forward.newton_linearisation import LaggedStress

@@ -32,9 +32,9 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.common import array_files
-from collocation_sysid.features.outlines.masks import decoded, encoded, read_masks
-from collocation_sysid.features.outlines.outlines import edge_pixels, mask_of
-from collocation_sysid.features.outlines.residual import OutlinesResidual
+from collocation_sysid.kinds.outlines.masks import decoded, encoded, read_masks
+from collocation_sysid.kinds.outlines.outlines import edge_pixels, mask_of
+from collocation_sysid.kinds.outlines.residual import OutlinesResidual
 from collocation_sysid.methods.reduced_space import ENDED_BY_ASSOCIATION
 from collocation_sysid.methods.solution import Solution, Status
 from collocation_sysid.program.observables import ObservableDerivatives
@@ -72,7 +72,7 @@ def test_the_distance_is_that_of_a_shifted_outline() -> None:
 def residual_of_pairs(residual: OutlinesResidual, pairs: Any) -> OutlinesResidual:
     from dataclasses import replace
 
-    from collocation_sysid.features.outlines.residual import compared
+    from collocation_sysid.kinds.outlines.residual import compared
 
     return replace(
         residual, correspondences=pairs, is_compared=compared(pairs, residual.observable_s)

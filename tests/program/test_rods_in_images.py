@@ -10,10 +10,10 @@ from scipy.interpolate import CubicSpline
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
-from collocation_sysid.features.image_tracks.table import ImageTracksSection
 from collocation_sysid.fem.meshes.selection import Along
-from collocation_sysid.fem.rods import centres_of_sections
+from collocation_sysid.kinds.image_tracks.residual import ImageTrackResidual
+from collocation_sysid.kinds.image_tracks.table import ImageTracksSection
+from collocation_sysid.kinds.rod.element import centres_of_sections
 from collocation_sysid.problem.measurement_section import RecordingFolder
 from collocation_sysid.program.observables import ObservableDerivatives
 

@@ -50,7 +50,7 @@ def experiment(**changes) -> Experiment:
         nodes_m=NODES,
         nodes=SimpleNamespace(points_m=NODES),
         frames=np.zeros((0, 4), dtype=int),
-        is_slender=False,
+        is_solid=True,
     )
     body.parts = [SimpleNamespace(name="", density_kg_m3=1000.0)]
     body.with_frames = lambda *_, **__: body

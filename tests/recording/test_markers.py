@@ -31,7 +31,7 @@ def box_body(divisions=(2, 2, 3), edge_m=0.1) -> Any:
     tetrahedra = np.concatenate(cells)
     mesh = TetMesh(nodes, tetrahedra)
     return SimpleNamespace(
-        nodes_m=nodes, place_cells=tetrahedra, place_element=element, is_slender=False, mesh=mesh
+        nodes_m=nodes, place_cells=tetrahedra, place_element=element, is_solid=True, mesh=mesh
     )
 
 
@@ -49,7 +49,7 @@ def quadratic(body) -> Any:
 
     element = SimpleNamespace(shape_functions=shape_functions)
     return SimpleNamespace(
-        nodes_m=nodes, place_cells=cells, place_element=element, is_slender=False, mesh=body.mesh
+        nodes_m=nodes, place_cells=cells, place_element=element, is_solid=True, mesh=body.mesh
     )
 
 

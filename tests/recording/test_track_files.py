@@ -13,7 +13,7 @@ from kit.logs import json_mcap
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.features.image_tracks.files import read_tracks
+from collocation_sysid.kinds.image_tracks.files import read_tracks
 from collocation_sysid.recording import read_markers
 from collocation_sysid.recording.sources.calibration_files import read_calibration
 from collocation_sysid.recording.sources.topics import list_topics

@@ -26,7 +26,7 @@ from kit.problem_files import pictures_drawn, run_command
 from kit.results import a_result
 
 import collocation_sysid as cs
-from collocation_sysid.features.cameras.poses import camera_hypotheses
+from collocation_sysid.kinds.depth.poses import camera_hypotheses
 from collocation_sysid.pipeline import run
 from collocation_sysid.program.depth.visible_surface import VisibleSurface
 from collocation_sysid.program.simulation import with_markers

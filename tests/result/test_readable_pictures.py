@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
+from collocation_sysid.kinds.image_tracks.residual import ImageTrackResidual
 from collocation_sysid.methods.solution import Iteration
 from collocation_sysid.result.pictures import convergence, correlation_matrix
 from collocation_sysid.result.pictures.cameras import tracks_picture

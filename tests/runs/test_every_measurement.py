@@ -27,7 +27,7 @@ from collocation_sysid.features.measurements import (
     lost_samples,
     reason_against_copy,
 )
-from collocation_sysid.features.specimens.concerns import SPECIMEN_CODES, as_specimen_concerns
+from collocation_sysid.kinds.specimen.concerns import SPECIMEN_CODES, as_specimen_concerns
 from collocation_sysid.program.depth.surface_comparison import DepthError, SurfaceComparison
 from collocation_sysid.runs.verdict import _outlier_counts
 from collocation_sysid.statistics.assessment import (

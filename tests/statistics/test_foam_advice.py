@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.features.specimens.concerns import as_specimen_concerns
+from collocation_sysid.kinds.specimen.concerns import as_specimen_concerns
 from collocation_sysid.statistics.concerns import Concern
 
 STRAIN = np.linspace(-0.4, 0.3, 15)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.features.specimens.concerns import as_specimen_concerns
-from collocation_sysid.features.specimens.doubts import likely_mistakes
+from collocation_sysid.kinds.specimen.concerns import as_specimen_concerns
+from collocation_sysid.kinds.specimen.doubts import likely_mistakes
 from collocation_sysid.methods.solution import Status
 from collocation_sysid.recording.specimen_checks import order_warnings
 from collocation_sysid.statistics.concerns import Concern

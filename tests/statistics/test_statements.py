@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import collocation_sysid as cs
-from collocation_sysid.features.specimens.concerns import as_specimen_concerns
+from collocation_sysid.kinds.specimen.concerns import as_specimen_concerns
 from collocation_sysid.runs.check.body import bending_concerns
 from collocation_sysid.statistics.assessment import _noisy_marker_concerns
 from collocation_sysid.statistics.concerns import Concern

@@ -11,7 +11,7 @@ from contact_twins import DRAGGED_NOISE_N, poked_twin, sheared_twin
 from wrong_obstacles import PLATE_FAULTS, POKING_FAULTS
 from wrong_twins import wrench_times
 
-from collocation_sysid.features.contact.doubts import obstacle_hypotheses
+from collocation_sysid.kinds.contact.doubts import obstacle_hypotheses
 from collocation_sysid.problem import Problem
 from collocation_sysid.recording import Nuisance, Plane
 from collocation_sysid.runs.check import misspecification_hypotheses

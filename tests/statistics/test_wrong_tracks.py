@@ -26,11 +26,11 @@ from kit.filmed import (
 )
 
 import collocation_sysid as cs
-from collocation_sysid.features.image_tracks.doubts import track_hypotheses
-from collocation_sysid.features.image_tracks.feature import notes
-from collocation_sysid.features.image_tracks.places import find_places
-from collocation_sysid.features.image_tracks.residual import ImageTrackResidual
-from collocation_sysid.features.image_tracks.stated_cameras import hypotheses
+from collocation_sysid.kinds.image_tracks.doubts import track_hypotheses
+from collocation_sysid.kinds.image_tracks.feature import notes
+from collocation_sysid.kinds.image_tracks.places import find_places
+from collocation_sysid.kinds.image_tracks.residual import ImageTrackResidual
+from collocation_sysid.kinds.image_tracks.stated_cameras import hypotheses
 
 TEMPLATE = Path(cs.__file__).parent / "problem/templates/video/problem.toml"
 Change = Callable[[cs.ImageTracks], cs.ImageTracks]

@@ -35,7 +35,7 @@ import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
-from collocation_sysid.fem.rods import CrossSection, rod_mesh
+from collocation_sysid.kinds.rod.element import CrossSection, rod_mesh
 from collocation_sysid.model.dynamics import Dynamics
 from collocation_sysid.model.forces import Forces
 from collocation_sysid.program.forward.scheme_simulation import simulate_scheme

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array
 from ...errors import InputError
-from ...fem.rods import centres_of_sections
+from ...kinds.rod.element import centres_of_sections
 from ...model.forces import Forces
 from ...program.modes.natural import natural_modes
 from ...recording import Grasp, Solid
@@ -81,7 +81,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
                 f"{grasp.until_s:g} s; a mocap body of MuJoCo holds nodes along all axes, "
                 "throughout: export to calculix or json"
             )
-    if body.body.is_slender:
+    if not body.body.is_solid:
         return _export_cable(body)
     limits = CAPABILITIES.limitations(body)
     if body.experiment.grasps:
@@ -315,7 +315,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
             "calculix or json",
             folder / MODEL,
         ) from error
-    if body.body.is_slender:
+    if not body.body.is_solid:
         return [_compare_tip(body, mujoco, model)] if body.simulated_m is not None else []
     compared = [_compare_first_frequency(body, mujoco, model=model)]
     if not body.experiment.is_static and body.simulated_m is not None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import InputError
-from ...fem.rods import RodMaterial, RodMesh, frames_of_sections
+from ...kinds.rod.element import RodMaterial, RodMesh, frames_of_sections
 from .identified import IdentifiedBody
 from .target import values_as_text
 

@@ -15,7 +15,7 @@ import numpy as np
 from ...common.array_types import Array, Index
 from ...errors import InputError, printable
 from ...fem.meshes.refinement import split_in_eight
-from ...fem.rods import LAWS as LAWS_OF_RODS
+from ...kinds.rod.element import LAWS as LAWS_OF_RODS
 from ...model.forces import Forces
 from ...program.forward.initial_equilibrium import equilibrium
 from ...program.simulation import simulate

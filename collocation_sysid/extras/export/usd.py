@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...errors import InputError, printable
-from ...fem.rods import CrossSection, RodMaterial, RodMesh, frames_of_sections
+from ...kinds.rod.element import CrossSection, RodMaterial, RodMesh, frames_of_sections
 from ...recording import Grasp, Obstacle
 from .identified import IdentifiedBody, IdentifiedRegion
 from .newton import compare_at_rest
@@ -85,10 +85,10 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     require_known_laws(body, "usd")
     pxr = _import_usd()
     limits = [*CAPABILITIES.limitations(body), SINGLE_PRECISION]
-    if body.body.is_slender:
-        limits += _curve_limitations(body)
-    else:
+    if body.body.is_solid:
         limits += [READERS_LAW, *[REGIONS] * (len(body.regions) > 1)]
+    else:
+        limits += _curve_limitations(body)
     limits += [SINGLE_AXES] * bool(
         (body.is_prescribed.any(axis=1) != body.is_node_prescribed).any()
     )
@@ -114,7 +114,7 @@ def export(body: IdentifiedBody) -> ExportedFiles:
     scene.CreateGravityMagnitudeAttr(size)
     scene.CreateGravityDirectionAttr(pxr.Gf.Vec3f(*(gravity / (size or 1.0)).tolist()))
     placed_m = np.where(body.is_prescribed, body.prescribed_m, body.nodes_m)
-    add = _add_curve if body.body.is_slender else _add_mesh
+    add = _add_mesh if body.body.is_solid else _add_curve
     add(pxr, stage, body=body, start_positions_m=placed_m)
     for k, grasp in enumerate(body.experiment.grasps, start=1):
         _add_gripper(pxr, stage, number=k, grasp=grasp, body=body, start_positions_m=placed_m)
@@ -216,7 +216,7 @@ def _add_points(
     prim = shape.GetPrim()
     prim.AddAppliedSchema(schema)
     pxr.UsdPhysics.CollisionAPI.Apply(prim)
-    is_curve = body.body.is_slender
+    is_curve = not body.body.is_solid
     points, normals = shape.CreatePointsAttr(), shape.CreateNormalsAttr() if is_curve else None
     t_s = body.experiment.t_s
     codes = (_rate_hz(t_s) * t_s).tolist()
@@ -337,7 +337,7 @@ def _add_gripper(
     )
     nodes = np.intersect1d(grasp.nodes, np.flatnonzero(body.is_node_prescribed))
     points_m = start_positions_m
-    if body.body.is_slender:
+    if not body.body.is_solid:
         nodes, points_m = nodes[::3] // 3, frames_of_sections(start_positions_m)[0]
     prim = stage.DefinePrim(f"{path}/Grasp", "PhysicsAttachment")
     types = pxr.Sdf.ValueTypeNames
@@ -440,7 +440,7 @@ def verify(body: IdentifiedBody, folder: Path) -> list[PredictionComparison]:
     SimulationError
         If the equilibrium of this package cannot be computed.
     """
-    if body.body.is_slender:
+    if not body.body.is_solid:
         raise InputError("a cable is verified in MuJoCo alone; expected --to mujoco --verify")
 
     def add_to(builder: Any) -> None:

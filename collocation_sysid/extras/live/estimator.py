@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from ...common.array_types import Array
 from ...common.validated_classes import validated
 from ...errors import InputError, SimulationError
-from ...features.image_tracks.tracks import ImageTracks
 from ...fem.laws.constants import unit_of
+from ...kinds.image_tracks.tracks import ImageTracks
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Status
 from ...model.point_forces import law_function

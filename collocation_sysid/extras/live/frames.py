@@ -14,7 +14,7 @@ from ...common.array_types import Array
 from ...common.text_files import parse_json
 from ...common.validated_classes import validated
 from ...errors import InputError
-from ...features.image_tracks.tracks import ImageTracks
+from ...kinds.image_tracks.tracks import ImageTracks
 from ...problem import Problem
 from ...problem.gripper_transforms import gripper_transforms
 from ...recording.experiment import Experiment

@@ -180,7 +180,7 @@ class PlannedProgram:
                 None,
                 where="avoid.clearance_m",
             )
-        if task.avoid.largest_stretch is not None and template.body.is_slender:
+        if task.avoid.largest_stretch is not None and not template.body.is_solid:
             raise InputError(
                 "a rod hardly stretches; expected largest_stretch for a solid body",
                 None,

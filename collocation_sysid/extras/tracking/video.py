@@ -18,7 +18,7 @@ from ...common.array_types import Array
 from ...common.files import in_counting_order, require_regular
 from ...common.installation import python_command
 from ...errors import InputError
-from ...features.outlines.masks import UNREADABLE
+from ...kinds.outlines.masks import UNREADABLE
 from ...recording.sources.depth_files import standard_error_silenced
 
 Image = NDArray[np.uint8]

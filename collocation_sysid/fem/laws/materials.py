@@ -23,6 +23,7 @@ and fibres beside an isotropic material part of `fibres`.
 from __future__ import annotations
 
 import inspect
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -183,6 +184,24 @@ class Material:
     def _describe_values(self, values: list[float]) -> str:
         """Return the constants with given values as text."""
         return ", ".join(f"{c.name} = {v:.3g}" for c, v in zip(self.constants, values, strict=True))
+
+
+class StrainMaterial(Material):
+    """Law of strains of its own, which an element has in place of the deformation gradient."""
+
+    @abstractmethod
+    def viscous_stress(
+        self, F: ca.SX, rate: ca.SX, values: ca.SX, gamma_r_s: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return the viscous stress (g,) at a stacked gradient (g,) and its rate, and its derivative
+        (g, g) by the gradient.
+        """
+
+    @abstractmethod
+    def resultants(
+        self, F: ca.SX, rate: ca.SX, values: ca.SX, gamma_r_s: ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return the strains (s,), and the stresses per volume (s,) that are conjugate to them."""
 
 
 def lame_constants(psi: ca.SX, F: ca.SX, rule: ChainRule | None = None) -> ca.SX:

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from ...common.array_types import Array, Index
 from ...common.validated_classes import validated
 from ...errors import InputError
-from ..elements import Element, reference_geometry
+from ...kinds.kind import SOLID, Kind
+from ..elements import Element, element_named, reference_geometry
 from .checks import (
     MeshQuality,
     boundary_of,
@@ -86,6 +87,7 @@ class TetMesh:
         are degenerate or given twice.
     """
 
+    kind: ClassVar[Kind] = SOLID  # record of the kind of bodies with such a mesh
     points_m: np.ndarray
     tetrahedra: np.ndarray
     point_arrays: dict[str, np.ndarray]
@@ -311,10 +313,57 @@ class TetMesh:
         """Return shape gradients and volumes, see `elements.reference_geometry`."""
         return reference_geometry(nodes.points_m, nodes.cells, element=element)
 
+    def geometry_at(self, positions_m: Array, cells: Index, geometry: Array) -> Array:
+        """Return a geometry (E, q, any) of elements (E, nodes) with their nodes at other positions
+        (n, 3) [m].
+        """
+        count, points = geometry.shape[:2]
+        slopes = geometry[..., :-1].reshape(count, points, -1, 3)
+        G = np.einsum("ean,eqai->eqni", positions_m[cells], slopes)
+        gradients = np.einsum("eqai,eqin->eqan", slopes, np.linalg.inv(G)).reshape(
+            count, points, -1
+        )
+        volumes = geometry[..., -1:] * np.linalg.det(G)[..., None]
+        return np.concatenate([gradients, volumes], axis=2)
+
+    def partly_straightened(self, cells: Index, geometry: Array, share: float) -> Array:
+        """Return `geometry` with a share of the change of the rest shape, see
+        `Body.partly_straightened`; itself if nothing changes.
+        """
+        return geometry
+
+    def element_and_law(
+        self, element: str, material: Any, natural_curvature: bool
+    ) -> tuple[Element, Any]:
+        """Return the element and the law of a body with this mesh, by the arguments of `Body`."""
+        if natural_curvature:
+            raise InputError(
+                "found natural_curvature for a body of tetrahedra; expected a mesh by cs.rod_mesh",
+                where="natural_curvature",
+            )
+        return element_named(element), material
+
+    @property
+    def places_in_refined(self) -> Index:
+        """Index (n,) of each node in the refined mesh."""
+        return np.arange(len(self.points_m))
+
+    def refined_mask(self, is_chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the mask of the nodes of the refined mesh that are nodes of a mask (n,), or between
+        two of them.
+        """
+        return np.concatenate([is_chosen, is_chosen[self.edges].all(axis=1)])
+
     @property
     def surface_factor(self) -> float:
         """Area of the surface of the body over that of the mesh."""
         return 1.0
+
+    @property
+    def extents_m(self) -> tuple[float, float, float]:
+        """Lengths of the body along its axes [m]."""
+        x, y, z = np.ptp(self.bounds_m, axis=0).tolist()
+        return x, y, z
 
     @property
     def arc_lengths_m(self) -> Array | None:

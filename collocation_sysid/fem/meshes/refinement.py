@@ -17,7 +17,6 @@ from ..elements import ELEMENTS
 from ..node_force import LocatedForce, NodeForce
 from ..regions import Region
 from ..rest_shape import UnderGravity
-from ..rods import RodMesh
 from .checks import orient_elements
 from .mesh import ElementNodes, TetMesh
 from .selection import Along, Ball, Box, Indices, Selection
@@ -103,7 +102,7 @@ def on_mesh(
         mesh,
         rest.material,
         rest.density_kg_m3,
-        "tet4" if body.is_slender else body.element.name,
+        body.element.name if body.is_solid else "tet4",
         damping=rest.damping,
         regions=regions,
         prony=rest.prony,
@@ -126,13 +125,12 @@ def refine_body(body: Body) -> Body:
     shape and `has_declared_mass` are those of `body`; the total mass is the same. Frames of obstacles are
     not copied.
     """
-    if isinstance(body.mesh, RodMesh):
-        return _refined_rod(body, body.mesh)
-    mesh = split_in_eight(body.mesh)
+    mesh = body.kind.refined(body.mesh)
+    children = np.arange(len(mesh.tetrahedra) // len(body.cells))
     finer = on_mesh(
         body,
         mesh,
-        cells=[(8 * part.cells[:, None] + np.arange(8)).ravel() for part in body.parts],
+        cells=[(len(children) * part.cells[:, None] + children).ravel() for part in body.parts],
         forces=[_refined_force(placed, mesh, body=body) for placed in body.placed_forces],
         rest_shape=_refined_rest_shape(body, mesh),
     )
@@ -151,12 +149,6 @@ def refine_body(body: Body) -> Body:
             for part, source in zip(finer.parts, body.parts, strict=True)
         )
     )
-
-
-def _refined_rod(body: Body, mesh: RodMesh) -> Body:
-    # Regions are tetrahedra, of which every element of a rod has three.
-    cells = [(6 * part.cells[:, None] + np.arange(6)).ravel() for part in body.parts]
-    return on_mesh(body, mesh.refined(), cells, (), _refined_rest_shape(body, mesh))
 
 
 def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["stress_free"] | None:
@@ -200,13 +192,7 @@ def refine_nodes(nodes: Index, selection: Selection | None, body: Body, finer: B
     """
     if isinstance(selection, (Along, Box, Ball)):
         return finer.select(selection)
-    if isinstance(body.mesh, RodMesh):
-        held = np.isin(np.arange(len(body.nodes_m)), nodes).reshape(-1, 3)
-        fine = np.zeros((2 * len(held) - 1, 3), dtype=bool)
-        fine[::2] = held
-        fine[1::2] = held[1:] & held[:-1]
-        return np.flatnonzero(fine)
     chosen: NDArray[np.bool_] = np.isin(np.arange(len(body.nodes_m)), nodes)
     if not body.element.edges:
-        chosen = np.concatenate([chosen, chosen[body.mesh.edges].all(axis=1)])
+        chosen = body.mesh.refined_mask(chosen)
     return np.flatnonzero(finer.nodes.with_mid_nodes(chosen)).astype(np.int64)

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from ..kind import Kind
-
-if TYPE_CHECKING:
-    from ...recording.deviation import Deviation
+from ..kind import Kind, lazy
 
 
 class Rod(Kind):
     """Rods, cables and hoses."""
 
-    @property
-    def effects(self) -> tuple[Deviation, ...]:
-        from .effects import ROWS
-
-        return ROWS
+    name = "rod"
+    is_solid = False
+    given_stresses = lazy(".stresses", "GivenStresses")
+    buckles = (
+        "the body loses its stability: it buckles between its grasps or under its weight. State "
+        "object.centreline in the shape at the beginning of the recording, or a stiffer guess"
+    )
+    place_dimension = 1
+    places_in_images = ("along the rod",)
+    association = lazy(".association", "CentrelineAssociation")
+    nearest_place = lazy(".element", "nearest_place")
+    refined = lazy(".element", "refined")
+    directions_beyond = lazy(".element", "directions_beyond_clamps")
+    effects = lazy(".effects", "ROWS")
+    other_effects = lazy(".effects", "OTHERS")
+    doubts = lazy(".doubts", "ROWS")
 
 
 KIND = Rod()

@@ -8,7 +8,6 @@ import numpy as np
 
 from ...common.array_types import Index
 from ...fem.laws.constants import TORSION
-from ...fem.rods import RodMesh
 from ...recording.deviation import Deviation
 from ...recording.experiment import Experiment
 from ...statistics.budget.effect import (
@@ -19,6 +18,42 @@ from ...statistics.budget.effect import (
     shape_effect,
     stated_names,
 )
+from .element import ROD_CURVATURE, RodMaterial, RodMesh, rod_material
+
+
+def _size(at: ExperimentAtAnswer, _: int) -> Effect:
+    """Return the effect of a section that is larger by a share, with the same masses."""
+    body, larger = at.body, 1 + SMALL
+    parts = [
+        replace(
+            part,
+            material=rod_material(
+                part.material.name,
+                part.material.section.scaled(larger),
+                part.material.has_natural_curvature,
+            ),
+        )
+        for part in body.parts
+        if isinstance(part.material, RodMaterial)
+    ]
+    geometry = body.geometry.copy()
+    geometry[..., -1] *= larger**2
+    thicker = body.with_parts(tuple(parts)).with_geometry(geometry)
+    return Effect((at.internal_n(body=thicker) - at.internal_n()) / SMALL)
+
+
+def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
+    """Return the effect of natural curvature about d₁ and d₂, and of natural twist, in units of
+    `ROD_CURVATURE` over the length of the rod, also if it is stated to be straight; None if they are
+    constants.
+    """
+    body = at.body
+    assert isinstance(body.mesh, RodMesh)
+    if body.natural_strain_indices:
+        return None
+    geometry = body.geometry.copy()
+    geometry[..., -4 + axis] += ROD_CURVATURE / float(body.mesh.s_m[-1])
+    return Effect(at.internal_n(body=body.with_geometry(geometry)) - at.internal_n())
 
 
 def _torsion(at: ExperimentAtAnswer, _: int) -> Effect | None:
@@ -77,3 +112,9 @@ ROWS = (
         effect=_length,
     ),
 )
+# Of rows of solids.
+OTHERS = {
+    "body_scale": _size,
+    "rest_shape": _rest_shape,
+    **dict.fromkeys(["surface", "section", "anisotropy", "memory_share"]),
+}

@@ -526,8 +526,8 @@ class TrialSimulation:
     def __init__(self, collocation: Collocation, share: float = SHARES[0]) -> None:
         self.collocation = collocation
         self.share = share
-        is_slender = any(each.body.is_slender for each in collocation.transcriptions)
-        self.options = None if is_slender else LOOSE
+        is_solid = all(each.body.is_solid for each in collocation.transcriptions)
+        self.options = LOOSE if is_solid else None
         usual = collocation.with_parameters(typical_parameters(collocation.parameters, SOFT_PA))
         self.rows = [rows_of_share(motion, share) for motion in motion_shares(usual)]
         self.all_rows = [each.grid_times for each in collocation.transcriptions]

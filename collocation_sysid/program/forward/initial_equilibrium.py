@@ -91,13 +91,19 @@ def _solve_equilibrium(
         return static_equations(forces.at_share(share), share, free=solver.free)
 
     guess = start
+    held = solver.is_prescribed
+    displaced_m = np.abs(goals_m[held] - shape.ravel()[held]).max(initial=0.0)
+    is_on_place = bool(displaced_m <= ON_PLACE * solver.size_m)
     if start is None and experiment.obstacles:
         guess = shape.ravel()
-    elif start is None and experiment.body.element.mean_dilatation:
-        held = solver.is_prescribed
-        if np.abs(goals_m[held] - shape.ravel()[held]).max(initial=0.0) <= ON_PLACE * solver.size_m:
-            guess = follow_loads(solver, forces, shape.ravel(), equations)
-    path = SolutionPath(separate.ravel(), halvings=solver.options.max_load_halvings, guess=guess)
+    elif start is None and experiment.body.element.mean_dilatation and is_on_place:
+        guess = follow_loads(solver, forces, shape.ravel(), equations)
+    path = SolutionPath(
+        separate.ravel(),
+        halvings=solver.options.max_halvings,
+        guess=guess,
+        may_begin_small=is_on_place,
+    )
     while path.share < 1.0:
         x, share = path.next_guess()
         residual, linearise = equations(share)

@@ -39,10 +39,6 @@ MOVING = 0.5
 # Shift of the eigenvalues away from zero, over the lowest of the undeformed body.
 SHIFT = 0.01
 # Message for slender bodies, whose surface is not modelled.
-BUCKLED_ROD = (
-    "the body loses its stability: it buckles between its grasps or under its weight. State "
-    "object.centreline in the shape at the beginning of the recording, or a stiffer guess"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +109,7 @@ def explain_failure(
         return error
     if instability is None:
         return error
-    message = BUCKLED_ROD if experiment.body.is_slender else instability.describe()
+    message = experiment.body.kind.buckles or instability.describe()
     explained_error = SimulationError(message, error.time_s, element=error.element)
     explained_error.stability_loss = instability
     return explained_error

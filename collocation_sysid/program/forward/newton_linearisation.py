@@ -56,12 +56,12 @@ class LaggedStress:
     velocity_slope: float = 0.0  # derivative of ν by ξ [1/s]
 
     def at(self, x: Array) -> Array:
-        """Return the mean stresses (E,) [Pa] at x (3n,) [m]; of a rod the resultants [J] (T, any) in
+        """Return the mean stresses (E,) [Pa] at x (3n,) [m]; of another body the resultants [J] (T, any) in
         each of T states.
         """
-        if self.forces.body.is_slender:
-            return self.forces.resultants(*self.states(x), self.velocity_slope)
-        return self.forces.mean_stresses(*self.states(x), self.velocity_slope)
+        if self.forces.body.is_solid:
+            return self.forces.mean_stresses(*self.states(x), self.velocity_slope)
+        return self.forces.resultants(*self.states(x), self.velocity_slope)
 
     def after(self, x: Array, step: Array) -> Array:
         """Return the mean stresses (E,) [Pa] to which a step (3n,) from x (3n,) [m] leads to first
@@ -82,20 +82,20 @@ class LaggedStress:
         self, at: NewtonLinearisation, x: Array, stress_pa: Array
     ) -> NewtonLinearisation:
         """Return the linearisation at x (3n,) [m] with the mean stresses `stress_pa` (E,) in place
-        of those of x in its derivative; for a rod with its resultants.
+        of those of x in its derivative; for another body with its resultants.
         """
         stiffness = self.weight * self.stiffness(x, stress_pa - self.at(x))
         return at._replace(symmetric=at.symmetric + stiffness)
 
     def stiffness(self, x: Array, stress_pa: Array) -> Array:
         """Return the lower triangle (m,) [N/m] of the part of the stiffness by ξ that mean stresses
-        (E,) [Pa], or resultants (1, any) [J] of a rod, have at x (3n,) [m].
+        (E,) [Pa], or resultants (1, any) [J], have at x (3n,) [m].
         """
         (xi,), _ = self.states(x)
         body = self.forces.body
         own = (
-            body.resultant_stiffness(xi[None], stress_pa, self.forces.theta)
-            if body.is_slender
-            else body.volume_stiffness(xi, stress_pa)[None]
+            body.volume_stiffness(xi, stress_pa)[None]
+            if body.is_solid
+            else body.resultant_stiffness(xi[None], stress_pa, self.forces.theta)
         )
         return np.asarray(self.forces.joint_pattern.expand(own)[0])

@@ -82,9 +82,6 @@ class NewtonOptions:
     max_halvings : int
         Largest number of halvings of a time step (Newmark) or of the increment of forces and grasps
         in it (schemes).
-    max_load_halvings : int
-        The same of the increment of loads and grasps towards an equilibrium: a rope turns by a right
-        angle under a thousandth of its weight.
     checks_stability : bool
         Whether the stiffness of an equilibrium is factorised at the equilibrium itself. If false,
         it may be known to be positive definite only at a near state, from which chord steps led
@@ -95,7 +92,6 @@ class NewtonOptions:
     max_iterations: int = 30
     max_backtracks: int = 25
     max_halvings: int = 8
-    max_load_halvings: int = 20
     checks_stability: bool = True
 
 
@@ -588,8 +584,8 @@ class _CompleteIteration:
     has_factor : bool
         Whether there is a factor of an earlier state. Where factors are reused for several
         matrices, that of another time step does not count: a new matrix costs less than steps that
-        shrink more slowly. Nor does it for a rod, whose matrices cost little and contain the
-        resultants of the step before.
+        shrink more slowly. Nor does it unless the body is a solid: other matrices cost little and
+        contain the resultants of the step before.
     """
 
     solver: NewtonSolver  # stores the factor
@@ -598,12 +594,12 @@ class _CompleteIteration:
 
     def __post_init__(self) -> None:
         solver = self.solver
-        is_slender = solver.body.is_slender
+        is_solid = solver.body.is_solid
         self.has_factor = (
-            solver.last_factor is not None and solver.factor_sequence is None and not is_slender
+            solver.last_factor is not None and solver.factor_sequence is None and is_solid
         )
         equations = self.equations
-        self._linearise = solver.with_last_stress(equations) if is_slender else equations.linearise
+        self._linearise = equations.linearise if is_solid else solver.with_last_stress(equations)
 
     def factorise_at(self, x: Array) -> None:
         solver = self.solver
@@ -689,15 +685,22 @@ class SolutionPath:
         x(0) [m]; not modified.
     halvings : int
         The smallest increment is 0.5 to this power.
+    may_begin_small : bool
+        Whether the smallest increment is relative to the share that has been reached, and the first
+        one its square: a rope turns by a right angle under a thousandth of its weight. What grasps
+        compress may buckle to any side after such increments.
     guess : (3n,) array, optional
         Guess of x(1), which is tried first; the path begins at x(0) if it fails, unless `halvings`
         is 0. By default the path begins at x(0).
     """
 
-    def __init__(self, x: Array, halvings: int, guess: Array | None = None) -> None:
+    def __init__(
+        self, x: Array, halvings: int, guess: Array | None = None, may_begin_small: bool = False
+    ) -> None:
         self.x = x
         self.share = 0.0
         self._halvings = halvings
+        self._may_begin_small = may_begin_small
         self._guess = guess
         self._rate = np.zeros_like(x)
         self._longest_step = 1.0
@@ -730,7 +733,10 @@ class SolutionPath:
         # What fails costs many times what succeeds: better short steps that grow.
         self._longest_step = self._step / 4
         self._last_succeeded = False
-        return self._longest_step >= 0.5**self._halvings
+        least = 0.5**self._halvings
+        return self._longest_step >= least * (
+            max(self.share, least) if self._may_begin_small else 1
+        )
 
 
 class NewtonSolvers:

@@ -382,9 +382,7 @@ def solve_row(
     origin = previous[solver.is_prescribed]
     is_static = row.dynamics.is_static
     first = previous if is_static else row.without_forces(solver.free, previous)
-    options = solver.options
-    halvings = options.max_load_halvings if is_static else options.max_halvings
-    path = SolutionPath(first, halvings=halvings, guess=guess)
+    path = SolutionPath(first, halvings=solver.options.max_halvings, guess=guess)
     while path.share < 1.0:
         start, share = path.next_guess()
         # Exact at the end, because bounds of the collocation program are.

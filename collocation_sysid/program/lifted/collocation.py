@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ...common.array_types import Array, Index
-from ...model.rod_stresses import GivenStresses
 from ..collocation import Collocation
 from ..experiment_iterate import ExperimentIterate
 from ..motion_transcription import Offsets, RowWeights, WeightedHistory
@@ -146,28 +145,29 @@ def with_lifted_variables(collocation: Collocation) -> Collocation:
     """Return the program with lifted variables, or the argument itself if it has them already or
     nothing can be lifted.
 
-    The transcriptions are shared with the result, except those of rods.
+    The transcriptions are shared with the result, except those of bodies that are no solids.
     """
-    is_slender = any(each.body.is_slender for each in collocation.transcriptions)
+    is_solid = all(each.body.is_solid for each in collocation.transcriptions)
     if isinstance(collocation, LiftedCollocation) or not (
-        collocation.eliminates_variables or is_slender
+        collocation.eliminates_variables or not is_solid
     ):
         return collocation
     settings = {field.name: getattr(collocation, field.name) for field in fields(Collocation)}
     lifted = LiftedCollocation(**settings)
     # The same transcriptions, with the values that they have cached.
     vars(lifted)["transcriptions"] = tuple(
-        _with_given_stresses(each) if each.body.is_slender else each
+        each if each.body.is_solid else _with_given_stresses(each)
         for each in collocation.transcriptions
     )
     return lifted
 
 
 def _with_given_stresses(transcription: Transcription) -> Transcription:
-    """Return the transcription of a rod with `GivenStresses` in its equations of motion."""
+    """Return the transcription with `Kind.given_stresses` in its equations of motion."""
     theta = transcription.constants.theta(transcription.parameters.guess_q)
     energy_j = transcription.force_n * transcription.length_m
-    stresses = GivenStresses.from_body(transcription.body, theta, energy_j)
+    body = transcription.body
+    stresses = body.kind.given_stresses.from_body(body, theta, energy_j)
     dynamics = transcription.dynamics
     own = replace(transcription)
     vars(own)["dynamics"] = replace(dynamics, forces=stresses.added_to(dynamics.forces))
@@ -248,7 +248,7 @@ def lift_variables(
         of_forces = [
             *((LiftedForceHistory, k) for k in forces.terms_with_internal_variables),
             *(
-                (LiftedStress if transcription.body.is_slender else LiftedPressure, k)
+                (LiftedPressure if transcription.body.is_solid else LiftedStress, k)
                 for k in forces.complementarity_terms
             ),
         ]

@@ -6,8 +6,8 @@ For evaluations k with an equation of motion, in the unit δ of the pressures,
 
 with the pressure variable b, the gap g and the relaxation r of a
 `model.point_forces.ComplementarityForce`. The structure is that of a force history
-(`force_histories`), but b belongs to the evaluation itself instead of the one before. Stresses of a
-rod have the same structure.
+(`force_histories`), but b belongs to the evaluation itself instead of the one before. Stresses
+of a law with strains of its own have the same structure.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...common.array_types import Array
-from ...fem.rods import RESULTANTS
 from ...model.point_forces import ComplementarityForce
 from ..experiment_iterate import ExperimentIterate
 from ..linear_algebra.sparse_assembly import EntryBlock
@@ -31,7 +30,11 @@ class LiftedPressure(LiftedForceHistory):
     """Lifted pressure variables b of one force of one experiment."""
 
     kind = "pressure"
-    width = 1  # number of variables of each point
+
+    @property
+    def width(self) -> int:
+        """Number of variables of each point."""
+        return 1
 
     @property
     def first_evaluation(self) -> int:  # type: ignore[override]
@@ -115,11 +118,14 @@ class LiftedPressure(LiftedForceHistory):
 
 
 class LiftedStress(LiftedPressure):
-    """Lifted stresses of the elements of a rod, see `model.rod_stresses`."""
+    """Lifted stresses of elements whose law has strains of its own, see `Kind.given_stresses`."""
 
     kind = "stress"
-    width = RESULTANTS
     is_bilinear = True
+
+    @property
+    def width(self) -> int:
+        return self.transcription.body.element.stresses
 
     def _hessian_blocks(self) -> Iterator[EntryBlock]:
         """Yield also the diagonal, which is zero: methods may add to it."""

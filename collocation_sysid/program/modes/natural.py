@@ -23,7 +23,7 @@ from ..linear_algebra.factorisation import Factor, Factoriser
 # ω² below this share of the largest K_ii / M_ii is zero up to rounding; of a rod, whose sections are
 # much stiffer than its bending, below a smaller share.
 RIGID = 1e-12
-RIGID_ROD = 1e-14
+RIGID_THIN = 1e-14
 # Largest number of dofs that are solved densely; Lanczos iterations need more vectors than modes.
 DENSE = 150
 # Share of the largest K_ii / M_ii by which K is shifted, because it is singular where a body can
@@ -82,7 +82,7 @@ def natural_modes(forces: Forces, x: ArrayLike, free_dofs: Index, count: int = 6
         squares, vectors = _lanczos_modes(
             stiffness, mass, factor=factor, shift_1_s2=-SHIFT * largest, requested=requested
         )
-    oscillating = squares > (RIGID_ROD if forces.body.is_slender else RIGID) * largest
+    oscillating = squares > (RIGID if forces.body.is_solid else RIGID_THIN) * largest
     shapes = np.zeros((int(oscillating.sum()), pattern.size))
     shapes[:, free_dofs] = vectors[:, oscillating].T
     omega = np.sqrt(squares[oscillating])[:count]

@@ -250,8 +250,11 @@ def field_shapes(
 def _surface_field(
     replay: MotionRecord, body: Body, constants: Mapping[str, float], field: str
 ) -> SurfaceField:
-    if body.is_slender:
-        raise InputError(f"found the field {field!r} of a rod; expected pictures without a field")
+    if not body.is_solid:
+        kind = body.kind.name
+        raise InputError(
+            f"found the field {field!r} of a {kind}; expected pictures without a field"
+        )
     elements = ElementFields.from_body(body, body.theta_from_values(constants))
     cells = body.mesh.surface_cells
 

@@ -18,8 +18,7 @@ from ...common.array_types import Array
 from ...common.limits import TimeLimitReached, time_limit
 from ...common.serialisation import content
 from ...errors import SimulationError
-from ...features.measurements import present
-from ...features.registry import FEATURES
+from ...features.registry import present
 from ...fem.schemes import as_scheme
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solve_recorder import best_iterate
@@ -333,7 +332,7 @@ def check_problem(
         at_guess += strain_stability_concerns(parts)
         if not start_notes:  # forces on a body that was only carried by its grasps mean nothing
             at_guess += branch_concerns(parts)
-            for feature in present(FEATURES, problem.experiments):
+            for feature in present(problem.experiments):
                 at_guess += feature.guess_concerns(parts, simulated is not first)
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
@@ -411,7 +410,7 @@ def _examples(problem: Problem) -> Problem:
 
 def _longer_edges(problem: Problem, search_s: float | None) -> tuple[float, float] | None:
     meshed = {each.body for each in problem.experiments if each.specimen is None}
-    if search_s is None or len(meshed) != 1 or (body := meshed.pop()).is_slender:
+    if search_s is None or len(meshed) != 1 or not (body := meshed.pop()).is_solid:
         return None
     of_a_minute = (search_s / LONG_SOLVE_S) ** (1 / EDGE_POWER)
     longest = longest_edges(body, slenderness(body.mesh)[2])
@@ -535,7 +534,6 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         For a size or a density that no body can have.
     """
     from ...judge.modes import find_misspecifications_by_modes
-    from ...judge.registry import SOURCES
 
     constants = typical_constants(problem.parameters)
     odd = (oddity for body in problem.bodies for oddity in size_and_density_hypotheses(body))
@@ -547,7 +545,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     by_feature = (
         cause
         for e in problem.experiments
-        for source in present(SOURCES, [e])
+        for source in present([e])
         for cause in source.described(e)
     )
     return (*odd, *rank((*by_feature, *doubtful)))

@@ -14,7 +14,6 @@ from ...fem.body import Body
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import edge_lengths, mean_ratios
 from ...fem.meshes.mesh import TetMesh
-from ...fem.rods import RodMesh
 from ...fem.spatial_field import FieldResolution
 from ...recording import Experiment, Grasp
 from ...statistics.concerns import Concern, concern_if
@@ -264,11 +263,9 @@ def check_body(
         part.field_name: part.field.describe_resolution() for part in body.parts if part.field
     }
     quality = mesh.quality()
-    worst = () if body.is_slender else worst_elements(mesh)
+    worst = worst_elements(mesh) if body.is_solid else ()
     shape = slenderness(mesh)
-    x, y, z = np.ptp(mesh.bounds_m, axis=0).tolist()
-    if isinstance(mesh, RodMesh):
-        x, (y, z) = float(mesh.s_m[-1]), (2 * half for half in mesh.section.extent_m)
+    x, y, z = mesh.extents_m
     return BodyCheck(
         experiments,
         nodes=len(body.nodes.points_m),
@@ -329,9 +326,8 @@ def _field_concerns(fields: Mapping[str, FieldResolution]) -> Iterator[Concern]:
 def _constants_at_guess(body: Body, theta: Array) -> dict[str, float]:
     """Return E [Pa] and ν of each part, then the constants; stated moduli replace computed ones."""
     moduli = {}
-    # Stiffnesses of a section follow from no modulus, or E and ν are constants.
     moduli_of_parts = body.lame(theta)
-    for part in () if body.is_slender else body.parts:
+    for part in body.parts if body.is_solid else ():
         young, poisson = engineering_constants(*moduli_of_parts[part.name])
         moduli |= {part.full_name("young_pa"): young, part.full_name("poisson"): poisson}
     constants = zip(body.constants, theta.tolist(), strict=True)
@@ -376,7 +372,7 @@ def check_grasps(experiment: Experiment, mean_edge_m: float) -> tuple[GraspCheck
         Mean edge length of the mesh [m].
     """
     points_m = experiment.body.nodes.points_m
-    if experiment.body.is_slender:
+    if not experiment.body.is_solid:
         mean_edge_m = 0.0  # arc lengths, which no rounding changes, select the sections
     return tuple(
         _check_grasp(experiment.name, points_m, grasp=g, mean_edge_m=mean_edge_m)

@@ -201,9 +201,10 @@ def changed_residuals(
 
 def _effect_of(row: Deviation, at: ExperimentAtAnswer, axis: int) -> Effect | None:
     is_specimen = at.iterate.transcription.experiment.specimen is not None
-    if row.effect is None or (is_specimen and not row.of_specimens):
+    effect = at.body.kind.other_effects.get(row.name, row.effect)
+    if effect is None or (is_specimen and not row.of_specimens):
         return None
-    return row.effect(at, axis)
+    return effect(at, axis)
 
 
 def _changes_by_effects(

@@ -18,7 +18,6 @@ from ...fem.body import Body
 from ...fem.laws.constants import GAMMA_R, without_region
 from ...fem.laws.moduli import engineering_constants
 from ...fem.meshes.checks import boundary_of
-from ...fem.rods import RodMesh
 from ...model.contact.summary import surface_gaps_and_pressures
 from ...model.dynamics import Dynamics
 from ...model.force_term import States
@@ -292,8 +291,8 @@ class ExperimentAtAnswer:
             return None
         body = self.body
         is_held = np.isin(np.arange(len(body.nodes_m)), np.concatenate(gripped))
-        if isinstance(body.mesh, RodMesh):
-            outward = body.mesh.directions_beyond_clamps(is_held[: len(self.stress_free_m)])
+        if not body.is_solid:
+            outward = body.kind.directions_beyond(body.mesh, is_held[: len(self.stress_free_m)])
             return shape_effect(self, outward) if outward.any() else None
         cells = body.mesh.tetrahedra
         faces, _ = boundary_of(cells[~is_held[cells].all(axis=1)])

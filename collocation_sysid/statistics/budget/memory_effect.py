@@ -26,9 +26,9 @@ RELAXATION_TIME = "τ="
 
 def supports_memory(body: Body, is_static: bool) -> bool:
     """Return whether a branch of memory can be added: the experiment is dynamic, no part of the
-    body has memory, its elements do not average the volume change, and it is not a rod.
+    body has memory, its elements do not average the volume change.
     """
-    return not (is_static or body.has_memory or body.element.mean_dilatation or body.is_slender)
+    return not (is_static or body.has_memory or body.element.mean_dilatation)
 
 
 def is_distinguishable(tau_s: float, sampling_s: float, duration_s: float) -> bool:

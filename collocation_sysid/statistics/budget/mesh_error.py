@@ -114,8 +114,8 @@ def _effect(
         raise InputError("obstacles touch the body")
     fine = refined_experiment(transcription.corrected_experiment(iterate.phi), finer[id(body)])
     dynamics = Dynamics.from_experiment(fine, scheme, transcription.substeps).with_theta(at.theta)
-    if body.is_slender:
-        return _effect_on_rod(at, fine, dynamics)
+    if not body.is_solid:
+        return _effect_of_simulation(at, fine, dynamics)
     by_dof = sp.csr_array(sp.kron(_interpolation(body, fine.body), sp.eye_array(3)))
     held = np.zeros(iterate.x.shape[1], dtype=bool)
     held[transcription.prescribed_dofs] = True
@@ -127,16 +127,15 @@ def _effect(
     return Effect(force_n=at.pad_rows(_changes_of_forces(at, dynamics, by_dof, moving, given)))
 
 
-def _effect_on_rod(at: ExperimentAtAnswer, fine: Experiment, dynamics: Dynamics) -> Effect:
-    """Return the change of the forces that moves the sections of a rod as a rod with twice as many
-    elements moves, which is simulated: a slender body hardly stretches, so that a motion between
-    the given sections cannot be condensed at those where they are.
+def _effect_of_simulation(at: ExperimentAtAnswer, fine: Experiment, dynamics: Dynamics) -> Effect:
+    """Return the change of the forces that moves the nodes as a body with elements of half the size
+    moves, which is simulated: one that hardly stretches cannot be condensed at the given nodes.
     """
     x = at.iterate.x
-    finer = simulate_scheme(fine, dynamics).reshape(len(x), -1, 3, 3)
-    own = len(at.body.nodes.points_m) // 3
+    finer = simulate_scheme(fine, dynamics).reshape(len(x), -1, 3)
     moved = x.copy().reshape(len(x), -1, 3)
-    moved[:, : 3 * own] = finer[:, : 2 * own - 1 : 2].reshape(len(x), -1, 3)
+    own = at.body.mesh.places_in_refined
+    moved[:, : len(own)] = finer[:, own]
     change = moved.reshape(x.shape) - x
     before = _forces_less_inertia(at.dynamics, x)
     after = _forces_less_inertia(at.dynamics, x + SMALL * change)

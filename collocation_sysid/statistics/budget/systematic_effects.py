@@ -27,7 +27,6 @@ from ...fem.body import Body
 from ...fem.laws.constants import GAMMA_M, GAMMA_R
 from ...fem.laws.materials import DAMPINGS, MATERIALS
 from ...fem.laws.moduli import engineering_constants
-from ...fem.rods import ROD_CURVATURE, RodMesh
 from ...kinds.registry import KINDS
 from ...model.parameters import Parameters
 from ...recording import nuisance
@@ -92,13 +91,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
     Buoyancy and the mass of moved air grow by s³, and drag by s². The own mass grows by s³ unless
     the mass of the body is declared, when it stays. For a mesh made under gravity, the weight
     during the scan relative to the stiffness grows by s, or falls by s² if the mass is declared.
-
-    Of a rod the section is larger, not the length.
     """
-    if at.body.is_slender:
-        return Effect(
-            (at.internal_n(body=at.body.with_section_scale(1 + SMALL)) - at.internal_n()) / SMALL
-        )
     larger = 1 + SMALL
     smaller = 1 - SMALL
     force = larger**2 * at.internal_n(larger) - smaller**2 * at.internal_n(smaller)
@@ -165,15 +158,13 @@ def _linear_shares(place_m: Array, weights: Array, extent_m: Array) -> Array:
     return (place_m - middle_m) / np.abs(extent_m - middle_m).max()
 
 
-def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect | None:
+def _anisotropy(at: ExperimentAtAnswer, axis: int) -> Effect:
     """Return the effect of a stiffness that is higher along one axis (index) by a share of E, the
     Young's modulus of the softest part: the energy ½ E e² of the strain e along it.
 
-    Rayleigh damping K(x) v follows by its time derivative. None for a rod.
+    Rayleigh damping K(x) v follows by its time derivative.
     """
     body = at.body
-    if body.is_slender:
-        return None
     xi, nu = at.states
     count, points = body.geometry.shape[:2]
     geometry = body.stress_free_geometry(at.theta)
@@ -560,7 +551,7 @@ def _other_damping(at: ExperimentAtAnswer, law: str) -> Effect | None:
     is_damped = any(
         constant is GAMMA_R and value for (_, constant), value in zip(names, at.theta, strict=False)
     )
-    is_same = body.is_slender and law == "material"  # "kelvin-voigt" of the strains of a rod
+    is_same = not body.is_solid and law == "material"  # "kelvin-voigt" of strains of its own
     if at.iterate.transcription.experiment.is_static or not is_damped or is_same:
         return None
     parts = tuple(
@@ -591,15 +582,7 @@ def _rayleigh_damping(at: ExperimentAtAnswer, _: int) -> Effect | None:
 
 
 def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
-    """Return None if the problem states the rest shape.
-
-    Of a rod: natural curvature about d₁ and d₂, and natural twist, in units of `ROD_CURVATURE` over
-    the length of the rod, also if it is stated to be straight; None if they are constants.
-    """
-    if isinstance(at.body.mesh, RodMesh):
-        size = ROD_CURVATURE / float(at.body.mesh.s_m[-1])
-        curved = at.body.with_natural_curvature(np.eye(3)[axis] * size)
-        return None if curved is None else Effect(at.internal_n(body=curved) - at.internal_n())
+    """Return None if the problem states the rest shape."""
     if at.body.rest_shape is not None:
         return None
     return Effect(
@@ -609,10 +592,8 @@ def _rest_shape(at: ExperimentAtAnswer, axis: int) -> Effect | None:
     )
 
 
-def _surface(at: ExperimentAtAnswer, mode: int) -> Effect | None:
-    """Return the effect per thickness; grasped nodes move with the surface. None for a rod."""
-    if at.body.is_slender:
-        return None
+def _surface(at: ExperimentAtAnswer, mode: int) -> Effect:
+    """Return the effect per thickness; grasped nodes move with the surface."""
     return shape_effect(at, at.surface_modes_m[mode])
 
 
@@ -643,7 +624,6 @@ def _section(at: ExperimentAtAnswer, index: int) -> Effect | None:
     """Return None for a mesh from a file or of known origin, or in contact with obstacles."""
     body = at.body
     is_stated = body.mesh_from is not None or body.inverse_equilibrium is not None
-    is_stated = is_stated or body.is_slender
     if is_stated or not body.mesh.is_generated or at.iterate.transcription.experiment.obstacles:
         return None
     other = other_section(body.mesh, body.nodes.points_m)

@@ -13,9 +13,7 @@ from ...methods.solution import Solution
 from ...model.contact.summary import ContactSummary, contact_summaries, surface_gaps_and_pressures
 from ...program.collocation import ExperimentIterate
 from ...recording.experiment import Experiment
-from ...recording.obstacle import Obstacle
 from ...statistics.concerns import Concern, Topic, concern_if
-from ..feature import Feature
 
 # Number of faces below which the mesh determines the width of a contact.
 FEWEST_FACES = 4.0
@@ -130,6 +128,3 @@ def contact_fields(
         experiment, np.array(theta), x=positions_m.reshape(len(positions_m), -1)
     )
     return {"gaps_m": gaps_m, "pressures_pa": pressures_pa}
-
-
-CONTACT = Feature(Obstacle, topics=TOPICS, guess_concerns=guess_concerns, concerns=concerns)

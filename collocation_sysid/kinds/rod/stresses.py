@@ -19,16 +19,16 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from ..common.array_types import Array, Index
-from ..fem.body import Body
-from ..fem.elements import ROD
-from ..fem.force_points import ForcePoints
-from ..fem.pattern import JointPattern
-from ..fem.rods import RESULTANTS, STRAINS, RodMaterial, RodMesh, strains_with_sections
-from .force_term import AssemblyIndices, States
-from .forces import Forces
-from .generated_functions import GeneratedFunction
-from .point_forces import ComplementarityForce, PreviousState
+from ...common.array_types import Array, Index
+from ...fem.body import Body
+from ...fem.elements import ROD
+from ...fem.force_points import ForcePoints
+from ...fem.pattern import JointPattern
+from ...model.force_term import AssemblyIndices, States
+from ...model.forces import Forces
+from ...model.generated_functions import GeneratedFunction
+from ...model.point_forces import ComplementarityForce, PreviousState
+from .element import RESULTANTS, STRAINS, RodMaterial, RodMesh, strains_with_sections
 
 DOFS = 3 * ROD.nodes
 # Data of an element: those of its rest shape, then the stiffnesses by the unit of energy, this, and
@@ -98,6 +98,12 @@ class GivenStresses(ComplementarityForce):
     def data(self, chosen: Index | None) -> Array:
         return self.element_data
 
+    @staticmethod
+    def unit_moment_n_m(body: Body, theta: Array) -> float:
+        """Return the moment that bends a rod by 1 rad, from end to end."""
+        assert isinstance(body.mesh, RodMesh)
+        return float(stiffnesses(body, theta)[:, 3:5].mean()) / float(body.mesh.s_m[-1])
+
     def scaled_pressures(self, xi: Array, nu: Array | None = None) -> Array:
         """Return the stresses b (12, T, E) at positions ξ (T, 3n) [m] and velocities ν."""
         y = self.points.vectors(xi)
@@ -117,12 +123,6 @@ def stiffnesses(body: Body, theta: Array) -> Array:
             values[: len(part.material.constants)]
         )
     return stiffness
-
-
-def bending_moment_n_m(body: Body, theta: Array) -> float:
-    """Return the moment that bends a rod by 1 rad, from end to end."""
-    assert isinstance(body.mesh, RodMesh)
-    return float(stiffnesses(body, theta)[:, 3:5].mean()) / float(body.mesh.s_m[-1])
 
 
 @cache

@@ -32,15 +32,16 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from ..common.array_types import Array, Index
-from ..common.checked_arrays import read_only_floats
-from ..common.validated_classes import validated
-from ..common.validated_types import Positive
-from ..errors import InputError
-from .elements import ROD, Element
-from .laws.constants import AXIAL, BENDING, NATURAL_STRAINS, POISSON, TORSION, YOUNG, Constant
-from .laws.materials import Material
-from .meshes.mesh import ElementNodes, TetMesh
+from ...common.array_types import Array, Index
+from ...common.checked_arrays import read_only_floats
+from ...common.validated_classes import validated
+from ...common.validated_types import Positive
+from ...errors import InputError
+from ...fem.elements import ROD, Element
+from ...fem.laws.constants import AXIAL, BENDING, NATURAL_STRAINS, POISSON, TORSION, YOUNG, Constant
+from ...fem.laws.materials import StrainMaterial
+from ...fem.meshes.mesh import ElementNodes, TetMesh
+from . import KIND
 
 # Stiffness of a section against changes of its shape, in units of EA. A moment M stretches directors
 # by about EI κ²/(10 EA), 0.01 % where the radius of curvature is 20 times that of the section.
@@ -55,7 +56,7 @@ _ANGLES = 2 * np.pi / 3 * np.arange(3)
 _DIRECTORS = np.stack([np.full(3, 1 / 3), 2 / 3 * np.cos(_ANGLES), 2 / 3 * np.sin(_ANGLES)])
 # Of the rest shape a point has half the length of its element, then the strains.
 COLUMNS, STRAINS = ROD.columns, ROD.rest_values - 1
-RESULTANTS = STRAINS + 6  # with those of both sections
+RESULTANTS = ROD.stresses  # with those of both sections
 
 
 @validated
@@ -142,6 +143,7 @@ class RodMesh(TetMesh):
         Whether the rod is straight without stress, whatever the positions of its nodes.
     """
 
+    kind = KIND
     section: CrossSection
     s_m: Array
     is_straight_at_rest: bool
@@ -161,6 +163,11 @@ class RodMesh(TetMesh):
     def volumes_m3(self) -> Array:
         """Volume of each tetrahedron (3 (N − 1),): a third of the rod between two sections [m³]."""
         return np.repeat(self.section.area_m2 * self.lengths_m / 3, 3)
+
+    @property
+    def extents_m(self) -> tuple[float, float, float]:
+        first, second = self.section.extent_m
+        return float(self.s_m[-1]), 2 * first, 2 * second
 
     @property
     def arc_lengths_m(self) -> Array:
@@ -241,7 +248,7 @@ class RodMesh(TetMesh):
     def geometry(self, nodes: ElementNodes, element: Element) -> Array:
         return self.geometry_at(nodes.points_m, nodes.cells)
 
-    def geometry_at(self, positions_m: Array, cells: Index) -> Array:
+    def geometry_at(self, positions_m: Array, cells: Index, geometry: Array | None = None) -> Array:
         """Return the geometry, see `rod_geometry`, with nodes (n, 3) at other positions [m]."""
         straight_m = None
         if self.is_straight_at_rest:
@@ -250,35 +257,50 @@ class RodMesh(TetMesh):
             straight_m = np.diff(self.s_m) * changed
         return rod_geometry(positions_m, cells, self.section.area_m2, straight_lengths_m=straight_m)
 
-    def directions_beyond_clamps(self, is_held: NDArray[np.bool_]) -> Array:
-        """Return unit vectors (n, 3) at the nodes of the last held section beside each free one,
-        along the centreline into the clamp, from a mask (n,) of held nodes; zero elsewhere.
+    def partly_straightened(self, cells: Index, geometry: Array, share: float) -> Array:
+        if share == 1 or not self.is_straight_at_rest:
+            return geometry
+        slopes = geometry[..., : 6 * COLUMNS].reshape(len(cells), -1, COLUMNS)
+        strains = _strains_of_shape(self.points_m[cells], slopes)[:, None]
+        straightened = geometry.copy()
+        straightened[..., -1 - STRAINS : -1] += (1 - share) * strains
+        return straightened
+
+    def element_and_law(
+        self, element: str, material: object, natural_curvature: bool
+    ) -> tuple[Element, RodMaterial]:
+        """Return the element of rods and the law; that of `Body`'s default is "rod".
+
+        Raises
+        ------
+        InputError
+            For any other material.
         """
-        held: NDArray[np.bool_] = np.asarray(is_held.reshape(-1, 3).all(axis=1))
-        centres = self.centres_of_sections_m
-        directions = np.zeros((len(held), 3, 3))
-        for k in np.flatnonzero(held[1:] != held[:-1]):
-            clamp, free = (k, k + 1) if held[k] else (k + 1, k)
-            into = centres[clamp] - centres[free]
-            directions[clamp] = into / np.linalg.norm(into)
-        return directions.reshape(-1, 3)
+        name = "rod" if material == "neo-hookean" else getattr(material, "name", material)
+        if name not in ("rod", "cable"):
+            raise InputError(
+                f"found {material!r}; expected 'rod' (E and ν) or 'cable' (EI, GJ and EA), the laws of "
+                "slender bodies",
+                where="material",
+            )
+        return ROD, rod_material(name, self.section, natural_curvature)
+
+    @property
+    def places_in_refined(self) -> Index:
+        return (6 * np.arange(len(self.s_m))[:, None] + np.arange(3)).ravel()
+
+    def refined_mask(self, is_held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        held = is_held.reshape(-1, 3)
+        fine = np.zeros((2 * len(held) - 1, 3), dtype=bool)
+        fine[::2] = held
+        fine[1::2] = held[1:] & held[:-1]
+        return fine.ravel()
 
     @property
     def surface_factor(self) -> float:
         corners = self.points_m[:3]
         around = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
         return self.section.perimeter_m / float(around)
-
-    def refined(self) -> RodMesh:
-        """Return the mesh with a section in the middle between each two."""
-        between = midpoint_interpolation(self.s_m)
-        sections = between @ self.points_m.reshape(len(self.s_m), -1)
-        return RodMesh(
-            sections.reshape(-1, 3),
-            between @ self.s_m,
-            self.section,
-            is_straight_at_rest=self.is_straight_at_rest,
-        )
 
     @property
     def cell_of_tetrahedra(self) -> Index:
@@ -384,17 +406,32 @@ def rod_geometry(
     return np.hstack([gradients.reshape(len(cells), -1), halves, strains, volumes])[:, None]
 
 
-def strains_in_shape(points_m: Array, cells: Index, geometry: Array) -> Array:
-    """Return the strains (E, 1, 6) of nodes at positions (n, 3) [m], from nothing, by the shape
-    gradients of a geometry, see `rod_geometry`.
-    """
-    gradients = geometry[..., : 6 * COLUMNS].reshape(len(cells), -1, COLUMNS)
-    return _strains_of_shape(points_m[cells], gradients)[:, None]
-
-
 def _strains_of_shape(ends_m: Array, gradients: Array) -> Array:
     G = np.einsum("eai,eac->eic", ends_m, gradients)
     return np.array([_strain_function()(each).full().ravel() for each in G]).reshape(-1, STRAINS)
+
+
+def directions_beyond_clamps(mesh: RodMesh, is_held: NDArray[np.bool_]) -> Array:
+    """Return unit vectors (n, 3) at the nodes of the last held section beside each free one,
+    along the centreline into the clamp, from a mask (n,) of held nodes; zero elsewhere.
+    """
+    held: NDArray[np.bool_] = np.asarray(is_held.reshape(-1, 3).all(axis=1))
+    centres = mesh.centres_of_sections_m
+    directions = np.zeros((len(held), 3, 3))
+    for k in np.flatnonzero(held[1:] != held[:-1]):
+        clamp, free = (k, k + 1) if held[k] else (k + 1, k)
+        into = centres[clamp] - centres[free]
+        directions[clamp] = into / np.linalg.norm(into)
+    return directions.reshape(-1, 3)
+
+
+def refined(mesh: RodMesh) -> RodMesh:
+    """Return the mesh with a section in the middle between each two."""
+    between = midpoint_interpolation(mesh.s_m)
+    sections = between @ mesh.points_m.reshape(len(mesh.s_m), -1)
+    return RodMesh(
+        sections.reshape(-1, 3), between @ mesh.s_m, mesh.section, mesh.is_straight_at_rest
+    )
 
 
 def midpoint_interpolation(s_m: Array) -> Array:
@@ -431,6 +468,14 @@ def nearest_on_centreline(centres_m: Array, points_m: Array) -> tuple[Index, Arr
     shares = np.clip(np.sum(away * steps, axis=2) / np.sum(steps**2, axis=1), 0.0, 1.0)
     nearest = np.linalg.norm(away - shares[..., None] * steps, axis=2).argmin(axis=1)
     return nearest, shares[np.arange(len(points_m)), nearest]
+
+
+def nearest_place(nodes_m: Array, point: Array) -> tuple[Array, Array]:
+    """Return the point (3,) of the centreline nearest to a point (3,), and its tangent (3, 1)."""
+    centres = centres_of_sections(nodes_m)
+    (k,), (share,) = nearest_on_centreline(centres, point[None])
+    step = centres[k + 1] - centres[k]
+    return centres[k] + share * step, (step / np.linalg.norm(step))[:, None]
 
 
 def frames_of_sections(nodes_m: Array) -> tuple[Array, Array]:
@@ -491,7 +536,7 @@ LAWS: dict[str, tuple[Constant, ...]] = {
 }
 
 
-class RodMaterial(Material):
+class RodMaterial(StrainMaterial):
     """Law of a rod of one section.
 
     Parameters
@@ -612,24 +657,6 @@ class RodMaterial(Material):
         if self.has_natural_curvature:
             natural[3:] = values[len(self.constants) - 3 : len(self.constants)]
         return strains_of(G) - rest - natural
-
-
-def rod_law(material: object, section: CrossSection, has_natural_curvature: bool) -> RodMaterial:
-    """Return the law of a rod by its name; that of `Body`'s default is "rod".
-
-    Raises
-    ------
-    InputError
-        For any other material.
-    """
-    name = "rod" if material == "neo-hookean" else getattr(material, "name", material)
-    if name not in ("rod", "cable"):
-        raise InputError(
-            f"found {material!r}; expected 'rod' (E and ν) or 'cable' (EI, GJ and EA), the laws of "
-            "slender bodies",
-            where="material",
-        )
-    return rod_material(name, section, has_natural_curvature)
 
 
 @lru_cache(64)

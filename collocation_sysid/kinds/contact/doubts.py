@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...common.array_types import Array
-from ...judge.source import Source
 from ...methods.solution import Solution
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle, ObstacleForces
@@ -97,6 +96,3 @@ def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
     """Yield likely errors in the obstacles of the fitted experiments and their loads."""
     for transcription in solution.collocation.transcriptions:
         yield from obstacle_hypotheses(transcription.experiment)
-
-
-CONTACT = Source(Obstacle, described=obstacle_hypotheses, fitted=fit_hypotheses)

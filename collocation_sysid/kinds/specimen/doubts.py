@@ -34,7 +34,6 @@ from ...judge.fit import (
     thinned,
     with_corrected,
 )
-from ...judge.source import Source
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
@@ -375,8 +374,3 @@ def _compressed(experiment: Experiment) -> Correction:
         for gauge in reversed_stress.readings
     ]
     return _strained(replace(reversed_stress, readings=readings), -1.0), {}
-
-
-SPECIMENS = Source(
-    HomogeneousDeformation, candidates=specimen_candidates, consistent=likelier_kinds
-)

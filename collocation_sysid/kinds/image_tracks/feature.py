@@ -9,10 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...program.collocation import ExperimentIterate
-from ..feature import Feature
 from .places import SIMILAR_POSES
 from .residual import ImageTrackResidual
-from .tracks import ImageTracks
 
 
 def notes(part: ExperimentIterate) -> Iterator[str]:
@@ -58,6 +56,3 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
                 f"nearly as well (error {places.mirror_ratio:.2g} times as large): state the places "
                 "of points that are not in a plane, or the pose"
             )
-
-
-IMAGE_TRACKS = Feature(ImageTracks, notes=notes)

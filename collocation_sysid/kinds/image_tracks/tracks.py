@@ -25,7 +25,6 @@ from .camera_images import CameraImages
 from .camera_images import PoseSigma as PoseSigma
 
 # Directions in which a place may move on the surface.
-DIRECTIONS = ("first", "second")
 # Terms of the series of a random walk: three contain 93 % of its variance.
 WALK_TERMS = 3
 # Places of another camera that a check compares: words, axis of the camera about which it is turned
@@ -279,7 +278,5 @@ def stated_places(experiment: Experiment) -> dict[str, tuple[Array, float]]:
 
 
 def place_labels(point: str, body: Body) -> list[str]:
-    """Return the labels of the coordinates of a place on the surface, or on the centreline."""
-    if body.is_slender:
-        return [f"place of {point} along the rod [m]"]
-    return [f"place of {point} on the surface, {direction} [m]" for direction in DIRECTIONS]
+    """Return the labels of the coordinates of a place on a body that images show."""
+    return [f"place of {point} {each} [m]" for each in body.kind.places_in_images]

@@ -21,7 +21,7 @@ from ...common.array_types import Array, Index
 from ...errors import InputError, listed
 from ...fem.body import Body
 from ...program.correspondences import Correspondences
-from ...program.markers.association import MarkerAssociation, association_kind
+from ...program.markers.association import MarkerAssociation
 from ...recording.experiment import Experiment
 from ...recording.obstacle import Obstacle
 from ...recording.placement import (
@@ -108,7 +108,7 @@ def find_places(
     rest = LocatedBody(experiment.body.nodes_m, experiment.body)
     stated = {name: place for name, (place, _) in stated_places(experiment).items()}
     _require_on_body(stated, rest)
-    if experiment.body.is_slender:
+    if not experiment.body.is_solid:
         _require_stated(cameras, stated)
     poses, mirrored = {}, {}
     for tracks in cameras:
@@ -442,7 +442,7 @@ class TrackedPlaces(ImageCorrespondences):
         an obstacle is in front of it; no point of a rod is.
         """
         count = len(shapes_m)
-        if not count or self.association.body.is_slender:
+        if not (count and self.association.body.is_solid):
             return self
         before, seen = self.is_visible[:count], self.tracks.is_seen[:count]
         visible = self.visible_points(shapes_m, self.translations[:count], before, seen)
@@ -484,7 +484,7 @@ class TrackedPlaces(ImageCorrespondences):
         """Return the correspondences at other estimates φ (k,) with the first s shapes (s, n, 3)
         [m]; self if nothing has changed.
         """
-        if self.association.body.is_slender:
+        if not self.association.body.is_solid:
             moved, _ = self.association.follow_estimates(self.coordinates(phi))
             return self if moved is self.association else replace(self, association=moved)
         other = self._with_faces_of(self.places_m(phi), shapes_m)
@@ -641,7 +641,7 @@ def surface_association(
     ]
     count = len(places_m)
     none = np.zeros(count, dtype=np.int64)
-    association = association_kind(body)(
+    association = body.kind.association(
         body,
         sigmas_m,
         prior_places_m=places_m,
@@ -650,11 +650,11 @@ def surface_association(
         weights=np.array([weights for _, weights in attached]),
         cells=none,
         centre_places_m=places_m,
-        axes=np.zeros((count, 3, 1 if body.is_slender else 2)),
+        axes=np.zeros((count, 3, 2 if body.is_solid else 1)),
         crossed_edges=np.full((count, 2, 3), np.nan),
         crossing_counts=none,
     )
-    if body.is_slender:
+    if not body.is_solid:
         return association.centred_at(places_m)
     on_faces = [
         nearest_points_of_triangles(place, body.nodes_m[body.mesh.surface[[face]]])[0]

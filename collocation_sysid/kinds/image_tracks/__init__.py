@@ -8,8 +8,21 @@
 - `feature`: likely errors, concerns and notes.
 """
 
-from ...program.measurement_models import MODELS
-from .residual import ImageTracksModel
-from .tracks import ImageTracks as ImageTracks
+from __future__ import annotations
 
-MODELS[ImageTracks] = ImageTracksModel
+from ..kind import Kind, lazy
+
+
+class TracksInImages(Kind):
+    """Pixels of points of the body."""
+
+    name = "image_tracks"
+    declares = "ImageTracks"
+    table = lazy(".table", "ImageTracksSection")
+    model = lazy(".residual", "ImageTracksModel")
+    notes = lazy(".feature", "notes")
+    described = lazy(".stated_cameras", "hypotheses")
+    fitted = lazy(".doubts", "fit_hypotheses")
+
+
+KIND = TracksInImages()

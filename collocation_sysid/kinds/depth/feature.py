@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ...common.array_types import Array
+from ...features.measurements import PredictionErrors
+from ...methods.solution import Solution
 from ...program.collocation import ExperimentIterate
 from ...program.depth.comparison import depth_residuals, outline_distances_px
-from ...recording.depth_camera import Depth
 from ...recording.nuisance import DEPTH_SHIFT, DEPTH_TURN
 from ...statistics.concerns import Concern, concern_if
-from ..feature import Feature
-from ..measurements import PredictionErrors
-from .poses import require_depth_units
+from ...statistics.hypothesis import Hypothesis
+from .poses import camera_hypotheses
 
 # Messages of concerns about a fit or a prediction, by code.
 MESSAGES = {
@@ -162,11 +162,7 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             )
 
 
-CAMERAS = Feature(
-    Depth,
-    messages=MESSAGES,
-    require_valid=require_depth_units,
-    concerns=concerns,
-    simulation_concerns=simulation_concerns,
-    notes=notes,
-)
+def fit_hypotheses(solution: Solution) -> Iterator[Hypothesis]:
+    """Yield likely mistakes of the cameras of a fit."""
+    for part in solution.parts:
+        yield from camera_hypotheses(part.transcription.experiment)

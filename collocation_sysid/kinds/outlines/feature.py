@@ -7,8 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...program.collocation import ExperimentIterate
-from ..feature import Feature
-from .outlines import Outlines
 from .residual import OutlinesResidual
 
 
@@ -26,6 +24,3 @@ def notes(part: ExperimentIterate) -> Iterator[str]:
             f"outline in {compared.any(axis=1).sum()} masks of '{residual.sensor.name}' are "
             f"{rms:.3g} pixels (RMS) from the edge"
         )
-
-
-OUTLINES = Feature(Outlines, notes=notes)

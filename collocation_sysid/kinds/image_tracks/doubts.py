@@ -9,12 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...common.array_types import Array
-from ...judge.source import Source
 from ...methods.solution import Solution
 from ...statistics.hypothesis import Hypothesis
-from . import stated_cameras
 from .residual import ImageTrackResidual
-from .tracks import ImageTracks
 
 # Standard deviations of residuals from which a track is suspicious, if those of the others are below
 # it, and over those of the others.
@@ -58,6 +55,3 @@ def track_hypotheses(
             data = {"point": residual.sensor.names[k], "sigmas": rms[k], "others": usual}
             strength = rms[k] / max(usual, 1.0)
             yield Hypothesis("image-track", of, data=data, strength=strength)
-
-
-IMAGE_TRACKS = Source(ImageTracks, described=stated_cameras.hypotheses, fitted=fit_hypotheses)

@@ -1,1 +1,0 @@
-"""Likely mistakes in the description of depth cameras, and concerns about them."""
