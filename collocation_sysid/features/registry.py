@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from ..kinds.kind import Kind
 from ..kinds.registry import KINDS, kind_of
 from ..recording.experiment import Experiment
-from ..statistics.concerns import declare_messages, declare_topics
+from ..statistics.concerns import TOPICS
 
 for _kind in KINDS:
-    declare_topics(_kind.topics)
-    declare_messages(_kind.messages)
+    TOPICS.update(_kind.topics)
+    for _code, _message in _kind.messages.items():
+        _key, _, _rest = _code.partition("/")
+        _messages = {**TOPICS[_key].messages, _rest: _message}
+        TOPICS[_key] = replace(TOPICS[_key], messages=_messages)
 
 
 def present(experiments: Iterable[Experiment]) -> list[Kind]:

@@ -2,13 +2,13 @@
 
 A concern has a code, a grade and data. The first part of the code is the topic: "noise/larger" is
 about the noise. Codes stay the same when messages are reworded. `TOPICS` contains the messages
-about bodies, fits and statistics; features add theirs (`features.feature.Feature`).
+about bodies, fits and statistics; kinds add theirs (`features.registry`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from ..errors import listed
@@ -396,38 +396,6 @@ TOPICS: dict[str, Topic] = {
         },
     ),
 }
-
-
-def declare_topics(topics: Mapping[str, Topic]) -> None:
-    """Add topics to `TOPICS`, by their keys, with all their messages.
-
-    Raises
-    ------
-    ValueError
-        If there is such a topic already.
-    """
-    for key, topic in topics.items():
-        if key in TOPICS:
-            raise ValueError(f"the topic {key!r} is declared twice")
-        TOPICS[key] = topic
-
-
-def declare_messages(messages: Mapping[str, str]) -> None:
-    """Add messages to known topics in `TOPICS`, by complete codes such as "noise/larger".
-
-    Raises
-    ------
-    KeyError
-        If the topic of a code is unknown.
-    ValueError
-        If there is a message for a code already.
-    """
-    for code, message in messages.items():
-        key, _, rest = code.partition("/")
-        topic = TOPICS[key]
-        if rest in topic.messages:
-            raise ValueError(f"the message of {code!r} is declared twice")
-        TOPICS[key] = replace(topic, messages={**topic.messages, rest: message})
 
 
 def message_of(code: str, data: Mapping[str, Any]) -> str:

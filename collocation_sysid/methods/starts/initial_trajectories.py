@@ -82,7 +82,6 @@ def initial_variables(collocation: Collocation) -> tuple[Array, list[str]]:
 def simulate_trajectories(
     collocation: Collocation,
     p: Array,
-    known_rows: Sequence[Array] | None = None,
     rows: Sequence[int] | None = None,
     options: NewtonOptions | None = None,
     stopwatch: Stopwatch | None = None,
@@ -94,9 +93,6 @@ def simulate_trajectories(
     ----------
     p : (np,) array
         Shared and nuisance parameters (q, φ).
-    known_rows : sequence of (k, 3n) array, optional
-        First rows of every trajectory [m], which are continued; by default simulations begin at the
-        experiments' starts.
     rows : sequence of int, optional
         Number of grid rows of each trajectory; all by default.
     options : NewtonOptions, optional
@@ -111,7 +107,7 @@ def simulate_trajectories(
         Trajectories, which are shorter than requested where the simulation failed, and the first
         failure; None if there was none.
     """
-    parts = collocation.iterates_at(p, known_rows or _empty_trajectories(collocation))
+    parts = collocation.iterates_at(p, _empty_trajectories(collocation))
 
     def simulate_one(k: int) -> tuple[Array, SimulationError | None]:
         """Return the trajectory as far as it succeeded, and the failure or None."""
@@ -120,7 +116,6 @@ def simulate_trajectories(
         x, failure = continue_simulation(
             part.transcription.experiment,
             part.equations.dynamics.truncated_to(count),
-            known=part.x if len(part.x) else None,
             options=options,
             stopwatch=stopwatch,
             approximate_solution=None if guess is None else guess[k],
