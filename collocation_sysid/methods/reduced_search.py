@@ -171,14 +171,9 @@ class ReducedSearch:
         Bounds of the parameters.
     has_correspondences : bool
         Whether an experiment has measurements with correspondences, as those of cameras have.
-    has_unlabelled : bool
-        Whether such measurements do not state which points of the body they are.
     is_associated : bool
         Whether cameras of unknown position have been associated with trajectories of
         sufficient length.
-    ended_by_association : bool
-        Whether the last `minimise` ended because new correspondences changed the loss by more than
-        short steps did, while a full step was longer than a standard error of a parameter.
     trust, noise : float
         Trust region of the last trial, and noise of the loss, see `Iteration`.
     indefinite_steps : int
@@ -213,12 +208,11 @@ class ReducedSearch:
             for each in transcription.association.correspondences
         ]
         self.has_correspondences = bool(correspondences)
-        self.has_unlabelled = not all(each.is_labelled for each in correspondences)
-        self.largest_trust = POLICY.seeing if self.has_unlabelled else np.inf
+        is_labelled = all(each.is_labelled for each in correspondences)
+        self.largest_trust = np.inf if is_labelled else POLICY.seeing
         self.indefinite_steps = 0
         self.lower, self.upper = collocation.parameter_bounds
         self.is_associated = True
-        self.ended_by_association = False
         self.reach = collocation.reach_p
         self.p: Array = collocation.guess_p
         self.trajectories: list[Any] | None = None
@@ -353,7 +347,6 @@ class ReducedSearch:
             accepted step; failed trials are only rejected.
         """
         assert self.trajectories is not None
-        self.ended_by_association = False
         start = horizon.evaluate(self.p, self.trajectories, known_iterate=self.point)
         self.trust, self.noise = min(self.options.trust, self.largest_trust), 0.0
         point = self._accept(self._reassociate(horizon, start))
@@ -400,9 +393,7 @@ class ReducedSearch:
                 point = self._settled(horizon, point)
                 is_feasible = point.feasibility_m <= POLICY.feasible * self.size_m
                 is_near = is_noise or is_rounding or self._is_near(point, farthest, 1.0)
-                self.ended_by_association = self.has_unlabelled and not is_near
-                is_answer = is_feasible and (is_near or self.has_unlabelled)
-                return Status.CONVERGED if is_answer else Status.STALLED
+                return Status.CONVERGED if is_feasible and is_near else Status.STALLED
         if self.sweeps >= self.options.max_iterations:
             return Status.ITERATION_LIMIT
         return None

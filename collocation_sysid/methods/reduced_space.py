@@ -50,12 +50,6 @@ from .trajectory_sweeps import trajectory_positions
 UNLIMITED_S = 1e6
 # Misfits above this many standard deviations of the markers are worth a note.
 MISFIT = 3.0
-# Note on a search that ended because new correspondences changed the loss.
-ENDED_BY_ASSOCIATION = (
-    "the search ended where the loss jumps as measured points change to other parts of the surface: "
-    "other guesses may lead to other minima of similar loss, whose spread the intervals do not "
-    "contain; solve from a few guesses to see it"
-)
 
 
 @validated
@@ -135,8 +129,6 @@ class ReducedSpace(SearchOptions):
                         found = Status.STALLED
                         break
             status = found or Status.CONVERGED
-            if search.ended_by_association:
-                recorder.notes.append(ENDED_BY_ASSOCIATION)
             message = status.explain(self.name, max_iterations=self.max_iterations)
         except SEARCH_ENDS as end:
             status, message = status_of_end(end)

@@ -12,9 +12,7 @@ from ..features.registry import present
 from ..fem.schemes import as_scheme
 from ..judge.posterior import Posterior
 from ..kinds.specimen.concerns import as_specimen_concerns
-from ..methods.reduced_space import ENDED_BY_ASSOCIATION
 from ..methods.solution import Solution, Status
-from ..methods.solve_recorder import misfit_of
 from ..problem import Problem
 from ..program.correspondences import CorrespondenceResidual
 from ..program.modes.stability import find_instabilities
@@ -45,7 +43,6 @@ from ..statistics.plausibility import (
 )
 from ..statistics.scale_identifiability import scale_concerns
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
-from ..statistics.thresholds import GROSS_MISFIT
 from ..statistics.uncertainty import Uncertainty
 from .check.modes import ModesCheck, check_modes
 from .forward_simulation import ForwardSimulation, fit_misfits
@@ -97,10 +94,6 @@ def solution_concerns(
         return
     if status is Status.ACCEPTABLE:
         yield Concern("solve/acceptable")
-    if ENDED_BY_ASSOCIATION in solution.notes:
-        # The posterior takes a linear step further, which may explain what the fit does not.
-        misfit = misfit_of(solution.collocation, sum(part.loss for part in solution.parts))
-        yield Concern("solve/jump", "doubtful" if misfit > GROSS_MISFIT else "check")
     transcriptions = solution.collocation.transcriptions
     fitted_experiments = [each.experiment for each in transcriptions]
     collocation = solution.collocation

@@ -386,8 +386,6 @@ TOPICS: dict[str, Topic] = {
         "reports no mistake.",
         messages={
             "lost": "the solve did not converge: {why}",
-            "jump": "the search ended where the loss jumps as measured points change to other "
-            "parts of the surface: other guesses may lead to other minima",
             "acceptable": "the solve converged to the acceptable tolerance, but not to the desired "
             "one: start from another guess, or raise max_iterations",
             "no-error-bars": "no error bars could be computed; the notes of the run "
