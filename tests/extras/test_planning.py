@@ -40,7 +40,7 @@ from collocation_sysid.extras.planning.full_program import (
     solve_full,
 )
 from collocation_sysid.extras.planning.hand_limits import Limits
-from collocation_sysid.extras.planning.hand_motion import angular_motion
+from collocation_sysid.extras.planning.hand_motion import TimeDerivatives, angular_motion
 from collocation_sysid.extras.planning.motion_plan import MotionPlan, plan_motion
 from collocation_sysid.extras.planning.planned_body import PlannedBody
 from collocation_sysid.extras.planning.planned_program import PlannedProgram
@@ -1884,6 +1884,34 @@ def test_a_point_is_thrown_with_a_position_and_a_velocity_at_one_time():
     velocity = (place[at + 1] - place[at - 1]) / (plan.t_s[at + 1] - plan.t_s[at - 1])
     assert velocity[[0, 2]] == pytest.approx([0.5, 0.0], abs=0.02)
     assert plan.residual_vibration_m < 5e-4
+
+
+def test_a_reference_counts_between_its_times_alone():
+    t_s = 0.02 * np.arange(41)
+    smooth = task().reference[0].model_dump() | {"from_s": 0.2, "until_s": 0.6}
+    held = {"point": "tip", "hold": True, "from_s": 0.3}
+    wanted = task(reference=[smooth, held])
+    first_m = np.array([[0.01, 0.01, 0.0]] * 2)
+    moved, still = sampled_references(wanted, t_s, [*first_m], first_m)
+    is_counted = np.isfinite(moved.position_m).all(axis=1)
+    assert np.array_equal(is_counted, (t_s > 0.19) & (t_s < 0.61))
+    assert np.isnan(moved.position_m[~is_counted]).all()
+    assert np.array_equal(np.isfinite(still.position_m).all(axis=1), t_s > 0.29)
+
+
+def test_shares_of_the_limits_are_those_of_a_known_motion():
+    """A straight motion, with a turn about its direction."""
+    bounds = LIMITS.bounds_from(np.zeros(3))
+    value, first, second = np.zeros((3, 5, 6))
+    value[2, [0, 3]] = 0.15, np.radians(30)
+    first[3, [0, 3]] = 0.75, np.radians(90)
+    second[1, [0, 3]] = 5.0, np.radians(600)
+    found = bounds.shares(TimeDerivatives(value, first, second=second))
+    expected = {"workspace_m": 0.5, "speed_m_s": 0.5, "acceleration_m_s2": 1 / 3}
+    expected |= {"rotation_deg": 0.5, "angular_speed_deg_s": 0.25}
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
+    assert found["angular_acceleration_deg_s2"] == pytest.approx(0.2)
+    assert bounds.reach.first == pytest.approx([1.5, np.radians(360)])
 
 
 def test_a_point_is_held_still_while_the_hand_moves():

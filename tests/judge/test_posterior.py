@@ -346,3 +346,18 @@ def test_a_constant_is_that_of_the_stated_damping_law(rng, laws):
         assert line.shares.get("damping_law", 0.0) < 1e-12
         assert line.combined95 == pytest.approx(stated.budget[name].combined95)
     assert found.budget["young_pa"].shares["damping_law"] > 0
+
+
+@pytest.mark.parametrize(("cosine", "are_alike"), [(0.95, True), (0.85, False), (-0.95, True)])
+def test_effects_are_alike_if_the_data_hardly_tell_them_apart(cosine, are_alike, rng):
+    """By the angle of what remains of their columns beside all parameters."""
+    by_parameters = slopes(rng, 4)
+    orthogonal = np.linalg.qr(np.hstack([by_parameters, rng.normal(size=(len(by_parameters), 2))]))[
+        0
+    ]
+    first, second = orthogonal[:, -2:].T
+    other = cosine * first + np.sqrt(1 - cosine**2) * second
+    columns = 50 * np.column_stack([first, other]) + by_parameters[:, :1]
+    residual = rng.normal(size=len(columns))
+    found = posterior(linear_fit(by_parameters, residual), columns, "mass", "body_scale")
+    assert of_effect(found, "mass").alike == (("body_scale",) if are_alike else ())
