@@ -29,8 +29,8 @@ STEPS = 0.1 * 4.0 ** -np.arange(19)
 ROUNDED = 3
 # Ratio of a remainder to these, above which its rate is known to some per cent.
 CLEAR = 30.0
-# Pairs of steps, the smallest with clear remainders, of which the best counts: a remainder may change
-# sign at one of them.
+# Pairs of steps, the smallest with clear remainders, whose median counts: where a remainder changes
+# sign, one rate is too high and the next too low.
 PAIRS = 3
 # Largest difference of a rate from its order, which is a whole number.
 RATE_TOLERANCE = 0.25
@@ -119,7 +119,7 @@ def _rate(remainders: Array) -> float:
     is_clear = remainders > CLEAR * remainders[-ROUNDED:].max()
     pairs = np.flatnonzero(is_clear[:-1] & is_clear[1:])[-PAIRS:]
     rates = np.log(remainders[pairs] / remainders[pairs + 1]) / np.log(STEPS[0] / STEPS[1])
-    return float(rates.max(initial=-np.inf)) if len(pairs) else np.inf
+    return float(np.median(rates)) if len(pairs) else np.inf
 
 
 def derivative_fault(collocation: Collocation, z: Array, rates: Mapping[str, float]) -> str:

@@ -57,8 +57,10 @@ SOFT_PA = 1e4
 # Factors of the usual stiffnesses of a section, which are those of a cable, and of the first modulus
 # of the scan, at which a rod of metal collapses.
 RAISED = 1.0, 30.0, 900.0, 27e3
-# Tolerance of simulations that are only compared. Slender bodies do not move on from such errors.
-LOOSE = NewtonOptions(tolerance=1e-4)
+# Simulations of a scan: a body that collapses under a small part of its weight is too soft. Solids are
+# only compared, but slender bodies do not move on from such errors.
+STRICT = NewtonOptions(may_begin_small=False)
+LOOSE = replace(STRICT, tolerance=1e-4)
 # Number of failures in a row that end the scan.
 CONSECUTIVE_FAILURES = 2
 # Misfit over the best one that counts as a failure.
@@ -527,7 +529,7 @@ class TrialSimulation:
         self.collocation = collocation
         self.share = share
         is_solid = all(each.body.is_solid for each in collocation.transcriptions)
-        self.options = LOOSE if is_solid else None
+        self.options = LOOSE if is_solid else STRICT
         usual = collocation.with_parameters(typical_parameters(collocation.parameters, SOFT_PA))
         self.rows = [rows_of_share(motion, share) for motion in motion_shares(usual)]
         self.all_rows = [each.grid_times for each in collocation.transcriptions]

@@ -102,7 +102,7 @@ def _solve_equilibrium(
         separate.ravel(),
         halvings=solver.options.max_halvings,
         guess=guess,
-        may_begin_small=is_on_place,
+        may_begin_small=is_on_place and solver.options.may_begin_small,
     )
     while path.share < 1.0:
         x, share = path.next_guess()

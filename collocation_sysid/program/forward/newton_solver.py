@@ -82,6 +82,8 @@ class NewtonOptions:
     max_halvings : int
         Largest number of halvings of a time step (Newmark) or of the increment of forces and grasps
         in it (schemes).
+    may_begin_small : bool
+        Whether the first load on the way to an equilibrium may be small, see `SolutionPath`.
     checks_stability : bool
         Whether the stiffness of an equilibrium is factorised at the equilibrium itself. If false,
         it may be known to be positive definite only at a near state, from which chord steps led
@@ -92,6 +94,7 @@ class NewtonOptions:
     max_iterations: int = 30
     max_backtracks: int = 25
     max_halvings: int = 8
+    may_begin_small: bool = True
     checks_stability: bool = True
 
 
