@@ -32,8 +32,8 @@ CLEAR = 30.0
 # Pairs of steps, the smallest with clear remainders, whose median counts: where a remainder changes
 # sign, one rate is too high and the next too low.
 PAIRS = 3
-# Largest difference of a rate from its order, which is a whole number.
-RATE_TOLERANCE = 0.25
+# Largest difference of a rate from its order: the nearest whole number counts.
+RATE_TOLERANCE = 0.5
 DERIVATIVES = ("value", "first derivative", "second derivative")
 # Order of the remainder that each derivative leaves.
 ORDERS = {
