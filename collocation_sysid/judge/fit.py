@@ -20,7 +20,12 @@ from ..recording.measurement import Measurement, root_mean
 from ..statistics.budget.consider_analysis import changed_residuals, changes_of_assumptions
 from ..statistics.distributions import largest_deviation, normal_isf
 from ..statistics.hypothesis import Hypothesis
-from ..statistics.linearised import LinearisedFit, least_squares_of_fit, linearise_fit
+from ..statistics.linearised import (
+    LinearisedFit,
+    least_squares_of_fit,
+    linearise_fit,
+    remaining_squares,
+)
 from ..statistics.thresholds import CHANCE, LEAST_DECREASE, MISFIT, NOISE, RARE, UNCORRELATED
 from .doubt import Doubt
 
@@ -187,7 +192,7 @@ def projected_gram(fit: LinearisedFit, blocks: Sequence[Array]) -> Array:
     what a step of its parameters explains.
     """
     count = blocks[0].shape[-1]
-    wide = fit.with_columns(blocks, [""] * count, np.zeros(count), is_known=False)
+    wide = fit.with_columns([""] * count, blocks)
     triangle = least_squares_of_fit(wide).triangle
     values = triangle[:, [-1, *range(len(fit.names), triangle.shape[1] - 1)]]
     jacobian = triangle[:, np.flatnonzero(~fit.at_bound)]
@@ -199,10 +204,10 @@ def least_loss(fit: Solution, deviations: Mapping[str, float | None]) -> float:
     """Return χ² after a linear step from a fit in its parameters and in all effects of the budget,
     with their standard deviations by name in place of the usual ones.
     """
-    effects = changes_of_assumptions(fit.collocation, fit.z, deviations).blocks
-    gram = projected_gram(linearise_fit(fit.collocation, fit.z), effects)
-    own, among = gram[0, 1:], gram[1:, 1:]
-    return float(gram[0, 0] - own @ np.linalg.solve(among + np.eye(len(among)), own))
+    effects = changes_of_assumptions(fit.collocation, fit.z, deviations)
+    known = linearise_fit(fit.collocation, fit.z)
+    count = len(effects.names)
+    return remaining_squares(known.with_columns(effects.names, effects.blocks, np.zeros(count)))
 
 
 def linear_step(

@@ -154,20 +154,16 @@ class Effects:
 
     def expected_in(self, fit: LinearisedFit) -> LinearisedFit:
         """Return the fit with residuals that contain the effects, each as large as its mean."""
-        changes = (each @ self.means for each in self.blocks)
+        pairs = zip(fit.blocks, self.blocks, strict=True)
         return replace(
-            fit,
-            blocks=tuple(
-                block.changed(change * block.compute_root_weight() * block.is_measured)
-                for block, change in zip(fit.blocks, changes, strict=True)
-            ),
+            fit, blocks=tuple(b.changed(b.weighted(each) @ self.means) for b, each in pairs)
         )
 
     def added_to(self, fit: LinearisedFit, parameters: Parameters) -> tuple[LinearisedFit, Array]:
         """Return the fit with the effects as its last parameters, and their definition: the matrix
         (p + a, p + a) that turns these parameters into those of the body.
         """
-        wide = fit.with_columns(self.blocks, self._unique_names, self.means)
+        wide = fit.with_columns(self._unique_names, self.blocks, self.means)
         definition = self._definition(wide, parameters)
         changed = [
             replace(b, jacobian=b.jacobian @ definition) if self._redefining else b

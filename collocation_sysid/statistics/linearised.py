@@ -174,6 +174,12 @@ class ResidualBlock:
             misfit = misfit + change / self.compute_root_weight()
         return replace(self, residual=self.residual + change, misfit=misfit)
 
+    def weighted(self, changes: Array) -> Array:
+        """Return changes (T, M, 3, a) of the residuals with Huber's weights; zero where nothing is
+        measured.
+        """
+        return changes * (self.compute_root_weight() * self.is_measured)[..., None]
+
     def may_be_slow_errors(self) -> bool:
         """Return whether the instrument may err slowly, and the residuals are within its σ."""
         return self.errs_slowly and bool(np.sum(self.residual**2) <= self.measurement_count)
@@ -290,7 +296,7 @@ class LinearisedFit:
         return replace(self, blocks=tuple(blocks_after), prior_residual=at_best)
 
     def with_columns(
-        self, changes: Sequence[Array], names: Sequence[str], means: Array, is_known: bool = True
+        self, names: Sequence[str], changes: Sequence[Array], means: Array | None = None
     ) -> LinearisedFit:
         """Return the fit with further parameters, which are its effects.
 
@@ -298,24 +304,27 @@ class LinearisedFit:
         ----------
         changes : sequence of (T, M, 3, a) arrays
             Changes of the residuals of each block by the parameters, in σ.
-        means : (a,) array
-            Means of their priors, of which the standard deviation is 1.
-        is_known : bool
-            Whether they have these priors.
+        means : (a,) array, optional
+            Means of their priors, of which the standard deviation is 1; without, they have none.
         """
-        blocks = []
-        for block, change in zip(self.blocks, changes, strict=True):
-            more = change * (block.compute_root_weight() * block.is_measured)[..., None]
-            blocks.append(replace(block, jacobian=np.concatenate([block.jacobian, more], axis=3)))
-        slopes = np.full(len(names), float(is_known))
+        count = len(names)
+        slopes = np.full(count, float(means is not None))
+        jacobians = (
+            np.concatenate([block.jacobian, block.weighted(change)], axis=3)
+            for block, change in zip(self.blocks, changes, strict=True)
+        )
         return replace(
             self,
-            blocks=tuple(blocks),
+            blocks=tuple(
+                replace(b, jacobian=j) for b, j in zip(self.blocks, jacobians, strict=True)
+            ),
             names=(*self.names, *names),
-            prior_residual=np.append(self.prior_residual, -slopes * means),
+            prior_residual=np.append(
+                self.prior_residual, np.zeros(count) if means is None else -means
+            ),
             prior_jacobian=np.append(self.prior_jacobian, slopes),
-            at_bound=np.append(self.at_bound, np.zeros(len(names), dtype=bool)),
-            effect_count=len(names),
+            at_bound=np.append(self.at_bound, np.zeros(count, dtype=bool)),
+            effect_count=count,
         )
 
     @property
@@ -477,3 +486,8 @@ def gauss_newton_step(fit: LinearisedFit) -> Array:
     """
     free = np.where(fit.at_bound, NO_STEP, np.inf)
     return least_squares_of_fit(fit).minimiser(-free, free)
+
+
+def remaining_squares(fit: LinearisedFit) -> float:
+    """Return χ² of measurements and priors after the step to the least squares."""
+    return least_squares_of_fit(fit).loss(gauss_newton_step(fit))

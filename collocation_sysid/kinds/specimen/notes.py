@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ...common.array_types import Array
 from ...common.display import short
 from ...errors import listed
 from ...fem.laws.constants import without_region
@@ -19,7 +18,12 @@ from ...model.parameters import Parameters
 from ...recording.experiment import Experiment
 from ...recording.specimen import STRESS_NAME
 from ...statistics.distributions import f_sf
-from ...statistics.linearised import LinearisedFit
+from ...statistics.linearised import (
+    LinearisedFit,
+    gauss_newton_step,
+    least_squares_of_fit,
+    remaining_squares,
+)
 from ...statistics.thresholds import GROSS_MISFIT, NAMED_ERRORS, NOTEWORTHY, OFFSET_FALSE_ALARMS
 
 # Moduli of small strain, whose meaning does not depend on the law.
@@ -81,22 +85,24 @@ def stress_offset_notes(fit: LinearisedFit) -> list[str]:
             name.startswith(f"{block.name}: stress_zero of {STRESS_NAME}") for name in fit.names
         )
     ]
-    residual, slopes, columns = _stacked(fit, offsets)
     measured = sum(block.measurement_count for block in fit.blocks)
     level = np.sqrt(fit.chi_squared / max(1, measured))
     count = len(offsets)
-    priors = int(np.count_nonzero(fit.prior_jacobian))
-    free = measured + priors - slopes.shape[1]
+    free = measured + int(np.count_nonzero(fit.prior_jacobian)) - int(np.sum(~fit.at_bound))
     if not count or free < 1 or not NOTEWORTHY < level <= GROSS_MISFIT:
         return []
-    complete = np.concatenate([slopes, columns], axis=1)
-    before = _remaining_squares(slopes, residual)
-    after = _remaining_squares(complete, residual)
+    changes = [np.zeros((*block.residual.shape, count)) for block in fit.blocks]
+    for column, k in enumerate(offsets):
+        changes[k][..., column] = PRIOR_SIGMAS / np.asarray(fit.blocks[k].sigma_ratios)
+    complete = fit.with_columns([""] * count, changes, np.zeros(count))
+    before, after = remaining_squares(fit), remaining_squares(complete)
     statistic = (before - after) / count / max(after / free, 1e-300)
     if f_sf(statistic, count, freedom=free) > OFFSET_FALSE_ALARMS:
         return []
-    estimates, errors = _offsets(complete, residual, count=count)
-    errors = errors * np.sqrt(after / free)
+    priors_pa = np.array([PRIOR_SIGMAS * fit.blocks[k].sigma_m[0] for k in offsets])
+    estimates = priors_pa * gauss_newton_step(complete)[-count:]
+    squares = least_squares_of_fit(complete.only(np.flatnonzero(~complete.at_bound)))
+    errors = priors_pa * squares.standard_errors[-count:] * np.sqrt(after / free)
     named = [k for k in range(count) if abs(estimates[k]) > NAMED_ERRORS * errors[k]] or [
         int(np.argmax(np.abs(estimates) / errors))
     ]
@@ -111,47 +117,3 @@ def stress_offset_notes(fit: LinearisedFit) -> list[str]:
         f"better, estimate it: stress_zero_pa = {prior_pa:g} in the [[experiment]]; a law that does "
         "not fit has a similar effect"
     ]
-
-
-def _stacked(fit: LinearisedFit, offsets: Sequence[int]) -> tuple[Array, Array, Array]:
-    """Return residuals (n,), derivatives (n, f) by the f parameters that are not at a bound, and
-    derivatives (n, k) by the k offsets [1/Pa], of all measurements and then of the priors, which
-    the offsets have too (`PRIOR_SIGMAS`).
-    """
-    residuals = []
-    slopes = []
-    columns = []
-    for index, block in enumerate(fit.blocks):
-        mask = block.is_measured
-        residuals.append(block.residual[mask])
-        slopes.append(block.jacobian[mask])
-        sigmas = block.sigma_m[:, None] * block.sigma_ratios
-        weights = block.compute_root_weight() / sigmas * mask
-        here = np.zeros((int(mask.sum()), len(offsets)))
-        if index in offsets:
-            here[:, offsets.index(index)] = weights[mask]
-        columns.append(here)
-    is_free = ~fit.at_bound
-    residuals += [fit.prior_residual, np.zeros(len(offsets))]
-    slopes.append(np.diag(fit.prior_jacobian))
-    slopes.append(np.zeros((len(offsets), len(fit.names))))
-    columns.append(np.zeros((len(fit.names), len(offsets))))
-    priors_pa = [PRIOR_SIGMAS * fit.blocks[k].sigma_m[0] for k in offsets]
-    columns.append(np.diag(1 / np.array(priors_pa)))
-    return (np.concatenate(residuals), np.concatenate(slopes)[:, is_free], np.concatenate(columns))
-
-
-def _remaining_squares(matrix: Array, residual: Array) -> float:
-    """Return the squares (n,) that no combination of columns explains."""
-    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    step = -np.linalg.pinv(matrix / scale) @ residual
-    return float(np.sum((residual + (matrix / scale) @ step) ** 2))
-
-
-def _offsets(matrix: Array, residual: Array, count: int) -> tuple[Array, Array]:
-    """Return offsets (k,) [Pa], measured less predicted, and standard errors at unit noise."""
-    scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    inverse = np.linalg.pinv(matrix / scale)
-    step = -(inverse @ residual) / scale
-    errors = np.linalg.norm(inverse, axis=1) / scale
-    return step[-count:], errors[-count:]

@@ -348,10 +348,7 @@ def estimate_changes(fit: LinearisedFit, changes: Sequence[Array]) -> Array:
         slope = block.jacobian[..., free]
         slope = slope.reshape(int(np.prod(slope.shape[:-1])), len(free))
         problem = problem.with_rows(np.zeros(len(slope)), slope)
-        weighted_change = (
-            change * block.compute_root_weight()[..., None] * block.is_measured[..., None]
-        )
-        score += slope.T @ weighted_change.reshape(len(slope), count)
+        score += slope.T @ block.weighted(change).reshape(len(slope), count)
     estimates = np.zeros((len(fit.names), count))
     estimates[free] = -problem.root @ (problem.root.T @ score)
     return estimates
