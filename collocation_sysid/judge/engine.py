@@ -76,10 +76,10 @@ def find_misspecifications(
     (`CERTAIN`), or if the residuals are noise.
     """
     deviations = deviations or {}
-    sources = present([part.transcription.experiment for part in solution.parts])
+    kinds = present([part.transcription.experiment for part in solution.parts])
     if is_consistent:
-        return rank(e for source in sources for e in source.consistent(solution, deviations))
-    found = [each for source in sources for each in source.fitted(solution)]
+        return rank(e for kind in kinds for e in kind.consistent(solution, deviations))
+    found = [each for kind in kinds for each in kind.fitted(solution)]
     misfits = [discrepancy(part) for part in solution.parts]
     worst = int(np.argmax(misfits))
     if _certainty(found) < CERTAIN:
@@ -132,8 +132,8 @@ def _tested(
     if stated is None:
         return []
     fit = TestedFit(solution, stated)
-    sources = present([each.experiment for each in solution.collocation.transcriptions])
-    candidates = [each for source in sources for each in source.candidates(fit)]
+    kinds = present([each.experiment for each in solution.collocation.transcriptions])
+    candidates = [each for kind in kinds for each in kind.candidates(fit)]
     if not is_specimen:
         candidates += [*fit.screened(motion_rows(fit)), *motion_candidates(fit)]
     candidates.sort(key=lambda each: each[0])

@@ -51,7 +51,6 @@ def lazy(module: str, name: str) -> Any:
     return _Lazy(module, name)
 
 
-@staticmethod
 def _nothing(*_: object) -> tuple[()]:
     return ()
 

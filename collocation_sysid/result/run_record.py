@@ -25,7 +25,7 @@ from ..common.written_files import listed_hashes
 from ..errors import InputError
 from ..features.measurements import recorded_series
 from ..fem.body import Body
-from ..kinds.contact.feature import contact_fields
+from ..kinds.contact.concerns import contact_fields
 from ..kinds.image_tracks.residual import ImageTrackResidual
 from ..kinds.outlines.outlines import edge_pixels
 from ..kinds.outlines.residual import OutlinesResidual

@@ -239,8 +239,8 @@ def _solve_from_smaller(
     if solution.status in FAILED_STATUSES:
         what = f"the search from the solution {smaller.size}"
         raise NoStartError(f"{what} ended with: {solution.message}")
-    own = [*solution.notes, *_feature_notes(solution)]
-    known = {*own, *_feature_notes(first)}
+    own = [*solution.notes, *_notes_of_kinds(solution)]
+    known = {*own, *_notes_of_kinds(first)}
     notes = [note for note in smaller.notes(first, solution) if note not in known]
     return replace(after(solution, first), scan=first.scan, notes=(*notes, *own))
 
@@ -264,7 +264,7 @@ def _solve_once(problem: Problem, warm_start: WarmStart | None, searches: Search
         problem = warm_start.apply_to_problem(problem)
 
     def finished(solution: Solution) -> Solution:
-        own = [*notes, *solution.notes, *_feature_notes(solution)]
+        own = [*notes, *solution.notes, *_notes_of_kinds(solution)]
         return replace(solution, notes=own)
 
     try:
@@ -293,8 +293,8 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
     """Return the start of the search in the nonlinear program of a problem."""
     collocation = problem.collocation()
     for experiment in collocation.experiments:
-        for feature in present([experiment]):
-            feature.require_valid(experiment)
+        for kind in present([experiment]):
+            kind.require_valid(experiment)
     if warm_start is not None and problem.substeps == "auto":
         collocation = replace(collocation, substeps=warm_start.substeps)
     has_guesses = not collocation.parameters.names_without_guess
@@ -319,7 +319,7 @@ def _program_and_start(problem: Problem, solver: Method, warm_start: WarmStart |
     return replace(warm, note=start.note)
 
 
-def _feature_notes(solution: Solution) -> list[str]:
+def _notes_of_kinds(solution: Solution) -> list[str]:
     parts = solution.parts
-    features = present([part.transcription.experiment for part in parts])
-    return [note for part in parts for feature in features for note in feature.notes(part)]
+    kinds = present([part.transcription.experiment for part in parts])
+    return [note for part in parts for kind in kinds for note in kind.notes(part)]

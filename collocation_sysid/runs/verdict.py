@@ -117,14 +117,14 @@ def solution_concerns(
     yield from stability_concerns(find_instabilities(solution.collocation, solution.z))
     yield from strain_stability_concerns(solution.parts)
     yield from branch_concerns(solution.parts)
-    for feature in present(fitted_experiments):
-        yield from feature.concerns(solution.parts)
+    for kind in present(fitted_experiments):
+        yield from kind.concerns(solution.parts)
     fitted = fit_misfits(solution)
     static = [each.experiment.name for each in transcriptions if each.experiment.is_static]
     for name, rollout in rollouts.items():
         if isinstance(rollout, ForwardSimulation):
-            for feature in present([rollout.trajectory.experiment]):
-                yield from feature.simulation_concerns(name, rollout)
+            for kind in present([rollout.trajectory.experiment]):
+                yield from kind.simulation_concerns(name, rollout)
         is_static = name in static
         is_contained = is_step_known and not is_static
         yield from _forward_concerns(name, rollout, fitted, is_static, is_contained)

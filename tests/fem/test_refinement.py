@@ -11,9 +11,11 @@ from kit.problems import EDGE_M, bar_let_go, box, cube_with_gaps, driven_bar, hu
 from collocation_sysid.fem.body import Body
 from collocation_sysid.fem.meshes.mesh import TetMesh
 from collocation_sysid.fem.meshes.refinement import refine_body, split_in_eight
-from collocation_sysid.fem.meshes.selection import Box
+from collocation_sysid.fem.meshes.selection import Box, Indices
 from collocation_sysid.fem.meshes.structured import box_mesh, cylinder_mesh
+from collocation_sysid.fem.node_force import NodeForce
 from collocation_sysid.fem.regions import Region
+from collocation_sysid.kinds.rod.element import CrossSection, rod_mesh
 from collocation_sysid.recording import Grasp
 from collocation_sysid.recording.experiment_refinement import (
     refined_experiment as refined_experiment,
@@ -157,3 +159,13 @@ def test_tendons_and_pressures_drive_the_finer_body_alike(faces: str):
         np.testing.assert_array_equal(
             fine.energy_amplitude_at(bar.t_s), coarse.energy_amplitude_at(bar.t_s)
         )
+
+
+def test_forces_on_sections_of_a_rod_are_on_those_between_them_too():
+    mesh = rod_mesh([[0, 0, 0], [1, 0, 0]], CrossSection.round(0.002), 11)
+    near = np.flatnonzero(mesh.points_m[:, 0] < 0.25)
+    push = NodeForce.from_law(lambda x, v, at: -x, nodes=Indices(near.tolist()))
+    finer = refine_body(Body(mesh, density_kg_m3=1e3, forces=[push]))
+    (placed,) = finer.placed_forces
+    loaded = np.unique(finer.mesh.points_m[placed.points.nodes, 0])
+    np.testing.assert_allclose(loaded, np.linspace(0, 0.2, 5), atol=1e-9)

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_erosion
 
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
-from collocation_sysid.kinds.depth.feature import camera_pose_concerns, outline_concerns
+from collocation_sysid.kinds.depth.concerns import camera_pose_concerns, outline_concerns
 from collocation_sysid.methods.starts.stiffness_scan import other_starts
 from collocation_sysid.model.nuisance_map import NuisanceMap
 from collocation_sysid.program.collocation import Collocation

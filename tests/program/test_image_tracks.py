@@ -30,7 +30,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
-from collocation_sysid.kinds.image_tracks.feature import notes
+from collocation_sysid.kinds.image_tracks.notes import notes
 from collocation_sysid.kinds.image_tracks.rays import (
     is_behind,
     is_occluded,

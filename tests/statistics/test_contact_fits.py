@@ -12,7 +12,7 @@ from kit.problems import GUESS, measured, prescribed_positions, pressed_cube
 
 import collocation_sysid as cs
 from collocation_sysid.common.display import plain_text
-from collocation_sysid.kinds.contact.feature import contact_concerns
+from collocation_sysid.kinds.contact.concerns import contact_concerns
 from collocation_sysid.model.contact.summary import ContactSummary, contact_summaries
 from collocation_sysid.recording import Experiment
 from collocation_sysid.result.run_summary import run_summary

@@ -27,7 +27,7 @@ from kit.filmed import (
 
 import collocation_sysid as cs
 from collocation_sysid.kinds.image_tracks.doubts import track_hypotheses
-from collocation_sysid.kinds.image_tracks.feature import notes
+from collocation_sysid.kinds.image_tracks.notes import notes
 from collocation_sysid.kinds.image_tracks.places import find_places
 from collocation_sysid.kinds.image_tracks.residual import ImageTrackResidual
 from collocation_sysid.kinds.image_tracks.stated_cameras import hypotheses

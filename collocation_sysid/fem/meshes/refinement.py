@@ -158,14 +158,13 @@ def _refined_rest_shape(body: Body, mesh: TetMesh) -> UnderGravity | Literal["st
         return body.scan_conditions
     corners = len(body.mesh.points_m)
     is_prescribed = np.isin(np.arange(corners), body.scan_conditions.grasped_nodes(body.nodes))
-    chosen = np.concatenate([is_prescribed, is_prescribed[body.mesh.edges].all(axis=1)])
-    return replace(body.scan_conditions, nodes=Indices(np.flatnonzero(chosen).tolist()))
+    chosen = np.flatnonzero(body.mesh.refined_mask(is_prescribed))
+    return replace(body.scan_conditions, nodes=Indices(chosen.tolist()))
 
 
 def _refined_force(placed: LocatedForce, mesh: TetMesh, body: Body) -> NodeForce:
     chosen = np.isin(np.arange(len(body.nodes_m)), placed.points.nodes)
-    nodes = chosen[: len(body.mesh.points_m)]
-    chosen = np.concatenate([nodes, nodes[body.mesh.edges].all(axis=1)])
+    chosen = body.mesh.refined_mask(chosen[: len(body.mesh.points_m)])
     if body.element.edges:
         chosen = np.concatenate([chosen, chosen[mesh.edges].all(axis=1)])
     return placed.force.on_refined_body(np.flatnonzero(chosen))

@@ -10,9 +10,9 @@ class Contact(Kind):
 
     name = "contact"
     declares = "Obstacle"
-    topics = lazy(".feature", "TOPICS")
-    guess_concerns = lazy(".feature", "guess_concerns")
-    concerns = lazy(".feature", "concerns")
+    topics = lazy(".concerns", "TOPICS")
+    guess_concerns = lazy(".concerns", "guess_concerns")
+    concerns = lazy(".concerns", "concerns")
     described = lazy(".doubts", "obstacle_hypotheses")
     fitted = lazy(".doubts", "fit_hypotheses")
 

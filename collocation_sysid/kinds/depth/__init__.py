@@ -11,13 +11,13 @@ class DepthCameras(Kind):
     name = "depth"
     declares = "Depth"
     model = lazy("...program.depth.model", "DepthModel")
-    messages = lazy(".feature", "MESSAGES")
+    messages = lazy(".concerns", "MESSAGES")
     require_valid = lazy(".poses", "require_depth_units")
-    concerns = lazy(".feature", "concerns")
-    simulation_concerns = lazy(".feature", "simulation_concerns")
-    notes = lazy(".feature", "notes")
+    concerns = lazy(".concerns", "concerns")
+    simulation_concerns = lazy(".concerns", "simulation_concerns")
+    notes = lazy(".concerns", "notes")
     described = lazy(".poses", "camera_hypotheses")
-    fitted = lazy(".feature", "fit_hypotheses")
+    fitted = lazy(".concerns", "fit_hypotheses")
 
 
 KIND = DepthCameras()

@@ -20,7 +20,7 @@ class TracksInImages(Kind):
     declares = "ImageTracks"
     table = lazy(".table", "ImageTracksSection")
     model = lazy(".residual", "ImageTracksModel")
-    notes = lazy(".feature", "notes")
+    notes = lazy(".notes", "notes")
     described = lazy(".stated_cameras", "hypotheses")
     fitted = lazy(".doubts", "fit_hypotheses")
 

@@ -650,7 +650,7 @@ def surface_association(
         weights=np.array([weights for _, weights in attached]),
         cells=none,
         centre_places_m=places_m,
-        axes=np.zeros((count, 3, 2 if body.is_solid else 1)),
+        axes=np.zeros((count, 3, len(body.kind.places_in_images))),
         crossed_edges=np.full((count, 2, 3), np.nan),
         crossing_counts=none,
     )

@@ -18,7 +18,7 @@ class OutlinesInImages(Kind):
     declares = "Outlines"
     table = lazy(".table", "OutlinesSection")
     model = lazy(".residual", "OutlinesModel")
-    notes = lazy(".feature", "notes")
+    notes = lazy(".notes", "notes")
 
 
 KIND = OutlinesInImages()

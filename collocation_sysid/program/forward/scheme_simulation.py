@@ -138,12 +138,13 @@ def continue_simulation(
     intervals = dynamics.intervals_to_next_s
     # Equilibria that depend on no history, nor on the side from which an obstacle was approached.
     is_any_order = dynamics.is_static and not previous_histories and not experiment.obstacles
+    held_m = np.nan_to_num(dynamics.prescribed_m[:, is_prescribed.any(axis=0)])
     guesses: list[Array] = []
     nearest = 1  # guess that missed least at the row before
     for t in range(done, dynamics.row_count):
         solver = solvers.for_prescribed(is_prescribed[t])
         goal = dynamics.prescribed_m[t, solver.is_prescribed]
-        before = _nearest(dynamics, t) if is_any_order else t - 1
+        before = _nearest(held_m[:t], held_m[t]) if is_any_order else t - 1
         row = RowEquations(
             dynamics, x, forces=forces, t=t, previous=previous_histories, before=before
         )
@@ -221,13 +222,10 @@ def extrapolate(x: Array, first_step: Array) -> Array:
     return x[-1] + next_value(np.diff(x[-1 - MOST_VALUES :], axis=0))
 
 
-def _nearest(dynamics: Dynamics, t: int) -> int:
-    """Return the row before t whose prescribed positions are nearest to its own, the last of equal
-    ones.
-    """
-    apart_m = np.nan_to_num(dynamics.prescribed_m[:t] - dynamics.prescribed_m[t])
-    distance = np.linalg.norm(apart_m, axis=1)
-    return t - 1 - int(np.argmin(distance[::-1]))
+def _nearest(before_m: Array, now_m: Array) -> int:
+    """Return the row of prescribed positions (t, k) nearest to those of row t, the last of equal ones."""
+    distance = np.linalg.norm(before_m - now_m, axis=1)
+    return len(distance) - 1 - int(np.argmin(distance[::-1]))
 
 
 def _extrapolate_static(x: Array, prescribed: Index, goal: Array) -> Array:

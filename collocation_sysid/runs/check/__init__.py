@@ -332,8 +332,8 @@ def check_problem(
         at_guess += strain_stability_concerns(parts)
         if not start_notes:  # forces on a body that was only carried by its grasps mean nothing
             at_guess += branch_concerns(parts)
-            for feature in present(problem.experiments):
-                at_guess += feature.guess_concerns(parts, simulated is not first)
+            for kind in present(problem.experiments):
+                at_guess += kind.guess_concerns(parts, simulated is not first)
     if simulated is not first and not start_notes:
         report_progress("computing what the recordings determine")
         found["combinations"], of_views = _expected_precision(problem, whole, z)
@@ -542,10 +542,7 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
         for e in problem.experiments
         for cause in find_misspecifications_by_modes(e, constants)
     )
-    by_feature = (
-        cause
-        for e in problem.experiments
-        for source in present([e])
-        for cause in source.described(e)
+    by_kind = (
+        cause for e in problem.experiments for kind in present([e]) for cause in kind.described(e)
     )
-    return (*odd, *rank((*by_feature, *doubtful)))
+    return (*odd, *rank((*by_kind, *doubtful)))
