@@ -145,8 +145,9 @@ def test_links_to_a_section_lead_to_its_heading():
     assert broken == []
 
 
-def test_the_problem_file_in_the_readme_is_complete():
-    blocks = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def test_the_problem_file_of_the_first_steps_is_complete():
+    page = ROOT / "docs" / "howto" / "getting_started.md"
+    blocks = re.findall(r"```toml\n(.*?)```", page.read_text(), re.DOTALL)
     file = ROOT / "problems" / "foam_cylinder" / "recording.toml"
     stated = tomllib.loads(file.read_text())
     del stated["title"]
