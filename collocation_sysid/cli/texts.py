@@ -104,7 +104,7 @@ def explain(
 ) -> None:
     """Show pages of the documentation, keys of the problem file, or words of the output.
 
-    Without a topic, the topics of the pages are listed; with any other word, the pages with it.
+    Without a topic, the topics of the pages are listed; with a key or a word, the pages about it.
     Pages are part of the installation; no network is needed. If the output is not a terminal, they
     are printed as Markdown.
     """
@@ -121,8 +121,8 @@ def explain(
     console = PlainConsole()
     for topic in [_known_topic(each) for each in topics]:
         if topic not in page_files():
-            tables = [each for each in (_key_table(topic), _word_table(topic)) if each.rows]
-            for table in tables or [_found_table(topic)]:
+            tables = (_key_table(topic), _word_table(topic), _found_table(topic))
+            for table in (each for each in tables if each.rows):
                 print_result(table)
         elif console.is_terminal:
             console.print(TerminalPage(page_text(topic), hyperlinks=False), crop=False)

@@ -262,3 +262,9 @@ def test_a_symbol_among_the_parameters_names_the_key(tmp_path: Path, symbol: str
     outcome = run_command("check", file)
     assert outcome.code == 2
     assert f"did you mean {name!r}?" in outcome.err
+
+
+def test_a_key_is_shown_with_the_pages_about_it():
+    shown = run_command("explain", "ipopt").out
+    assert "solver.interior-point.ipopt" in shown
+    assert "explain optimal_control" in shown
