@@ -115,7 +115,8 @@ def smooth_distance(experiment: Experiment, *, most: int, share: float) -> int:
         return 1
     tracks = np.asarray(markers.positions_m)
     noise_m = NOISE_OF_CURVATURE * float(np.sqrt(np.mean(markers.sigma_m**2)))
-    varying_m = float(np.sqrt(np.nanmean(np.nanvar(tracks, axis=0))))
+    is_seen = np.isfinite(tracks).any(axis=(0, 2))
+    varying_m = float(np.sqrt(np.nanmean(np.nanvar(tracks[:, is_seen], axis=0))))
     for distance in range(most, 1, -1):
         half = max(1, distance // 2)
         bend = tracks[half:-half] - (tracks[: -2 * half] + tracks[2 * half :]) / 2

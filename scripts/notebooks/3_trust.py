@@ -442,13 +442,13 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(7.1, 2.8))
 for row, name in enumerate(names):
     estimate = run.estimates[name]
     low, high = run.interval(name)
-    left.plot([low / estimate.value, high / estimate.value], [row, row], color=BLUE, lw=2)
+    left.plot([low / estimate.value, high / estimate.value], [row, row], color=BLUE, lw=7)
     low, high = estimate.statistical95 or (np.nan, np.nan)
-    left.plot([low / estimate.value, high / estimate.value], [row, row], color=VERMILION, lw=5)
+    left.plot([low / estimate.value, high / estimate.value], [row, row], color=VERMILION, lw=2)
     left.plot(TRUE_VALUES[name] / estimate.value, row, "k|", ms=12)
 left.set(title="95 % intervals: combined (blue), statistical (orange)", xscale="log")
 left.set(xlabel="value / estimate (black: true value)")
-left.set_xticks([0.25, 0.5, 1, 2, 4], ["0.25", "0.5", "1", "2", "4"])
+left.set_xticks([0.8, 1, 1.25], ["0.8", "1", "1.25"])
 left.set_xticks([], minor=True)
 sums = np.zeros(len(names))
 for effect, (label, colour) in MAIN_EFFECTS.items():

@@ -200,7 +200,9 @@ print(f"off the predicted tip: {np.std(off_mm):.2f} mm, of which {1e3 * NOISE_M:
 again = cs.run(cs.Problem([recorded, execution], unknown, uncertainty=exact))
 for name in ("young_pa", "gamma_r_s"):
     before, after = (
-        f"{each.estimates[name].value:.4g} ± {each.std_error(name):.2g}" for each in (run, again)
+        f"{each.estimates[name].value:.{digits}f} ± {each.std_error(name):.{digits}f}"
+        for each in (run, again)
+        for digits in [max(0, 1 - int(np.floor(np.log10(each.std_error(name)))))]
     )
     print(f"{name}: {before}, with the execution {after}")
 assert again.std_error("gamma_r_s") > 5 * run.std_error("gamma_r_s")

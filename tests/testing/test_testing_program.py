@@ -117,6 +117,8 @@ WRONG = {
 @pytest.mark.parametrize("sentence", WRONG)
 def test_the_term_with_a_wrong_derivative_is_named(sentence: str, monkeypatch):
     experiment = WRONG[sentence](monkeypatch)
-    expected = rf"The first derivative of the {sentence}.* of order (0\.[5-9]|1\.[0-4])\d in the step"
+    expected = (
+        rf"The first derivative of the {sentence}.* of order (0\.[5-9]|1\.[0-4])\d in the step"
+    )
     with pytest.raises(AssertionError, match=expected):
         check_program(cs.Problem([experiment], GUESS))
