@@ -27,8 +27,6 @@ from ..program.lifted.collocation import with_lifted_variables
 from ..program.simulation import require_steps
 from ..recording import Experiment
 from ..recording.impact_steps import impact_steps
-from ..statistics.plausibility import size_and_density_hypotheses
-from ..statistics.scale_identifiability import scale_concerns, static_concerns
 from .options import Origin, RolloutOptions, UncertaintyOptions
 
 
@@ -99,8 +97,7 @@ class Problem:
     ------
     InputError
         For experiments with equal names, parameters that do not match the constants of the bodies,
-        an unknown scheme or method, a profile of a parameter that is not estimated, or an
-        implausible size or density.
+        an unknown scheme or method, or a profile of a parameter that is not estimated.
     """
 
     experiments: tuple[Experiment, ...] = key(converter=tuple[Experiment, ...])
@@ -126,14 +123,8 @@ class Problem:
         vars(self)["experiments"] = _with_free_densities(self.experiments, self.parameters)
         vars(self)["parameters"] = self.parameters.with_fields(self.bodies)
         cleaned = (note for body in self.bodies for note in (*body.mesh.notes, *body.notes))
-        odd = (
-            oddity.message for body in self.bodies for oddity in size_and_density_hypotheses(body)
-        )
-        still = (c.message for c in static_concerns(self.experiments, self.parameters))
-        vars(self)["notes"] = tuple(dict.fromkeys((*odd, *still, *cleaned, *self.notes)))
+        vars(self)["notes"] = tuple(dict.fromkeys((*cleaned, *self.notes)))
         self._validate()
-        unscaled = (c.message for c in scale_concerns(self.experiments, self.parameters))
-        vars(self)["notes"] = tuple(dict.fromkeys((*unscaled, *self.notes)))
 
     def __repr__(self) -> str:
         """Return the title (if there is one), the names of the experiments and the parameters as

@@ -29,7 +29,8 @@ from ..recording.grasp import Grasp, prescribed_nodes
 from ..recording.markers import Markers
 from ..recording.specimen_files import specimen_strains
 from ..statistics.concerns import Concern
-from ..statistics.plausibility import copied_measurements
+from ..statistics.plausibility import copied_measurements, size_and_density_hypotheses
+from ..statistics.scale_identifiability import scale_concerns, static_concerns
 
 Fact = Concern | str
 
@@ -244,7 +245,7 @@ FACTS = (loose_parts, late_load, lost_samples, motion_at_rest, gaps)
 
 
 def facts(problem: Problem) -> list[Fact]:
-    """Return the facts about all recordings of a problem: concerns, and notes as text.
+    """Return the facts about all bodies and recordings of a problem: concerns, and notes as text.
 
     In recordings that are declared to be simulated the grasp usually is that of the model, so that
     its extent is a note.
@@ -256,6 +257,10 @@ def facts(problem: Problem) -> list[Fact]:
     """
     with located(problem.path):
         found = [each for e in problem.experiments for fact in FACTS for each in fact(e)]
+        odd = [each for body in problem.bodies for each in size_and_density_hypotheses(body)]
+    found += [each.concern("doubtful") for each in odd]
+    found += static_concerns(problem.experiments, problem.parameters)
+    found += scale_concerns(problem.experiments, problem.parameters)
     found += [each.concern() for each in copied_measurements(problem.experiments)]
     extents = [each for e in problem.experiments for each in grasp_extent(e)]
     return found + (sentences(extents) if problem.is_declared_simulated else extents)

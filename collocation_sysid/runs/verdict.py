@@ -36,12 +36,7 @@ from ..statistics.assessment import (
     validation_concerns,
 )
 from ..statistics.concerns import Concern, Grade
-from ..statistics.plausibility import (
-    density_concerns,
-    material_hypothesis,
-    size_and_density_hypotheses,
-)
-from ..statistics.scale_identifiability import scale_concerns
+from ..statistics.plausibility import density_concerns, material_hypothesis
 from ..statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..statistics.uncertainty import Uncertainty
 from .check.modes import ModesCheck, check_modes
@@ -196,22 +191,16 @@ def _outlier_counts(solution: Solution) -> tuple[int, int]:
 
 
 def body_concerns(solution: Solution) -> Iterator[Concern]:
-    """Yield concerns about implausible sizes and densities, or else about an implausible stiffness
-    at the estimates, of each fitted body, and about an unknown scale of the moduli; all are
-    doubtful, except densities that are unusual for the way in which a body was made.
+    """Yield concerns about an implausible stiffness at the estimates of each fitted body, which are
+    doubtful, and about densities that are unusual for the way in which a body was made.
     """
     for body in dict.fromkeys(
         transcription.body for transcription in solution.collocation.transcriptions
     ):
-        odd = size_and_density_hypotheses(body) or [
-            material_hypothesis(body, body.theta_from_values(solution.parameters))
-        ]
-        yield from (each.concern("doubtful") for each in odd if each is not None)
+        theta = body.theta_from_values(solution.parameters)
+        if (metal := material_hypothesis(body, theta)) is not None:
+            yield metal.concern("doubtful")
         yield from density_concerns(body)
-    experiments = [
-        transcription.experiment for transcription in solution.collocation.transcriptions
-    ]
-    yield from scale_concerns(experiments, solution.collocation.parameters, grade="doubtful")
 
 
 def allowance_concerns(solution: Solution) -> Iterator[Concern]:

@@ -30,7 +30,7 @@ from ..fem.laws.constants import (
 from ..methods.starts.stiffness_scan import SOFT_PA, typical_parameters
 from ..model.parameters import Parameters, ThetaMap
 from ..recording.experiment import Experiment
-from .concerns import Concern, Grade
+from .concerns import Concern
 from .distributions import chi2_isf
 
 # Relative error up to which parameters can multiply all constants by a common factor.
@@ -59,14 +59,12 @@ def relative_moduli(experiments: Iterable[Experiment], parameters: Parameters) -
     return _scaled_parameters(experiments, parameters, includes_declared=True)
 
 
-def scale_concerns(
-    experiments: Iterable[Experiment], parameters: Parameters, grade: Grade = "check"
-) -> list[Concern]:
-    """Return one concern "scale/unknown" of a grade, as a list, if `parameters_of_open_scale` has
+def scale_concerns(experiments: Iterable[Experiment], parameters: Parameters) -> list[Concern]:
+    """Return one doubtful concern "scale/unknown", as a list, if `parameters_of_open_scale` has
     names; else empty.
     """
     names = parameters_of_open_scale(experiments, parameters)
-    return [Concern("scale/unknown", grade, data={"names": names})] if names else []
+    return [Concern("scale/unknown", "doubtful", data={"names": names})] if names else []
 
 
 @dataclass(frozen=True)

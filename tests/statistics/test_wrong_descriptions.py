@@ -32,6 +32,7 @@ from collocation_sysid.program.simulation import simulate, with_markers
 from collocation_sysid.recording import Experiment, Grasp, PoseSequence, read_poses
 from collocation_sysid.runs.check import misspecification_hypotheses
 from collocation_sysid.runs.check.body import check_grasps, grasp_concerns
+from collocation_sysid.runs.facts import facts
 from collocation_sysid.statistics.assessment import cause_concerns
 from collocation_sysid.statistics.plausibility import (
     material_hypothesis,
@@ -315,8 +316,9 @@ def test_likely_mistakes_come_first(fault, rng):
     given = soft("block")
     silicone = replace(given, experiments=[replace(given.experiments[0], body=heavy)])
     wrong = FAULTS[fault](silicone, rng)
-    assert misspecification_hypotheses(wrong)[0].cause in FAULTS[fault].causes
-    assert any("expected 10 to" in note or "expected 0.0001" in note for note in wrong.notes)
+    first = facts(wrong)[0]
+    assert first.code.split("/")[1] in FAULTS[fault].causes
+    assert any(each in first.message for each in ("expected 10 to", "expected 0.0001"))
 
 
 # The nodes of a grasp -----------------------------------------------------------------------------

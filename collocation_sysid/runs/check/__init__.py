@@ -40,8 +40,7 @@ from ...statistics.budget.discretisation_error import MOST_SUBSTEPS
 from ...statistics.combinations import Combination, with_something_to_state
 from ...statistics.concerns import Concern
 from ...statistics.hypothesis import Hypothesis, rank
-from ...statistics.plausibility import size_and_density_hypotheses
-from ...statistics.scale_identifiability import scale_concerns, scale_reference, static_concerns
+from ...statistics.scale_identifiability import scale_reference
 from ...statistics.stability_concerns import branch_concerns, strain_stability_concerns
 from ..cost import LONG_SOLVE_S, MethodCost, cost_concerns, cost_notes, method_costs, nonzeros
 from ..derivatives import derivative_fault, shortened_problem, taylor_rates
@@ -478,14 +477,12 @@ def _concerns(
     problem: Problem, findings: CheckResult, unstable: Sequence[Instability]
 ) -> tuple[Concern, ...]:
     """Return the likeliest mistakes first."""
-    experiments, parameters, bodies = problem.experiments, problem.parameters, findings.bodies
+    experiments, bodies = problem.experiments, findings.bodies
     steps = problem.choose_first_substeps()
     chosen = findings.chosen_cost
     body_of = {name: body for body in bodies for name in body.experiments}
     return (
         *(cause.concern() for cause in findings.causes),
-        *static_concerns(experiments, parameters),
-        *scale_concerns(experiments, parameters),
         *(each for body in bodies for each in _body_concerns(body, len(bodies) == 1)),
         *(each for grasp_check in findings.holds for each in grasp_concerns(grasp_check)),
         *(each for motion in findings.motions for each in mode_concerns(motion)),
@@ -523,20 +520,13 @@ def _body_concerns(body: BodyCheck, alone: bool) -> tuple[Concern, ...]:
 
 
 def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
-    """Return likely errors in the description of a problem; mostly none.
+    """Return likely errors in the description of a problem, the likeliest first; mostly none.
 
-    Odd sizes and densities come first, as others may follow from them; then the likeliest.
     Parameters without a guess get usual values.
-
-    Raises
-    ------
-    InputError
-        For a size or a density that no body can have.
     """
     from ...judge.modes import find_misspecifications_by_modes
 
     constants = typical_constants(problem.parameters)
-    odd = (oddity for body in problem.bodies for oddity in size_and_density_hypotheses(body))
     doubtful = (
         cause
         for e in problem.experiments
@@ -545,4 +535,4 @@ def misspecification_hypotheses(problem: Problem) -> tuple[Hypothesis, ...]:
     by_kind = (
         cause for e in problem.experiments for kind in present([e]) for cause in kind.described(e)
     )
-    return (*odd, *rank((*by_kind, *doubtful)))
+    return rank((*by_kind, *doubtful))
