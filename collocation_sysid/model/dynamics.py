@@ -119,7 +119,7 @@ class Dynamics:
             t_s = experiment.t_s[0] + np.arange(rows) * experiment.timestep_s / substeps
             table = as_scheme(scheme, experiment.start_rule)
         rows = len(t_s)
-        first_row = 0 if experiment.start == "equilibrium" else 1
+        first_row = 0 if experiment.is_balanced_at_start else 1
         tables = StencilTables.from_scheme(table, rows, first_row=first_row)
         velocity = experiment.initial_velocities_m_s
         dofs = experiment.body.pattern.size

@@ -1,11 +1,11 @@
 """Inputs u(p; t) by which parameters enter the equations of motion, with generated derivatives.
 
 The entries of u at each evaluation are, in this order: the constants θ of the body; gravity (3), if
-a nuisance parameter rotates it; the share of each load whose time is estimated; the amplitude of
-each tendon and pressure; the relative change of the stiffness, if a deviation changes it. The
-parameters p are those that affect the motion: the shared coordinates
-q, then the nuisance parameters φ of `NuisanceMap.motion_indices`. Every force provides its
-derivatives by u (see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
+a nuisance parameter rotates it; the share of each load whose time is estimated; the factors of the
+motion at the first time; the amplitude of each tendon and pressure; the relative change of the
+stiffness, if a deviation changes it. The parameters p are those that affect the motion: the shared
+coordinates q, then the nuisance parameters φ of `NuisanceMap.motion_indices`. Every force provides
+its derivatives by u (see `forces`); this module generates ∂u/∂p and Σ w ∂²u/∂p².
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from ..recording.actuator import Actuator
 from ..recording.experiment import Experiment
 from ..recording.loads import smooth_ramp
 from ..recording.nuisance import JOINING
+from ..recording.start_motion import start_forces_n
 from .dynamics import Dynamics
 from .generated_functions import GeneratedFunction
 from .nuisance_map import NuisanceMap, TimedLoad
@@ -108,17 +109,22 @@ class Inputs:
         return mask
 
 
-def with_inputs(dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
+def with_inputs(experiment: Experiment, dynamics: Dynamics, nuisance: NuisanceMap) -> Dynamics:
     """Return equations of motion whose weight has the inputs that φ changes: gravity, if a
-    parameter rotates it, and the shares of loads with an estimated time. The argument is not
-    modified.
+    parameter rotates it, the shares of loads with an estimated time, and the motion at the first
+    time. The argument is not modified.
 
     Values are unchanged until `Dynamics.with_inputs` sets the inputs.
     """
     forces = dynamics.forces
     loads = [timed.load for timed in nuisance.timed_loads]
     has_gravity_input = len(nuisance.gravity_indices) > 0
-    weight = forces.weight.with_load_inputs(has_gravity_input, loads, t_s=dynamics.evaluated_s)
+    starting_n = np.zeros((0, len(dynamics.evaluated_s), forces.pattern.size))
+    if numbers := [nuisance.number_of_start(phi) for phi in nuisance.start_indices.tolist()]:
+        starting_n = start_forces_n(experiment, dynamics.evaluated_s)[numbers]
+    weight = forces.weight.with_load_inputs(
+        has_gravity_input, loads, t_s=dynamics.evaluated_s, starting_n=starting_n
+    )
     return replace(dynamics, forces=replace(forces, weight=weight))
 
 
@@ -186,6 +192,10 @@ def inputs_from_experiment(
         groups.append(Input(3, gravity, data=no_data, is_coupled_to_state=False))
     joining = zip(nuisance.indices_of_rows(JOINING).tolist(), nuisance.timed_loads, strict=True)
     groups += [share(phi, timed) for phi, timed in joining]
+    groups += [
+        Input(1, lambda p, _, phi=phi: value(p, phi), data=no_data, is_coupled_to_state=False)
+        for phi in nuisance.start_indices.tolist()
+    ]
     groups += [amplitude(k, actuator) for k, actuator in enumerate(experiment.actuators)]
     if rows := experiment.stiffness_deviations:
         changing = nuisance.stiffness_indices.tolist()

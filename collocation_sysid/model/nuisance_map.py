@@ -50,6 +50,8 @@ from ..recording.nuisance import (
     PRESSURE_OFFSET,
     SMALLEST_FACTOR,
     SPECIMEN_FACTORS,
+    START_ACCELERATION,
+    START_VELOCITY,
     STRAIN_ZERO,
     TARE,
     TENSION_OFFSET,
@@ -463,6 +465,26 @@ class NuisanceMap(RecordingQuantities):
     def stiffness_indices(self) -> Index:
         """Indices in φ of the parameters that change the stiffness."""
         return self._indices_where(lambda e: "stiffness" in e.row.changes)
+
+    @cached_property
+    def start_indices(self) -> Index:
+        """Indices in φ of the motion at the first time."""
+        return self.indices_of_rows(START_ACCELERATION, START_VELOCITY)
+
+    def number_of_start(self, phi: int) -> int:
+        """Return the index of one of `start_indices` in the forces of `start_forces_n`."""
+        entry = self.entries[phi]
+        return 6 * (entry.row.name == START_VELOCITY.name) + entry.axis
+
+    def with_start(self, experiment: Experiment, phi: Array) -> Experiment:
+        """Return the experiment with the motion at its first time that φ (k,) estimates known."""
+        if not len(self.start_indices):
+            return experiment
+        known = experiment.start_motion
+        motion = np.zeros(12) if known is None else known.copy()
+        for k in self.start_indices.tolist():
+            motion[self.number_of_start(k)] += phi[k] * self.scales[k]
+        return replace(experiment, start_motion=motion)
 
     def with_stiffness(self, experiment: Experiment, phi: Array) -> Experiment:
         """Return the experiment with the changes of its stiffness that φ (k,) estimates known."""

@@ -29,6 +29,7 @@ from ..fem.node_force import ADDED_MASS_SHARE
 from ..fem.regions import Theta
 from ..recording.experiment import Experiment
 from ..recording.loads import Force, PointMass
+from ..recording.start_motion import start_forces_n
 from .force_term import AssemblyIndices, ForceTerm, States
 
 
@@ -105,6 +106,10 @@ class Weight(ForceTerm):
         gives NaN masses until `with_theta`.
         """
         applied = experiment.declared_node_forces_n(t_s)
+        if experiment.start_motion is not None:
+            starting = start_forces_n(experiment, np.atleast_1d(t_s))
+            moving = np.tensordot(experiment.start_motion, starting, 1)
+            applied = applied + moving.reshape(applied.shape)
         body = experiment.body
         tied = np.repeat(experiment.point_mass_at_nodes_kg(t_s), 3, axis=1)
         air_kg = experiment.air_density_kg_m3 * body.sum_dof_volumes_m3()
@@ -133,10 +138,14 @@ class Weight(ForceTerm):
         return replace(self, mass=replace(self.mass, own_kg=self.body.mass_of_dofs(theta)))
 
     def with_load_inputs(
-        self, has_gravity_input: bool, loads: Sequence[PointMass | Force], t_s: Array
+        self,
+        has_gravity_input: bool,
+        loads: Sequence[PointMass | Force],
+        t_s: Array,
+        starting_n: Array,
     ) -> Weight:
-        """Return this weight with gravity and the shares of some loads as inputs; other loads stay
-        as they are.
+        """Return this weight with gravity, the shares of some loads and the motion at the first time as
+        inputs; other loads stay as they are.
 
         Parameters
         ----------
@@ -146,8 +155,11 @@ class Weight(ForceTerm):
             Loads whose shares are inputs.
         t_s : (T,)
             Times of the evaluations [s].
+        starting_n : (k, T, 3n) array
+            Forces by the motion at the first time, whose factors are inputs after the shares.
         """
-        joining = _zero_loads(self.applied_n, len(loads))
+        joining = _zero_loads(self.applied_n, len(loads) + len(starting_n))
+        joining["joining_n"][len(loads) :] = starting_n
         nodes = self.body.pattern.size // 3
         for k, load in enumerate(loads):
             if isinstance(load, PointMass):

@@ -449,9 +449,10 @@ class ExperimentSection(NamedSection, of=Experiment):
     gravity_frame : str, optional
         Frame of the log in whose axes gravity_m_s2 is stated, such as "base_link"; it must be fixed
         in the frame of the poses by static transforms. The frame of the poses by default.
-    start : {"equilibrium", "undeformed"}
-        State of the body at the first time. "equilibrium": at rest under its loads. "undeformed":
-        undeformed, and at rest unless `start_velocity_m_s` or `start_spin_rad_s` is stated.
+    start : {"equilibrium", "moving", "undeformed"}
+        State of the body at the first time. "equilibrium": at rest under its loads. "moving": it still
+        swings; its displacement and velocity are nuisance parameters. "undeformed": undeformed, and
+        at rest unless `start_velocity_m_s` or `start_spin_rad_s` is stated.
     mass : list of PointMassSection
         [[experiment.mass]] tables: point masses tied to the body.
     force : list of ForceSection
@@ -489,7 +490,7 @@ class ExperimentSection(NamedSection, of=Experiment):
     gravity_m_s2: Declared
     gravity_frame: Text | None = None
     kind: Declared
-    start: Literal["equilibrium", "undeformed"] = "equilibrium"
+    start: Literal["equilibrium", "moving", "undeformed"] = "equilibrium"
     start_velocity_m_s: Declared
     start_spin_rad_s: Declared
     start_rule: Declared

@@ -126,6 +126,7 @@ class MotionTranscription:
         estimate; the constants of the body are not set.
         """
         return with_inputs(
+            self.experiment,
             Dynamics.from_experiment(self.experiment, self.scheme, substeps=self.substeps),
             self.nuisance,
         )
@@ -306,7 +307,7 @@ class MotionTranscription:
         grasps at the first time.
         """
         experiment = self.experiment
-        if experiment.start == "equilibrium":
+        if experiment.is_balanced_at_start:
             return None
         if experiment.start_positions_m is not None:
             return experiment.start_positions_m.ravel()
@@ -405,7 +406,7 @@ class MotionTranscription:
             tendons=tendons,
             pressures=pressures,
         )
-        changed = self.nuisance.with_stiffness(changed, phi)
+        changed = self.nuisance.with_start(self.nuisance.with_stiffness(changed, phi), phi)
         return self.nuisance.with_times(changed, phi)
 
     def with_prescribed_positions(self, x: Array, phi: Array) -> Array:

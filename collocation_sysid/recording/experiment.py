@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ..fem.pattern import JointPattern, SymmetricPattern
 
 Kind = Literal["dynamic", "static"]
-Start = Literal["equilibrium", "undeformed", "given"]
+Start = Literal["equilibrium", "moving", "undeformed", "given"]
 StartRule = Literal["standard", "paper"]
 
 # Relative tolerance of the flatness of a face, and of a node that lies in a plane: rounding of mesh
@@ -134,9 +134,10 @@ class Experiment:
     kind : {"dynamic", "static"}
         "dynamic": a motion. "static": each sample is an equilibrium, and a material with memory
         relaxes between the samples.
-    start : {"equilibrium", "undeformed", "given"}
-        State at the first time: at rest under its loads; undeformed, at rest or with `start_velocity_m_s`
-        and `start_spin_rad_s`; or as given.
+    start : {"equilibrium", "moving", "undeformed", "given"}
+        State at the first time: at rest under its loads; displaced from there and moving, as nuisance
+        parameters describe; undeformed, at rest or with `start_velocity_m_s` and `start_spin_rad_s`;
+        or as given.
     start_rule : {"standard", "paper"}
         Inertia in the first time step. "standard": from the initial velocity. "paper": zero
         acceleration.
@@ -147,6 +148,9 @@ class Experiment:
         "undeformed"; at rest by default.
     start_spin_rad_s : (3,) array, optional
         Angular velocity [x, y, z] of such a body about its centre of mass; zero by default.
+    start_motion : (12,) array, optional
+        Known part of the motion of a body that starts "moving", see `start_motion.start_forces_n`: six
+        accelerations [m/s²] and six velocities [m/s]; zero by default.
     loaded_since_s : float
         How long a body with memory has been in the shape of its initial equilibrium [s]; by default
         the material is completely relaxed.
@@ -209,6 +213,7 @@ class Experiment:
     start_spin_rad_s: Array | None = key(
         Vector | None, converter=float_converter((3,), "start_spin_rad_s"), default=None
     )
+    start_motion: Array | None = key(converter=float_converter((12,), "start_motion"), default=None)
     loaded_since_s: float = key(NotNegative | None, default=np.inf)
     validation: bool = key(Flag, default=False)
     frames_fault: str = ""
@@ -899,7 +904,7 @@ class Experiment:
 
     def _check_start(self) -> None:
         """Complete a given start in place: zero velocities, and the frames of the obstacles."""
-        if np.isfinite(self.loaded_since_s) and self.start != "equilibrium":
+        if np.isfinite(self.loaded_since_s) and not self.is_balanced_at_start:
             raise InputError(
                 f"loaded_since_s is given, but start is '{self.start}'; loaded_since_s is the "
                 "time for which a body that starts in equilibrium has been loaded"
@@ -927,8 +932,19 @@ class Experiment:
                     f"or no {name}",
                     where=name,
                 )
-        if self.start == "equilibrium":
+        if self.is_balanced_at_start:
             self._require_unique_equilibrium()
+        if self.start == "moving" and not self.body_grasps:
+            raise InputError(
+                "start = 'moving' needs a grasp; expected another start", where="start"
+            )
+
+    @property
+    def is_balanced_at_start(self) -> bool:
+        """Whether the forces at the first time are in equilibrium, also those that hold a body which
+        moves then.
+        """
+        return self.start in ("equilibrium", "moving")
 
     @property
     def initial_velocities_m_s(self) -> Array | None:

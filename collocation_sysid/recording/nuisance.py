@@ -116,8 +116,12 @@ def _has_observable_hand_eye(experiment: Any) -> bool:
     return (
         bool(experiment.body_grasps)
         and _has_markers(experiment)
-        and experiment.start == "equilibrium"
+        and experiment.is_balanced_at_start
     )
+
+
+def _moves_at_start(experiment: Any) -> bool:
+    return experiment.start == "moving"
 
 
 def _has_turned_clamps(experiment: Any) -> bool:
@@ -455,6 +459,34 @@ JOINING = Deviation(
     sentence="{which} {number}{error}{unit} {way} than {stated}",
     description="delay of the time at which each point mass or force begins or ends, if "
     "this time is within the recording",
+)
+START_ACCELERATION = Deviation(
+    "start_acceleration_m_s2",
+    "m/s²",
+    sigma=20.0,
+    key="start_acceleration",
+    axes="x1 y1 z1 x2 y2 z2",
+    changes=("loads",),
+    by="length",
+    applies=_moves_at_start,
+    label="acceleration that held the body at the start, {axis}",
+    sentence="acceleration that held the body at the start: {size}",
+    description="the displacement at the first time of a body that starts moving: that by two fields of "
+    "forces, which alone would give its far end this acceleration",
+)
+START_VELOCITY = Deviation(
+    "start_velocity_m_s",
+    "m/s",
+    sigma=2.0,
+    key="start_velocity",
+    axes="x1 y1 z1 x2 y2 z2",
+    changes=("loads",),
+    by="length",
+    applies=_moves_at_start,
+    label="velocity of the far end at the start, {axis}",
+    sentence="velocity of the far end at the start: {size}",
+    description="the velocity of the far end at the first time of a body that starts moving, in the same "
+    "two fields",
 )
 TEMPERATURE = Deviation(
     "stiffness_per_kelvin",

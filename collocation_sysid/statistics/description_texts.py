@@ -56,8 +56,8 @@ MESSAGES = {
     "are exchanged or reversed; reorder the columns, or rotate the tracks",
     "not-at-rest": "point {point} of '{experiment}' moves by {by} ({sigmas:.2g} times {noise}) in "
     'the first {still_s:.3g} s, in which the poses stand still, but with start = "equilibrium" the '
-    "body is at rest until a grasp moves: wait before the recording until the body is at rest, or "
-    "let window_s begin when it is",
+    "body is at rest until a grasp moves: wait before the recording until the body is at rest, let "
+    'window_s begin when it is, or state start = "moving"',
     "specimen-true-stress": "stresses fit as true stresses (force over deformed area): set "
     'stress = "true", or divide the forces by the undeformed area',
     "specimen-compression": "strains and stresses fit as those of a compression test: set "

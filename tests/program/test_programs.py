@@ -331,6 +331,7 @@ def gripped_rod(scheme: str = "midpoint", **options) -> Collocation:
     return program(felt(sensing(rod)), scheme=scheme, parameters=parameters, **options)
 
 
+STARTS = Nuisance.none(start_acceleration_m_s2=3.0, start_velocity_m_s=0.2)
 PROGRAMS: dict[str, Make] = {
     "rod": gripped_rod,
     "rod, bdf2": lambda: gripped_rod("bdf2"),
@@ -379,6 +380,12 @@ PROGRAMS: dict[str, Make] = {
             scheme=scheme,
         )
         for scheme in SCHEMES
+    },
+    **{
+        f"moving start, {scheme}": lambda scheme=scheme: program(
+            replace(swung(), start="moving", nuisance=STARTS), scheme=scheme
+        )
+        for scheme in ("midpoint", "bdf2")
     },
     "loads, all fixed": lambda: program(bar_loaded(6), parameters=ALL_FIXED),
     **{

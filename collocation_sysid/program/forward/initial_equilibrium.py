@@ -227,7 +227,7 @@ def initial_state(
     """
     velocity = experiment.initial_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
-    if experiment.start == "equilibrium":
+    if experiment.is_balanced_at_start:
         at_s = float(experiment.t_s[0])
         prescribed_m = (
             experiment.prescribed_displacements([at_s])[1].ravel()

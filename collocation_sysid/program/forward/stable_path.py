@@ -89,7 +89,7 @@ def find_branch_change(experiment: Experiment, dynamics: Dynamics, x: Array) -> 
         solver = solvers.for_prescribed(is_prescribed[t])
         time_s = float(dynamics.t_s[t])
         if t == 0:
-            if experiment.start != "equilibrium" or previous:
+            if not experiment.is_balanced_at_start or previous:
                 continue
             origin = experiment.rigid_positions([time_s])[0].ravel()
             equations = _first_equations(experiment, dynamics, solver, goal_m=x[0])
