@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .fem.laws.fibres import Fibres
     from .fem.laws.materials import DampingLaw, Material, Prony
     from .fem.meshes.mesh import TetMesh
-    from .fem.meshes.selection import Ball, Box, Face, Indices, Named
+    from .fem.meshes.selection import Along, Ball, Box, Face, Indices, Named
     from .fem.meshes.structured import box_mesh, cylinder_mesh
     from .fem.node_force import NodeForce
     from .fem.regions import Region
@@ -92,6 +92,7 @@ if TYPE_CHECKING:
     __version__: str
 
 __all__ = [
+    "Along",
     "Assumptions",
     "AugmentedLagrangian",
     "Ball",

@@ -378,12 +378,14 @@ def _with_natural_strains(parameters: Sections, body: Body) -> Sections:
 def _stations_m(file: ProblemFile) -> list[float]:
     """Return the arc lengths that a problem names, where a rod must have sections."""
     stations: list[float] = []
+    selections: list[object] = [region.cells for region in file.object.region]
     for experiment in file.recordings:
         stations += experiment.markers.s_m.values()
-        for held in (*experiment.grasp_list, *experiment.mass, *experiment.force):
-            nodes = getattr(held, "nodes", None)
-            if isinstance(nodes, NodesSection) and nodes.s_m is not None:
-                stations += nodes.s_m
+        placed = (*experiment.grasp_list, *experiment.mass, *experiment.force)
+        selections += [getattr(each, "nodes", None) for each in placed]
+    for selection in selections:
+        if isinstance(selection, NodesSection) and selection.s_m is not None:
+            stations += selection.s_m
     return stations
 
 

@@ -96,7 +96,7 @@ class RegionSection(Section):
         Name, made of letters, digits, - and _.
     cells : ElementNodes
         Elements of the region, selected by their centres: a table of box_m, ball_m or indices, or
-        the name of a cell array or of a physical group.
+        s_m along a rod, or the name of a cell array or of a physical group.
     material : Material, optional
         Material of the region; by default that of the object.
     damping : DampingName, optional

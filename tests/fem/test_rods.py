@@ -382,3 +382,12 @@ def test_a_rod_mesh_states_its_volume():
     mesh = bent()
     assert isinstance(mesh, RodMesh)
     assert mesh.volumes_m3.sum() == pytest.approx(STRIP.area_m2 * mesh.lengths_m.sum(), rel=1e-12)
+
+
+def test_regions_side_by_side_along_a_rod_have_each_element_once():
+    """Also where no section is at their common end: the element belongs to that of its middle."""
+    regions = [cs.Region("a", cs.Along(0, 0.407)), cs.Region("b", cs.Along(0.407, 1))]
+    parts = cable(straight(1.0, ROUND, 11), regions=regions).parts
+    assert [part.name for part in parts] == ["a", "b"]
+    assert np.array_equal(parts[0].cells, range(4))
+    assert np.array_equal(parts[1].cells, range(4, 10))

@@ -176,6 +176,42 @@ def test_arc_lengths_of_a_solid_body_are_refused(tmp_path):
     )
     with pytest.raises(InputError, match="not a rod"):
         cs.Problem.read(problem)
+    create_problem(tmp_path / "sponge", "swing")
+    problem = with_region(tmp_path / "sponge" / "problem.toml", "s_m = [0, 0.1]")
+    with pytest.raises(InputError, match=r"object\.region 'core'.*not a rod"):
+        cs.Problem.read(problem)
+
+
+def with_region(problem, cells: str):
+    text = problem.read_text(encoding="utf-8")
+    region = f'[[object.region]]\nname = "core"\ncells = {{ {cells} }}\n'
+    problem.write_text(text + region, encoding="utf-8")
+    return changed(problem, "[parameters]", '[parameters]\n"core.bending_n_m2" = 2e-3')
+
+
+def test_a_region_between_arc_lengths_is_that_of_its_cell_numbers(problem):
+    text = problem.read_text(encoding="utf-8")
+    stated = cs.Problem.read(with_region(problem, "s_m = [0.05, 0.3]"))
+    s_m = stated.bodies[0].mesh.s_m
+    first, end = np.searchsorted(s_m, [0.05 - 1e-9, 0.3 - 1e-9])
+    problem.write_text(text, encoding="utf-8")
+    numbered = cs.Problem.read(with_region(problem, f"indices = {[*range(3 * first, 3 * end)]}"))
+    constants = {"core.bending_n_m2": 2e-3, "torsion_n_m2": 3e-4, "axial_n": 200.0}
+    tracks_m, others_m = (
+        cs.simulate(each.experiments[0], TRUTH | constants).markers_m for each in (stated, numbered)
+    )
+    assert np.array_equal(tracks_m, others_m)
+
+
+def test_a_rod_has_sections_where_a_region_ends(problem):
+    body = cs.Problem.read(with_region(problem, "s_m = [0.1234, 0.2345]")).bodies[0]
+    (core,) = (part for part in body.parts if part.name == "core")
+    assert np.allclose(body.mesh.s_m[[core.cells[0], core.cells[-1] + 1]], [0.1234, 0.2345])
+
+
+def test_a_region_outside_a_rod_is_refused(problem):
+    with pytest.raises(InputError, match=r"object\.region 'core'.*\[0\.3, 0\.7\].*0 to 0\.6 m"):
+        cs.Problem.read(with_region(problem, "s_m = [0.3, 0.7]"))
 
 
 @pytest.mark.long

@@ -187,7 +187,8 @@ class Face(_PositionSelection):
 @validated
 @dataclass(frozen=True)
 class Along:
-    """Selection of the cross-sections of a rod between two arc lengths.
+    """Selection of the cross-sections of a rod between two arc lengths, or of its cells by their
+    middles.
 
     Parameters
     ----------
@@ -211,20 +212,20 @@ class Along:
         return _indices_or_error(self._contains(nodes.mesh), nodes.mesh, what=str(self))
 
     def resolve_cells(self, mesh: TetMesh) -> np.ndarray:
-        """Return the indices of the cells between the selected sections, sorted."""
-        chosen = np.asarray(self._contains(mesh)[mesh.tetrahedra].all(axis=1))
+        """Return the indices of the cells whose middle is in between, sorted."""
+        chosen = self._contains(mesh, cells=mesh.tetrahedra)
         return _indices_or_error(chosen, mesh, what=str(self), of=OF_CELLS)
 
     def resolve_faces(self, mesh: TetMesh) -> np.ndarray:
         """Return the rows of `mesh.surface` between the selected sections, sorted."""
         return _select_faces(self._contains(mesh), mesh, what=str(self))
 
-    def _contains(self, mesh: TetMesh) -> np.ndarray:
+    def _contains(self, mesh: TetMesh, cells: np.ndarray | None = None) -> np.ndarray:
+        """Return the mask of the nodes (n,), or of cells (E, 4) by their middles."""
         if mesh.arc_lengths_m is None:
             raise InputError(
                 "found arc lengths for a body that is not a rod; expected a selection by position, "
-                "such as box_m",
-                where="s_m",
+                "such as box_m"
             )
         slack = _tolerance_m(mesh.points_m)
         length_m = mesh.arc_lengths_m[-1]
@@ -233,8 +234,10 @@ class Along:
                 f"found [{self.first_m:g}, {self.last_m:g}]; expected arc lengths from 0 to "
                 f"{length_m:g} m, the length of the rod"
             )
-        inside = mesh.arc_lengths_m >= self.first_m - slack
-        return np.asarray(inside & (mesh.arc_lengths_m <= self.last_m + slack))
+        s_m = mesh.arc_lengths_m
+        if cells is not None:
+            s_m = (s_m[cells].min(axis=1) + s_m[cells].max(axis=1)) / 2
+        return np.asarray((s_m >= self.first_m - slack) & (s_m <= self.last_m + slack))
 
     def __str__(self) -> str:
         return f"the part of the rod from {self.first_m:g} to {self.last_m:g} m"
