@@ -33,7 +33,7 @@ from ..common.validated_classes import validated
 from ..common.validated_types import AtLeastOne, Positive
 from ..errors import InputError
 from .discretisation import Discretisation
-from .laws.constants import DENSITY, NATURAL_STRAINS, Constant
+from .laws.constants import DENSITY, NATURAL_ENDS, NATURAL_STRAINS, Constant, NaturalCurvature
 from .laws.fibres import Fibres
 from .laws.materials import DampingLaw, Energy, Material, Prony
 from .laws.memory import MemoryInput
@@ -182,8 +182,9 @@ class Body(Discretisation):
     material_density_kg_m3 : float, optional
         Known density of the material of a body with `mass_kg`, with which the mass over the volume
         of the mesh is compared.
-    natural_curvature : bool
-        Whether natural curvature and twist of a rod are constants.
+    natural_curvature : bool or "affine"
+        Whether natural curvatures and twist of a rod are constants, or "affine" for those at the
+        beginning and at the end of the rod, or of each region.
     evaluator : {"auto", "simd", "casadi"}
         Evaluator of the element kernels, see `kernels`. "auto" uses CasADi's map, with a note, for
         a material that vector code cannot evaluate.
@@ -236,7 +237,7 @@ class Body(Discretisation):
         made: Made | None = None,
         mesh_from: MeshOrigin | None = None,
         material_density_kg_m3: Positive | None = None,
-        natural_curvature: bool = False,
+        natural_curvature: NaturalCurvature = False,
         evaluator: str = "auto",
         threads: AtLeastOne | None = None,
     ) -> None:
@@ -363,7 +364,7 @@ class Body(Discretisation):
     @cached_property
     def natural_strain_indices(self) -> list[int]:
         """Indices in θ of the natural curvatures and twists."""
-        names = {constant.name for constant in NATURAL_STRAINS}
+        names = {constant.name for constant in NATURAL_STRAINS + NATURAL_ENDS}
         return [k for k, name in enumerate(self.constants) if name.split(".")[-1] in names]
 
     def partly_straightened(self, share: float) -> Body:

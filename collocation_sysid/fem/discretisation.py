@@ -88,7 +88,7 @@ class Discretisation(ConstantsModel):
         self._framed: dict[tuple[Any, ...], Any] = {}
         self.cells: Index = self.nodes.cells
         self.threads = threads or available_threads()
-        self.geometry = mesh.geometry(self.nodes, self.element)
+        self.geometry = mesh.geometry(self.nodes, self.element, [p.cells for p in parts])
         self.cell_volumes_m3: Array = self.geometry[..., -1].sum(axis=1)
         self._evaluators: dict[str, list[Evaluator]] = {}
         self._choice = EvaluatorChoice(evaluator)

@@ -132,7 +132,7 @@ ROD = Element(
     meshio_type="wedge",
     columns=5,
     stresses=12,
-    rest_values=7,
+    rest_values=8,
 )
 
 

@@ -22,8 +22,10 @@ from ..fem.laws.constants import (
     DENSITY,
     FRICTION,
     MASS,
+    NATURAL_ENDS,
     NATURAL_STRAINS,
     Constant,
+    NaturalCurvature,
     constant_named,
     is_density,
     with_undamped,
@@ -230,10 +232,7 @@ def _load_object(
         mesh,
         code=code,
         natural_curvature=isinstance(mesh, RodMesh)
-        and (
-            section.rest_shape is None
-            or any(constant.name in file.parameters for constant in NATURAL_STRAINS)
-        ),
+        and _natural_curvature(section, file.parameters),
     )
     size = replace(size, nodes=len(body.nodes.points_m))
     require_feasible(replace(size, substeps=1), say)
@@ -359,20 +358,38 @@ def _locate_in_table(path: Path, table: str, odd: Sequence[str] = ()) -> Iterato
         raise InputError("; ".join([*odd, error.message]), source, where=where) from error
 
 
+def _natural_curvature(section: ObjectSection, parameters: Sections) -> NaturalCurvature:
+    """Return which natural curvatures a rod has, by the parameters that are stated."""
+    stated = {without_region(name) for name in parameters}
+    if any(constant.name in stated for constant in NATURAL_ENDS):
+        return "affine"
+    return section.rest_shape is None or any(each.name in stated for each in NATURAL_STRAINS)
+
+
 def _with_natural_strains(parameters: Sections, body: Body) -> Sections:
     """Return parameters with all natural curvatures and twists of a rod: zero beside a stated one,
-    and estimated with a prior where neither they nor the rest shape are stated.
+    at the end as at the beginning, and estimated with a prior where neither they nor the rest shape
+    are stated.
     """
     names = [[*body.constants][k] for k in body.natural_strain_indices]
     if not names:
         return parameters
     missing: ParameterSection | float = 0.0
-    if not any(name in parameters for name in names):
+    if not any(name in parameters or without_region(name) in parameters for name in names):
         assert isinstance(body.mesh, RodMesh)
         deviation = ROD_CURVATURE / float(body.mesh.s_m[-1])
         prior = {"mean": 0.0, "deviation": deviation}
         missing = ParameterSection.model_validate({"guess": 0.0, "prior": prior})
-    return dict(parameters) | {name: missing for name in names if name not in parameters}
+    complete = dict(parameters)
+    for name in names:
+        if name not in complete and without_region(name) not in parameters:
+            start = name.replace("_end_1_m", "_1_m")
+            start = start if start in complete else without_region(start)
+            given = complete.get(start, missing)
+            if start in complete and isinstance(given, ParameterSection) and given.fixed is None:
+                given = ParameterSection.model_validate({"tied_to": start})
+            complete[name] = given
+    return complete
 
 
 def _stations_m(file: ProblemFile) -> list[float]:
@@ -506,7 +523,7 @@ def fibres_of(section: ObjectSection | RegionSection, where: str) -> Fibres | No
 
 
 def _load_body(
-    section: ObjectSection, mesh: TetMesh, code: CodeLoader, natural_curvature: bool
+    section: ObjectSection, mesh: TetMesh, code: CodeLoader, natural_curvature: NaturalCurvature
 ) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 

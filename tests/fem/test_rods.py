@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import collocation_sysid as cs
 from collocation_sysid.errors import InputError
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.laws.constants import NaturalCurvature
 from collocation_sysid.kinds.rod.element import CrossSection, RodMesh, rod_mesh
 from collocation_sysid.testing.property_check import PropertyCheck
 
@@ -23,6 +24,8 @@ STRIP = CrossSection.rectangle(0.012, 0.007)
 SECTIONS = {"round": ROUND, "hose": HOSE, "rectangle": STRIP}
 HOMOGENEOUS = {"young_pa": 3e6, "poisson": 0.35}
 NATURAL = {"curvature_1_1_m": 1.0, "curvature_2_1_m": -2.0, "twist_1_m": 0.5}
+ENDS = {"curvature_1_end_1_m": -0.5, "curvature_2_end_1_m": 0.7, "twist_end_1_m": 1.5}
+CURVATURES = {False: {}, True: NATURAL, "affine": NATURAL | ENDS}
 LAWS = {"rod": HOMOGENEOUS, "cable": CABLE}
 DAMPED = {"gamma_r_s": 0.02, "gamma_m_1_s": 0.3}
 
@@ -32,7 +35,7 @@ def body(
     law: str = "rod",
     damping: str = "kelvin-voigt",
     evaluator: str = "auto",
-    natural_curvature: bool = False,
+    natural_curvature: NaturalCurvature = False,
 ) -> Body:
     return Body(
         bent(),
@@ -44,8 +47,8 @@ def body(
     )
 
 
-def constants_of(law: str, natural_curvature: bool = False) -> dict[str, float]:
-    return LAWS[law] | (NATURAL if natural_curvature else {})
+def constants_of(law: str, natural_curvature: NaturalCurvature = False) -> dict[str, float]:
+    return LAWS[law] | CURVATURES[natural_curvature]
 
 
 def deformed(rod: Body, rng: np.random.Generator) -> np.ndarray:
@@ -69,7 +72,7 @@ def test_a_rod_at_rest_has_no_force_and_resists_every_strain(section, law):
         assert spectrum[6] > 1e3 * np.abs(spectrum[:6]).max()
 
 
-@pytest.mark.parametrize("natural_curvature", [False, True])
+@pytest.mark.parametrize("natural_curvature", CURVATURES)
 @pytest.mark.parametrize("law", LAWS)
 def test_a_rigid_motion_rotates_the_force_and_keeps_the_energy(law, natural_curvature, rng):
     rod, constants = (
@@ -84,7 +87,7 @@ def test_a_rigid_motion_rotates_the_force_and_keeps_the_energy(law, natural_curv
     assert rod.energy(moved, **constants) == pytest.approx(rod.energy(x, **constants), rel=1e-12)
 
 
-@pytest.mark.parametrize("natural_curvature", [False, True])
+@pytest.mark.parametrize("natural_curvature", CURVATURES)
 @pytest.mark.parametrize("law", LAWS)
 def test_elastic_forces_of_a_rod_balance(law, natural_curvature, rng):
     rod = body(law, natural_curvature=natural_curvature)
@@ -95,7 +98,7 @@ def test_elastic_forces_of_a_rod_balance(law, natural_curvature, rng):
 
 
 @pytest.mark.parametrize("damping", ["kelvin-voigt", "rayleigh"])
-@pytest.mark.parametrize("natural_curvature", [False, True])
+@pytest.mark.parametrize("natural_curvature", CURVATURES)
 @pytest.mark.parametrize("law", LAWS)
 def test_derivatives_of_rods(law, natural_curvature, damping):
     """First and second derivatives by positions, velocities and constants, and the energy."""
@@ -131,7 +134,7 @@ def test_both_evaluators_of_rods_agree(law, damping, rng):
             assert relative_error(found[1][name], expected) < 1e-11, name
 
 
-@pytest.mark.parametrize("natural_curvature", [False, True])
+@pytest.mark.parametrize("natural_curvature", CURVATURES)
 @pytest.mark.parametrize("evaluator", ["casadi", "simd"])
 @pytest.mark.parametrize("law", LAWS)
 def test_resultants_turn_with_a_rod(law, evaluator, natural_curvature, rng):

@@ -117,6 +117,62 @@ def test_a_cable_that_is_bent_by_itself_is_identified_unless_it_is_stated_to_be_
     assert any("rest shape" in each.message for each in wrong.trust.concerns)
 
 
+ENDS = {"curvature_1_1_m": 1.0, "curvature_1_end_1_m": -1.5}
+
+
+def test_the_end_of_a_natural_curvature_is_as_its_beginning_unless_it_is_stated(problem):
+    changed(problem, 'name = "swing"', 'name = "swing"\nwindow_s = [0.0, 0.1]')
+    changed(
+        problem, "gamma_m_1_s  = {}", "gamma_m_1_s  = {}\ncurvature_1_1_m = {}\ntwist_1_m = 0.2"
+    )
+    constant = cs.Problem.read(problem)
+    changed(problem, "twist_1_m = 0.2", "twist_1_m = 0.2\ncurvature_2_end_1_m = 0.0")
+    affine = cs.Problem.read(problem)
+    assert {item.name for item in affine.parameters.free} == TRUTH.keys() | {"curvature_1_1_m"}
+    ties = {item.name: item.tied.to for item in affine.parameters.components if item.tied}
+    assert ties == {"curvature_1_end_1_m": "curvature_1_1_m"}
+    (twist,) = (item for item in affine.parameters.components if item.name == "twist_end_1_m")
+    assert twist.is_fixed
+    assert twist.guess == 0.2
+    known = TRUTH | {"torsion_n_m2": 3e-4, "axial_n": 200.0, "curvature_2_1_m": 0.0}
+    known |= {"curvature_1_1_m": 1.0, "twist_1_m": 0.2}
+    ends = {"curvature_1_end_1_m": 1.0, "curvature_2_end_1_m": 0.0, "twist_end_1_m": 0.2}
+    uniform_m = cs.simulate(constant.experiments[0], known).markers_m
+    assert (
+        np.abs(cs.simulate(affine.experiments[0], known | ends).markers_m - uniform_m).max() < 1e-9
+    )
+
+
+def test_a_region_alone_may_have_a_natural_curvature(problem):
+    with_region(problem, "s_m = [0.3, 0.6]")
+    changed(problem, "[parameters]", '[parameters]\n"core.curvature_1_1_m" = {}')
+    parameters = cs.Problem.read(problem).parameters
+    assert {item.name for item in parameters.free} == TRUTH.keys() | {"core.curvature_1_1_m"}
+
+
+@pytest.mark.long
+def test_a_natural_curvature_that_is_affine_is_identified(problem):
+    changed(problem, "sections = 41", "sections = 21")
+    changed(problem, 'name = "swing"', 'name = "swing"\nwindow_s = [0.0, 1.5]')
+    unknown = "".join(f"\n{name} = {{}}" for name in ENDS)
+    changed(problem, "gamma_m_1_s  = {}", "gamma_m_1_s  = {}" + unknown)
+    (experiment,) = cs.Problem.read(problem).experiments
+    zero = dict.fromkeys(
+        ["curvature_2_1_m", "curvature_2_end_1_m", "twist_1_m", "twist_end_1_m"], 0.0
+    )
+    constants = TRUTH | ENDS | zero | {"torsion_n_m2": 3e-4, "axial_n": 200.0}
+    tracks_m = cs.simulate(experiment, constants).markers_m
+    noise_m = np.random.default_rng(5).normal(scale=5e-4, size=tracks_m.shape)
+    names = experiment.markers.names
+    write_markers_csv(problem.parent / "markers.csv", experiment.t_s, names, tracks_m + noise_m)
+    wrench = 'wrench = { file = "wrench.csv", sigma_n = 0.01, sigma_nm = 0.001, frame = "world" }'
+    run = cs.run(cs.Problem.read(changed(problem, wrench, "")))
+    assert run.trust.verdict == "good"
+    for name, true in (TRUTH | ENDS).items():
+        low, high = run.interval(name)
+        assert low <= true <= high
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -190,6 +246,7 @@ def with_region(problem, cells: str):
 
 
 def test_a_region_between_arc_lengths_is_that_of_its_cell_numbers(problem):
+    changed(problem, 'name = "swing"', 'name = "swing"\nwindow_s = [0.0, 0.1]')
     text = problem.read_text(encoding="utf-8")
     stated = cs.Problem.read(with_region(problem, "s_m = [0.05, 0.3]"))
     s_m = stated.bodies[0].mesh.s_m

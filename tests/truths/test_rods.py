@@ -33,6 +33,7 @@ from scipy.spatial.transform import Rotation
 
 import collocation_sysid as cs
 from collocation_sysid.fem.body import Body
+from collocation_sysid.fem.laws.constants import NATURAL_ENDS, NATURAL_STRAINS
 from collocation_sysid.fem.meshes.structured import box_mesh
 from collocation_sysid.fem.pattern import dofs_of
 from collocation_sysid.kinds.rod.element import CrossSection, rod_mesh
@@ -213,6 +214,40 @@ def test_natural_curvature_alone_makes_a_circle():
     )
     np.testing.assert_allclose(tip(x), 0.0, atol=0.005)
     assert curved.energy(x, **constants) < 1e-9
+
+
+def test_natural_curvature_that_is_affine_makes_a_spiral():
+    """An arc of Euler's spiral, whose tangent has turned by κ₀ s + (κ₁ − κ₀) s²/2L at s."""
+    begin, end, length_m = 2.0, 9.0, 0.6
+    zero = {"curvature_2_1_m": 0.0, "twist_1_m": 0.0}
+    zero |= {"curvature_2_end_1_m": 0.0, "twist_end_1_m": 0.0}
+    s_m = np.linspace(0, length_m, 2001)
+    angle = begin * s_m + (end - begin) * s_m**2 / (2 * length_m)
+    along, across = np.trapezoid([np.cos(angle), np.sin(angle)], s_m)
+    counts, errors = np.array([11, 21, 41]), []
+    for count in counts:
+        curved = cable(straight(length_m, THIN, count), natural_curvature="affine")
+        ends = {"curvature_1_1_m": begin, "curvature_1_end_1_m": end}
+        x = rest_shape_under(clamped(curved), **CABLE, **ends, **zero)
+        side = np.cross(directors(curved.mesh, curved.nodes_m)[0, 0], [1.0, 0.0, 0.0])
+        errors.append(np.linalg.norm(tip(x) - along * np.array([1.0, 0.0, 0.0]) - across * side))
+    assert errors[-1] < 5e-4
+    assert observed_order(1 / (counts - 1), errors) == pytest.approx(2, abs=0.2)
+
+
+def test_a_straight_part_and_a_region_whose_curvature_grows():
+    """The angle at the tip is the mean natural curvature of the region times its length."""
+    region = cs.Region("drum", cs.Along(0.2, 0.6))
+    mesh = rod_mesh([[0, 0, 0], [0.6, 0, 0]], THIN, 31, stations_m=[0.2])
+    curved = cable(mesh, natural_curvature="affine", regions=[region])
+    names = [constant.name for constant in NATURAL_STRAINS + NATURAL_ENDS]
+    drum = {"drum.curvature_1_1_m": 1.0, "drum.curvature_1_end_1_m": 4.0}
+    x = rest_shape_under(clamped(curved), **CABLE, **dict.fromkeys(names, 0.0), **drum)
+    d1, d2 = directors(mesh, x)[-1]
+    turned = np.arccos(np.cross(d1, d2)[0])
+    assert turned == pytest.approx(2.5 * 0.4, rel=1e-3)
+    straight_m = centres(x)[mesh.s_m < 0.2 + 1e-9]
+    np.testing.assert_allclose(straight_m[:, 1:], 0.0, atol=1e-9)
 
 
 def test_natural_curvature_and_twist_make_a_helix():

@@ -79,13 +79,16 @@ class Chain:
         rest = np.zeros((len(lengths), 3))
         if not mesh.is_straight_at_rest:
             rest = hinge_angles(body.body.nodes_m, sections)
-        natural = law.natural_strains(values)[[2, 0, 1]]
+        if law.natural_curvature:
+            shares = mesh.s_m[sections[:-1], None] / mesh.s_m[-1]
+            natural = law.natural_strains(np.array(values), shares)
+            rest = rest + between[:, None] * natural[:, [2, 0, 1]]
         return cls(
             lengths,
             masses,
             inertias,
             stiffness_nm=stiffness / between[:, None],
-            rest_rad=rest + between[:, None] * natural,
+            rest_rad=rest,
             gamma_r_s=region.gamma_r_s,
             gamma_m_1_s=region.gamma_m_1_s,
             sections=sections,

@@ -155,7 +155,7 @@ def _curve_limitations(body: IdentifiedBody) -> list[str]:
     assert isinstance(law, RodMaterial)
     about_1, about_2 = law.section.moments_m4
     is_round = np.isclose(about_1, about_2, atol=0)
-    return [CURVE_NATURAL] * law.has_natural_curvature + [CURVE_ROUND] * (not is_round)
+    return [CURVE_NATURAL] * bool(law.natural_curvature) + [CURVE_ROUND] * (not is_round)
 
 
 def _add_curve(pxr: Any, stage: Any, body: IdentifiedBody, start_positions_m: Array) -> None:

@@ -346,6 +346,17 @@ NATURAL_STRAINS = tuple(
         ("twist_1_m", "τ", "natural twist"),
     )
 )
+NaturalCurvature = bool | Literal["affine"]
+# Of natural strains that are affine in the arc length; those above are then at the beginning.
+NATURAL_ENDS = tuple(
+    replace(
+        constant,
+        name=constant.name.replace("_1_m", "_end_1_m"),
+        symbol=f"{constant.symbol} end",
+        meaning=f"{constant.meaning} at the end",
+    )
+    for constant in NATURAL_STRAINS
+)
 INSTANTANEOUS = Constant(
     "instantaneous_young_pa", "E₀", meaning="instantaneous Young's modulus, before relaxation"
 )
@@ -386,6 +397,7 @@ KNOWN: Mapping[str, Constant] = {
         TORSION,
         AXIAL,
         *NATURAL_STRAINS,
+        *NATURAL_ENDS,
         INSTANTANEOUS,
     )
 }

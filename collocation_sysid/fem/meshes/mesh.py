@@ -21,6 +21,7 @@ from ...common.validated_classes import validated
 from ...errors import InputError
 from ...kinds.kind import SOLID, Kind
 from ..elements import Element, element_named, reference_geometry
+from ..laws.constants import NaturalCurvature
 from .checks import (
     MeshQuality,
     boundary_of,
@@ -309,8 +310,10 @@ class TetMesh:
         """Return the nodes of the elements of a kind: corners, and mid nodes if it has any."""
         return ElementNodes.for_element(self, element)
 
-    def geometry(self, nodes: ElementNodes, element: Element) -> Array:
-        """Return shape gradients and volumes, see `elements.reference_geometry`."""
+    def geometry(self, nodes: ElementNodes, element: Element, parts: Sequence[Index]) -> Array:
+        """Return shape gradients and volumes, see `elements.reference_geometry`, of a body with
+        these elements in each of its parts.
+        """
         return reference_geometry(nodes.points_m, nodes.cells, element=element)
 
     def geometry_at(self, positions_m: Array, cells: Index, geometry: Array) -> Array:
@@ -333,7 +336,7 @@ class TetMesh:
         return geometry
 
     def element_and_law(
-        self, element: str, material: Any, natural_curvature: bool
+        self, element: str, material: Any, natural_curvature: NaturalCurvature
     ) -> tuple[Element, Any]:
         """Return the element and the law of a body with this mesh, by the arguments of `Body`."""
         if natural_curvature:

@@ -110,7 +110,7 @@ def on_mesh(
         rest_shape=rest_shape,
         made=body.made,
         mesh_from=body.mesh_from,
-        natural_curvature=getattr(rest.material, "has_natural_curvature", False),
+        natural_curvature=getattr(rest.material, "natural_curvature", False),
         evaluator=body.evaluator,
         threads=body.threads,
     )

@@ -30,7 +30,7 @@ def _size(at: ExperimentAtAnswer, _: int) -> Effect:
             material=rod_material(
                 part.material.name,
                 part.material.section.scaled(larger),
-                part.material.has_natural_curvature,
+                part.material.natural_curvature,
             ),
         )
         for part in body.parts

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache, cached_property, lru_cache
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -38,7 +38,17 @@ from ...common.validated_classes import validated
 from ...common.validated_types import Positive
 from ...errors import InputError
 from ...fem.elements import ROD, Element
-from ...fem.laws.constants import AXIAL, BENDING, NATURAL_STRAINS, POISSON, TORSION, YOUNG, Constant
+from ...fem.laws.constants import (
+    AXIAL,
+    BENDING,
+    NATURAL_ENDS,
+    NATURAL_STRAINS,
+    POISSON,
+    TORSION,
+    YOUNG,
+    Constant,
+    NaturalCurvature,
+)
 from ...fem.laws.materials import StrainMaterial
 from ...fem.meshes.mesh import ElementNodes, TetMesh
 from . import KIND
@@ -54,8 +64,9 @@ ROD_CURVATURE = 0.5
 _ANGLES = 2 * np.pi / 3 * np.arange(3)
 # Centre and directors of a section from its nodes: rows for r, h₁ d₁ and h₂ d₂.
 _DIRECTORS = np.stack([np.full(3, 1 / 3), 2 / 3 * np.cos(_ANGLES), 2 / 3 * np.sin(_ANGLES)])
-# Of the rest shape a point has half the length of its element, then the strains.
-COLUMNS, STRAINS = ROD.columns, ROD.rest_values - 1
+# Of the rest shape a point has half the length of its element, the share of the length of its region
+# that is before it, then the strains.
+COLUMNS, STRAINS = ROD.columns, ROD.rest_values - 2
 RESULTANTS = ROD.stresses  # with those of both sections
 
 
@@ -245,17 +256,25 @@ class RodMesh(TetMesh):
         cells = 3 * np.arange(len(self.s_m) - 1)[:, None] + np.arange(6)
         return ElementNodes(self, self.points_m, cells=cells, ends=np.empty((0, 2), dtype=np.int64))
 
-    def geometry(self, nodes: ElementNodes, element: Element) -> Array:
-        return self.geometry_at(nodes.points_m, nodes.cells)
+    def geometry(self, nodes: ElementNodes, element: Element, parts: Sequence[Index]) -> Array:
+        shares = np.empty(len(nodes.cells))
+        for cells in parts:
+            first, last = self.s_m[cells.min()], self.s_m[cells.max() + 1]
+            middles = (self.s_m[cells] + self.s_m[cells + 1]) / 2
+            shares[cells] = (middles - first) / (last - first)
+        return self._geometry(nodes.points_m, nodes.cells, shares)
 
-    def geometry_at(self, positions_m: Array, cells: Index, geometry: Array | None = None) -> Array:
-        """Return the geometry, see `rod_geometry`, with nodes (n, 3) at other positions [m]."""
+    def geometry_at(self, positions_m: Array, cells: Index, geometry: Array) -> Array:
+        return self._geometry(positions_m, cells, geometry[:, 0, -2 - STRAINS])
+
+    def _geometry(self, positions_m: Array, cells: Index, shares: Array) -> Array:
+        """Return the geometry, see `rod_geometry`, with nodes (n, 3) at any positions [m]."""
         straight_m = None
         if self.is_straight_at_rest:
             centres = centres_of_sections(positions_m)
             changed = np.linalg.norm(np.diff(centres, axis=0), axis=1) / self.lengths_m
             straight_m = np.diff(self.s_m) * changed
-        return rod_geometry(positions_m, cells, self.section.area_m2, straight_lengths_m=straight_m)
+        return rod_geometry(positions_m, cells, self.section.area_m2, shares, straight_m)
 
     def partly_straightened(self, cells: Index, geometry: Array, share: float) -> Array:
         if share == 1 or not self.is_straight_at_rest:
@@ -267,7 +286,7 @@ class RodMesh(TetMesh):
         return straightened
 
     def element_and_law(
-        self, element: str, material: object, natural_curvature: bool
+        self, element: str, material: object, natural_curvature: NaturalCurvature
     ) -> tuple[Element, RodMaterial]:
         """Return the element of rods and the law; that of `Body`'s default is "rod".
 
@@ -370,10 +389,14 @@ def rod_mesh(
 
 
 def rod_geometry(
-    points_m: Array, cells: Index, area_m2: float, straight_lengths_m: Array | None = None
+    points_m: Array,
+    cells: Index,
+    area_m2: float,
+    shares: Array,
+    straight_lengths_m: Array | None = None,
 ) -> Array:
-    """Return the shape gradients of G, half the length, the strains at rest and the volume of each
-    element (E, 1, 6 · 5 + 1 + 6 + 1).
+    """Return the shape gradients of G, half the length, the share of the region before it, the
+    strains at rest and the volume of each element (E, 1, 6 · 5 + 2 + 6 + 1).
 
     Parameters
     ----------
@@ -382,6 +405,8 @@ def rod_geometry(
     cells : (E, 6)
     area_m2 : float
         Area of the section.
+    shares : (E,)
+        Share of the length of the region before the middle of each element.
     straight_lengths_m : (E,), optional
         Lengths of the elements of a rod that is straight at rest, if its nodes are not.
     """
@@ -402,8 +427,8 @@ def rod_geometry(
     if straight_lengths_m is None:
         strains = _strains_of_shape(points_m[cells], gradients)
     volumes = (area_m2 * lengths)[:, None]
-    halves = lengths[:, None] / 2
-    return np.hstack([gradients.reshape(len(cells), -1), halves, strains, volumes])[:, None]
+    places = np.stack([lengths / 2, shares], axis=1)
+    return np.hstack([gradients.reshape(len(cells), -1), places, strains, volumes])[:, None]
 
 
 def _strains_of_shape(ends_m: Array, gradients: Array) -> Array:
@@ -545,30 +570,31 @@ class RodMaterial(StrainMaterial):
         "rod": Young's modulus and Poisson's ratio of a homogeneous section; "cable": bending,
         torsional and axial stiffness of a composite one, equal about both axes.
     section : CrossSection
-    has_natural_curvature : bool
-        Whether natural curvature and twist, uniform along the rod, are constants beside the rest
-        shape.
+    natural_curvature : bool or "affine"
+        Whether natural curvature and twist, uniform along the rod or affine in the arc length of a
+        region, are constants beside the rest shape.
     """
 
     section: CrossSection
-    has_natural_curvature: bool
+    natural_curvature: NaturalCurvature
 
     def __init__(
-        self, law: RodLaw, section: CrossSection, has_natural_curvature: bool = False
+        self, law: RodLaw, section: CrossSection, natural_curvature: NaturalCurvature = False
     ) -> None:
-        constants = LAWS[law] + (NATURAL_STRAINS if has_natural_curvature else ())
+        constants = LAWS[law] + (NATURAL_STRAINS if natural_curvature else ())
+        constants += NATURAL_ENDS if natural_curvature == "affine" else ()
         for name, value in (
             ("name", law),
             ("energy", strains_of),
             ("constants", constants),
             ("section", section),
-            ("has_natural_curvature", has_natural_curvature),
+            ("natural_curvature", natural_curvature),
         ):
             object.__setattr__(self, name, value)
 
     def psi(self, F: ca.SX, values: ca.SX) -> ca.SX:
         """Return the energy per volume [J/m³] at G (3, 5), from the constants, then half the
-        length, the strains at rest (6,) and the volume of the element.
+        length, the share before it, the strains at rest (6,) and the volume of the element.
         """
         stiffness, strain = self._all_strains(F, values)
         return ca.dot(stiffness, strain**2) / (2 * self.section.area_m2)
@@ -615,9 +641,12 @@ class RodMaterial(StrainMaterial):
         """Return them with those of both sections (12,)."""
         return np.array(ca.evalf(self._all_stiffnesses(ca.SX(ca.DM(list(values)))))).ravel()
 
-    def natural_strains(self, values: Sequence[float]) -> Array:
-        """Return the natural curvatures and twist (3,) [1/m] from the constants (c,)."""
-        return np.array(values[-3:] if self.has_natural_curvature else [0.0] * 3)
+    def natural_strains(self, values: Any, share: Any) -> Any:
+        """Return the natural curvatures and twist (3,) [1/m] after a share of the length, from the
+        constants (c,); numbers, or CasADi expressions.
+        """
+        own = values[len(LAWS[self.name]) : len(self.constants)]
+        return own[:3] + share * (own[-3:] - own[:3])
 
     def _stiffness(self, values: ca.SX) -> ca.SX:
         """Return (GA, GA, EA, EI₁, EI₂, GJ)."""
@@ -654,17 +683,17 @@ class RodMaterial(StrainMaterial):
     def _strain(self, G: ca.SX, values: ca.SX) -> ca.SX:
         rest = values[values.numel() - STRAINS - 1 : values.numel() - 1]
         natural = ca.SX(STRAINS, 1)
-        if self.has_natural_curvature:
-            natural[3:] = values[len(self.constants) - 3 : len(self.constants)]
+        if self.natural_curvature:
+            natural[3:] = self.natural_strains(values, values[len(self.constants) + 1])
         return strains_of(G) - rest - natural
 
 
 @lru_cache(64)
 def rod_material(
-    law: RodLaw, section: CrossSection, has_natural_curvature: bool = False
+    law: RodLaw, section: CrossSection, natural_curvature: NaturalCurvature = False
 ) -> RodMaterial:
     """Return the law of a rod; equal arguments give the same object, so that kernels are shared."""
-    return RodMaterial(law, section, has_natural_curvature)
+    return RodMaterial(law, section, natural_curvature)
 
 
 def _by_arc_length(points: Array, steps_m: Array) -> tuple[scipy.interpolate.CubicSpline, Array]:
