@@ -218,9 +218,7 @@ def run(
                 answer = replace(answer, profiles=profiles)
                 answer = _with_added_measurements(answer, say)
                 answer = _with_offset_notes(answer, fit)
-            fitted = answer.solution.collocation.experiments
-            are_specimens = all(each.specimen for each in fitted)
-            if seek_causes and (are_specimens or not answer.is_consistent):
+            if seek_causes:
                 from .judge.engine import cause_notes, find_misspecifications
 
                 if not answer.is_consistent:

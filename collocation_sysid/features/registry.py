@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import replace
 
 from ..kinds.kind import Kind
@@ -18,8 +18,8 @@ for _kind in KINDS:
         TOPICS[_key] = replace(TOPICS[_key], messages=_messages)
 
 
-def present(experiments: Iterable[Experiment]) -> list[Kind]:
-    """Return the kinds of which experiments have a measurement, an obstacle or a specimen."""
+def present(experiments: Collection[Experiment]) -> list[Kind]:
+    """Return the kinds of which experiments have a body, a measurement, an obstacle or a specimen."""
     declared = (each for e in experiments for each in (*e.measurements, *e.obstacles, e.specimen))
-    found = {kind_of(each) for each in declared}
+    found = {e.body.kind for e in experiments}.union(map(kind_of, declared))
     return [kind for kind in KINDS if kind in found]

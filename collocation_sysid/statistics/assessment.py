@@ -149,7 +149,7 @@ def cause_concerns(causes: Iterable[Hypothesis]) -> list[Concern]:
     return [
         (
             each
-            if f"description/{each.code}" in OPEN_CAUSES
+            if f"description/{each.cause}" in OPEN_CAUSES
             else replace(each, subject=f"likely: {each.subject}")
         ).concern("doubtful" if each.strength > AS_GOOD_AS_CERTAIN else "check")
         for each in causes

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from ..kind import Kind, lazy
 
+MESSAGES = {
+    "description/several/mirror": "a mirror image of the rod fits as well, with {found} instead of "
+    "{stated}, so that the data do not determine which: state one of these natural curvatures, or "
+    "measure a marker across the plane of the others"
+}
+
 
 class Rod(Kind):
     """Rods, cables and hoses."""
@@ -24,6 +30,8 @@ class Rod(Kind):
     effects = lazy(".effects", "ROWS")
     other_effects = lazy(".effects", "OTHERS")
     doubts = lazy(".doubts", "ROWS")
+    consistent = lazy(".doubts", "mirror_images")
+    messages = MESSAGES
 
 
 KIND = Rod()
