@@ -333,7 +333,7 @@ def gripper_markers(section: ExperimentSection) -> set[str]:
     """Return the names of the markers from which poses of grasps and obstacles are computed; empty
     if there are none.
     """
-    return {name for moved in section.moved_sections for name in moved.markers or ()}
+    return {name for moved in section.moved_sections for name in moved.cluster}
 
 
 def read_marker_tracks(section: ExperimentSection, file: Path) -> MarkerTable:
@@ -420,10 +420,12 @@ def poses_from_markers(
     InputError
         If the fit is not possible.
     """
-    assert grasp.markers is not None
-    names = list(grasp.markers)
-    reference_m = np.array([grasp.markers[name] for name in names])
+    names = list(grasp.cluster)
+    reference_m = np.array([*grasp.cluster.values()])
     tracks = table.positions_m[:, [table.names.index(name) for name in names]]
+    if grasp.two_points:
+        known = PoseSequence.from_two_points(table.t_s, tracks, reference_m, grasp.interpolation)
+        return known, []
     fit = fit_poses(reference_m, tracks, weights=[grasp.weights.get(name, 1.0) for name in names])
     poses = replace(fit.poses(table.t_s), interpolation=grasp.interpolation)
     first_s, last_s = window_s or (-np.inf, np.inf)

@@ -213,8 +213,9 @@ class RecordingReader:
         are constant. `gripper_to_body` and the interpolation of the section are applied.
         """
         grasp = self.section.moved_sections[k]
-        if grasp.markers is not None:
-            return self._poses_from_markers(grasp, self._grasp_key(k, "markers"))
+        if grasp.cluster:
+            key = self._grasp_key(k, "two_points" if grasp.two_points else "markers")
+            return self._poses_from_markers(grasp, key)
         if isinstance(grasp, GraspSection) and grasp.displacements is not None:
             key = self._grasp_key(k, "displacements")
             file = existing_file(self.folder, grasp.displacements, key=key)
@@ -249,7 +250,7 @@ class RecordingReader:
                 "markers.file, or poses"
             )
             raise InputError(message, where=key)
-        _require_known_markers(grasp.markers or (), self._marker_tracks.names, key=key)
+        _require_known_markers(grasp.cluster, self._marker_tracks.names, key=key)
         with located(where=key):
             poses, notes = poses_from_markers(
                 grasp, self._marker_tracks, window_s=self.section.window_s

@@ -230,6 +230,8 @@ class MovedSection(Section):
     markers : mapping of name to (3,) array, optional
         Position [x, y, z] in the frame of the undeformed body of each marker on the gripper or
         obstacle, by name; the poses are fitted to the tracks of these markers.
+    two_points : mapping of name to (3,) array, optional
+        The same of two markers alone: the rotation about their line is that of least twist.
     weights : mapping of name to float
         Weight of each marker in `markers` in the fit of the poses, by name; 1 by default.
     gripper_to_body : TransformSection, optional
@@ -245,20 +247,23 @@ class MovedSection(Section):
     quaternion: Literal["xyzw", "wxyz"] | None = None
     length_unit: Unit | None = None
     markers: dict[str, Vector] | None = None
+    two_points: dict[str, Vector] | None = None
     weights: dict[str, NotNegative] = Field(default_factory=dict)
     gripper_to_body: TransformSection | None = None
     interpolation: Literal["smooth", "linear", "hold"] = "smooth"
 
     @model_validator(mode="after")
     def _require_one_source(self) -> MovedSection:
-        sources = used_keys(self, "poses", "displacement", "markers")
+        sources = used_keys(self, "poses", "displacement", "markers", "two_points")
         if len(sources) > 1:
             raise ValueError(f"found {' and '.join(sources)}; expected one of them")
-        if self.gripper_to_body is not None and self.markers is not None:
+        if self.gripper_to_body is not None and self.cluster:
             raise ValueError(
-                "found gripper_to_body and markers; expected no gripper_to_body, because the "
-                "positions in markers already refer to the undeformed body"
+                f"found gripper_to_body and {sources[0]}; expected no gripper_to_body, because the "
+                f"positions in {sources[0]} already refer to the undeformed body"
             )
+        if self.two_points is not None and len(self.two_points) != 2:
+            raise ValueError(f"found {len(self.two_points)} in two_points; expected two")
         for section, keys in (
             ("poses", ("quaternion", "length_unit", "gripper_to_body")),
             ("markers", ("weights",)),
@@ -275,6 +280,11 @@ class MovedSection(Section):
                     f"found {name!r} in weights; expected names among {', '.join(names)}"
                 )
         return self
+
+    @property
+    def cluster(self) -> dict[str, Vector]:
+        """Markers on the gripper or obstacle, with their places."""
+        return self.markers or self.two_points or {}
 
 
 class GraspSection(MovedSection, of=Grasp):
@@ -297,7 +307,7 @@ class GraspSection(MovedSection, of=Grasp):
 
     @model_validator(mode="after")
     def _require_deviation(self) -> GraspSection:
-        others = used_keys(self, "poses", "displacement", "markers")
+        others = used_keys(self, "poses", "displacement", "markers", "two_points")
         if self.displacements is not None and (others or self.sigma_m is None):
             found = f"together with {others[0]}" if others else "without sigma_m"
             raise ValueError(

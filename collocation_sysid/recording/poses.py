@@ -47,6 +47,8 @@ _LEAST_JUMP_SHARE = 1e-3
 LONGEST_STEP_S = 1.0
 # Largest difference of the poses of a grasp at rest, in metres and in a quaternion's components.
 LARGEST_REST_DIFFERENCE = 1e-6
+# Largest relative change of the distance of two points of a rigid body, in nine of ten samples.
+_LARGEST_CHANGE = 0.1
 # Measured places nearest to a node that determine its displacement.
 _NEAREST_PLACES = 50
 # Relative spread of places along a direction below which they have no gradient along it.
@@ -209,6 +211,61 @@ class PoseSequence:
         return cls(
             times, motions[:, :3, 3], quaternions_xyzw=quaternions, interpolation=interpolation
         )
+
+    @classmethod
+    @validated
+    def from_two_points(
+        cls,
+        t_s: ArrayLike,
+        points_m: ArrayLike,
+        reference_m: ArrayLike,
+        interpolation: Interpolation = "smooth",
+    ) -> PoseSequence:
+        """Return the poses of a gripper of which two points were measured.
+
+        They do not show the rotation about their line, which is that of least twist: the smallest
+        rotation from the undeformed body to the first sample, and from each sample to the next.
+
+        Parameters
+        ----------
+        points_m : (m, 2, 3) array
+            Measured positions at the times `t_s` (m,); samples with NaN are left out.
+        reference_m : (2, 3) array
+            Places of the points on the undeformed body.
+
+        Raises
+        ------
+        InputError
+            If the points coincide, their distance changes, or no sample has both.
+        """
+        times = read_only_floats(t_s, (None,), name="t_s of the poses", finite=False)
+        measured = read_only_floats(points_m, (len(times), 2, 3), name="points_m", finite=False)
+        reference = read_only_floats(reference_m, (2, 3), name="reference_m")
+        known = np.isfinite(measured).all(axis=(1, 2))
+        if not known.any():
+            raise InputError("found no sample with both points; expected at least one")
+        places = np.concatenate([reference[None], measured[known]])
+        lines = places[:, 1] - places[:, 0]
+        lengths_m = np.linalg.norm(lines, axis=1)
+        length_m = float(lengths_m[0])
+        if not length_m > 0:
+            raise InputError("found two points at the same place; expected two that are apart")
+        if np.quantile(np.abs(lengths_m[1:] - length_m), 0.9) > _LARGEST_CHANGE * length_m:
+            raise InputError(
+                f"the two points are {lengths_m[1:].min():.4g} to {lengths_m[1:].max():.4g} m apart, and "
+                f"{length_m:.4g} m on the undeformed body; expected the same distance, of points on "
+                "one rigid gripper: check their names, places and unit"
+            )
+        lines /= lengths_m[:, None]
+        before, after = lines[1:-1], lines[2:]
+        turns = np.column_stack([np.cross(before, after), 1 + np.sum(before * after, axis=1)])
+        rotations = [Rotation.align_vectors(lines[1], lines[0])[0]]
+        for turn in Rotation.from_quat(turns):
+            rotations.append(turn * rotations[-1])
+        whole = Rotation.concatenate(rotations)
+        middles = places.mean(axis=1)
+        shifts_m = middles[1:] - whole.apply(middles[0])
+        return cls(times[known], shifts_m, whole.as_quat(), interpolation)
 
     def after(self, first: ArrayLike | PoseSequence) -> PoseSequence:
         """Return the composition of these poses with a constant rigid motion that is applied first.

@@ -370,7 +370,7 @@ def _table_names(
         moved = section and section.moved_sections[k]
         if experiment.grasps[k].poses.deformation is not None:
             keys.append(_numbered_key("face", k))
-        elif moved is None or moved.poses is not None or moved.markers is not None:
+        elif moved is None or moved.poses is not None or moved.cluster:
             keys.append(_numbered_key("poses", k))
     bench: list[str] = []
     if section is not None and has_displacement_table(section):

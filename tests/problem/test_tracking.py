@@ -81,6 +81,48 @@ def test_markers_on_the_gripper_give_its_poses_and_are_not_fitted(tracked):
     )
 
 
+def driven_by_two(folder: Path, text: str, further: str = "") -> None:
+    driven = DRIVEN.replace("markers", "two_points") % (text, further)
+    replace_text(GRASP, driven)(folder)
+
+
+def test_two_markers_on_the_gripper_are_where_they_were_measured(tracked):
+    names = list(BASE_M)[:2]
+    table = read_markers(tracked / MARKERS)
+    tracks = table.positions_m[:, [table.names.index(name) for name in names]]
+    driven_by_two(tracked, places(names))
+    (experiment,) = load(tracked).experiments
+    reference_m = [BASE_M[name] for name in names]
+    found_m = experiment.grasps[0].poses.moved_positions(reference_m, table.t_s)
+    np.testing.assert_allclose(found_m, tracks, atol=1e-8)
+    assert not set(names) & set(experiment.markers.names)
+
+
+@pytest.mark.parametrize(
+    ("text", "further", "words"),
+    [
+        (places(list(BASE_M)[:3]), "", ["found 3 in two_points", "expected two"]),
+        (
+            places(list(BASE_M)[:2]),
+            ', poses = "swing_motion.csv"',
+            ["found poses and two_points", "expected one of them"],
+        ),
+        ("base1 = [0, 0, 0.1], base2 = [0, 0, 0.1]", "", ["grasp.two_points", "at the same place"]),
+        (
+            "base1 = [0, 0, 0.1], base2 = [0, 0, 0.3]",
+            "",
+            ["grasp.two_points", "0.08 to 0.08 m apart", "0.2 m on the undeformed body"],
+        ),
+        ("base1 = [0, 0, 0.1], bas2 = [0, 0, 0.3]", "", ["'bas2'", "did you mean 'base2'?"]),
+    ],
+)
+def test_two_points_that_are_no_gripper_are_refused(tracked, text, further, words):
+    driven_by_two(tracked, text, further)
+    with pytest.raises(InputError) as caught:
+        load(tracked)
+    assert all(word in str(caught.value) for word in words), caught.value
+
+
 def test_a_named_marker_of_the_gripper_is_fitted(tracked):
     driven_by_markers(tracked)
     experiment = load(

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from collocation_sysid.errors import InputError
-from collocation_sysid.recording import MarkerTable, align_to_template, fit_poses
+from collocation_sysid.recording import MarkerTable, PoseSequence, align_to_template, fit_poses
 from collocation_sysid.recording.rigid_fit import least_rigid_marker
 
 CLUSTER_M = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.03, 0.03, 0.06]])
@@ -190,3 +190,70 @@ def test_a_template_that_cannot_be_fitted_is_refused(rng, names, window_s, words
     template = dict(zip(names, CLUSTER_M.tolist(), strict=False))
     with pytest.raises(InputError, match=words):
         align_to_template(table, template, window_s)
+
+
+# Two points ---------------------------------------------------------------------------------------
+
+
+def turned_across(rng, frames=30) -> tuple[Rotation, np.ndarray, np.ndarray]:
+    """Small rotations from frame to frame about axes across the line of two points, from the pose of
+    the undeformed body.
+    """
+    line = CLUSTER_M[1] - CLUSTER_M[0]
+    rotations = [Rotation.identity()]
+    for vector in rng.normal(scale=0.1, size=(frames - 1, 3)):
+        now = rotations[-1].apply(line) / np.linalg.norm(line)
+        rotations.append(Rotation.from_rotvec(vector - (vector @ now) * now) * rotations[-1])
+    return Rotation.concatenate(rotations), rng.normal(size=(frames, 3)), CLUSTER_M[:2]
+
+
+def test_a_motion_that_does_not_twist_follows_from_two_points(rng):
+    rotations, shifts_m, points_m = turned_across(rng)
+    t_s = np.arange(len(rotations)) / 100
+    tracks = carried(points_m, rotations, shifts_m)
+    poses = PoseSequence.from_two_points(t_s, tracks, points_m)
+    assert_rotations(poses.quaternions_xyzw, rotations)
+    np.testing.assert_allclose(poses.positions_m, shifts_m, atol=1e-12)
+
+
+def test_the_rotation_between_two_points_does_not_twist(rng):
+    """Whatever the body did about their line."""
+    rotations, shifts_m = motion(rng, frames=9)
+    tracks = carried(CLUSTER_M[:2], rotations, shifts_m)
+    poses = PoseSequence.from_two_points(np.arange(9.0), tracks, CLUSTER_M[:2])
+    np.testing.assert_allclose(
+        poses.moved_positions(CLUSTER_M[:2], np.arange(9.0)), tracks, atol=1e-12
+    )
+    lines = np.diff(tracks, axis=1)[:, 0]
+    found = Rotation.from_quat(poses.quaternions_xyzw)
+    steps = (found[1:] * found[:-1].inv()).as_rotvec()
+    assert np.abs(np.sum(steps * lines[:-1], axis=1)).max() < 1e-9
+
+
+def test_samples_without_one_of_two_points_are_left_out(rng):
+    rotations, shifts_m, points_m = turned_across(rng)
+    t_s = np.arange(len(rotations)) / 100
+    tracks = carried(points_m, rotations, shifts_m)
+    tracks[[0, 7], [0, 1]] = np.nan
+    poses = PoseSequence.from_two_points(t_s, tracks, points_m)
+    np.testing.assert_array_equal(poses.t_s, np.delete(t_s, [0, 7]))
+    with pytest.raises(InputError, match="no sample with both points"):
+        PoseSequence.from_two_points(t_s, np.full_like(tracks, np.nan), points_m)
+
+
+def test_a_line_that_points_the_other_way_is_turned_over():
+    points_m = CLUSTER_M[:2]
+    poses = PoseSequence.from_two_points([0.0], -points_m[None], points_m)
+    np.testing.assert_allclose(poses.moved_positions(points_m, [0.0])[0], -points_m, atol=1e-12)
+
+
+def test_two_points_whose_distance_changes_are_refused(rng):
+    rotations, shifts_m, points_m = turned_across(rng)
+    tracks = carried(points_m, rotations, shifts_m)
+    noisy = tracks + rng.normal(scale=5e-4, size=tracks.shape)
+    PoseSequence.from_two_points(np.arange(30.0), noisy, points_m)
+    tracks[10:, 1] += 0.05
+    with pytest.raises(InputError, match="expected the same distance"):
+        PoseSequence.from_two_points(np.arange(30.0), tracks, points_m)
+    with pytest.raises(InputError, match="at the same place"):
+        PoseSequence.from_two_points(np.arange(30.0), tracks, points_m[[0, 0]])
