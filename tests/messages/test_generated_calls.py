@@ -71,6 +71,7 @@ def valid(name: str) -> dict[str, Any]:
         "AugmentedLagrangian": {},
         "Ball": {"center_m": (0, 0, 0), "radius_m": 0.1},
         "Body": {"mesh": mesh, "density_kg_m3": 30.0},
+        "Along": {"first_m": 0.0, "last_m": 0.1},
         "Box": {"low_m": (0, 0, 0), "high_m": (1, 1, 1)},
         "Camera": {"matrix": MATRIX, "pose": np.eye(4), "size_px": (100, 80)},
         "Capsule": {"radius_m": 0.1, "ends_m": LINE_M},
@@ -160,6 +161,11 @@ def valid(name: str) -> dict[str, Any]:
             **{"quaternions_xyzw": [(0.0, 0.0, 0.0, 1.0)] * 2},
         },
         "PoseSequence.fixed": {},
+        "PoseSequence.from_two_points": {
+            "t_s": [0.0, 1.0],
+            "points_m": np.tile(np.eye(3)[:2], (2, 1, 1)),
+            "reference_m": np.eye(3)[:2],
+        },
         "PoseSequence.from_matrices": {
             "t_s": [0.0, 1.0],
             "matrices": np.tile(np.eye(4), (2, 1, 1)),

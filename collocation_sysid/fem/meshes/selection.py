@@ -15,7 +15,7 @@ import numpy as np
 
 from ...common.checked_arrays import as_array
 from ...common.validated_classes import validated
-from ...common.validated_types import Positive, Text
+from ...common.validated_types import NotNegative, Positive, Text
 from ...errors import InputError, hint_at, require_among
 from .mesh import ElementNodes, TetMesh
 
@@ -196,8 +196,8 @@ class Along:
         Arc lengths from the beginning of the rod [m].
     """
 
-    first_m: float
-    last_m: float
+    first_m: NotNegative
+    last_m: NotNegative
 
     def __post_init__(self) -> None:
         if not self.first_m <= self.last_m:

@@ -21,13 +21,18 @@ from ...judge.doubt import Correction, Doubt
 from ...methods.reduced_space import ReducedSpace
 from ...methods.solution import Solution
 from ...methods.starts.initial_trajectories import associated_at_guess
+from ...program.experiment_iterate import ExperimentIterate
+from ...program.measured_motion import fitted_values
 from ...recording.experiment import Experiment
 from ...recording.loads import PointMass
+from ...recording.markers import Markers
 from ...statistics.hypothesis import Hypothesis
 from ...statistics.thresholds import INDISTINGUISHABLE
 from .effects import end_mass_effect, free_end
 from .element import frames_of_sections
 
+# Sum of squared changes of markers by the reflection, over the loss, above which it is no image.
+REFUTED = 10.0
 # Sweeps from the mirror image of an answer, which has the same loss where it is one.
 MOST_SWEEPS = 15
 
@@ -55,30 +60,36 @@ def mirror_images(solution: Solution, _: Mapping[str, float | None]) -> list[Hyp
     names = [name if name in free else without_region(name) for name in names]
     if not free.keys() & names:
         return []
+    centre_m, normal, directors = _plane(solution)
+    loss = solution.history[-1].loss
+    if _reflected_loss(solution.parts[0], centre_m, normal) > REFUTED * max(1.0, loss):
+        return []
     strains = body.theta_from_values(stated)[indices].reshape(-1, 3)
-    across = np.append(_normal_in_clamp(solution), 0.0)
+    across = np.append(normal @ directors, 0.0)
+    across /= np.linalg.norm(across)
     mirrored = 2 * np.outer(strains @ across, across) - strains
     image = {n: each for n, each in zip(names, mirrored.ravel(), strict=True) if n in free}
+    limit = loss + INDISTINGUISHABLE
     try:
         begun = parameters.with_estimates(free | image)
-        method = ReducedSpace(max_iterations=MOST_SWEEPS)
+        method = ReducedSpace(max_iterations=MOST_SWEEPS, largest_loss=limit)
         refit = method(associated_at_guess(solution.collocation.with_parameters(begun)))
     except (InputError, SimulationError):
         return []
     refit.unless_interrupted()
     found = refit.parameters
     returned = sum(abs(found[n] - image[n]) - abs(found[n] - stated[n]) for n in image) >= 0
-    if returned or refit.history[-1].loss > solution.history[-1].loss + INDISTINGUISHABLE:
+    if returned or not refit.history or refit.history[-1].loss > limit:
         return []
     other = [n for n in image if not np.isclose(found[n], stated[n], rtol=0.1)]
     texts = ([f"{symbol_of(n)} = {at[n]:.3g} 1/m" for n in other] for at in (found, stated))
-    data = dict(zip(("found", "stated"), texts, strict=True))
+    data: dict[str, object] = dict(zip(("found", "stated"), texts, strict=True))
     return [Hypothesis("several/mirror", data=data, strength=1.0)]
 
 
-def _normal_in_clamp(solution: Solution) -> Array:
-    """Return the components (2,) along d₁ and d₂ of the first clamp of the normal of the plane that
-    has gravity, the motion of the clamp and measured markers of the first recording.
+def _plane(solution: Solution) -> tuple[Array, Array, Array]:
+    """Return a point (3,) [m] and the normal (3,) of the plane that has gravity, the motion of the
+    clamp and measured markers of the first recording, and d₁ and d₂ (3, 2) in the clamp.
     """
     experiment, x = solution.parts[0].transcription.experiment, solution.positions_m[0]
     held = experiment.body_grasps[0].nodes[0] // 3
@@ -87,5 +98,17 @@ def _normal_in_clamp(solution: Solution) -> Array:
     away_m = np.nan_to_num(experiment.markers.positions_m - centres[0]).reshape(-1, 3)
     moved_m = np.vstack([centres - centres[0], away_m]) / x.std()
     rows = np.vstack([experiment.gravity_m_s2, frames[:, :, 0], moved_m])
-    normal = np.linalg.svd(rows, full_matrices=False)[2][-1] @ frames[0, :, 1:]
-    return normal / np.linalg.norm(normal)
+    return centres[0], np.linalg.svd(rows, full_matrices=False)[2][-1], frames[0, :, 1:]
+
+
+def _reflected_loss(part: ExperimentIterate, centre_m: Array, normal: Array) -> float:
+    """Return the sum of the squared changes of predicted markers, in σ, by a reflection."""
+    pairs = zip(part.transcription.experiment.measurements, fitted_values(part), strict=True)
+    changes = [
+        2
+        * np.multiply.outer((values.reshape(len(values), -1, 3) - centre_m) @ normal, normal)
+        / np.where(np.isfinite(each.positions_m), each.sigma_m[:, None], np.inf)
+        for each, values in pairs
+        if isinstance(each, Markers) and isinstance(values, np.ndarray)
+    ]
+    return float(sum(np.nansum(change**2) for change in changes))
