@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from .kinds.image_tracks.tracks import ImageTracks, PoseSigma
     from .kinds.outlines.outlines import Outlines
     from .kinds.rod.element import CrossSection, RodMesh, rod_mesh
+    from .kinds.rod.friction import bending_friction
     from .methods.comparison.casadi_nlp import Sleqp, SqpMethod
     from .methods.comparison.penalty import AugmentedLagrangian, Penalty
     from .methods.comparison.shooting import Shooting
@@ -175,6 +176,7 @@ __all__ = [
     "UnderGravity",
     "Unknown",
     "Wrench",
+    "bending_friction",
     "box_mesh",
     "compare_models",
     "cylinder_mesh",

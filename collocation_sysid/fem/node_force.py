@@ -44,7 +44,7 @@ from .meshes.selection import Indices, Selection
 # Force or internal variables as a law returns them: a column, or its components.
 Column = ca.SX | Sequence[ca.SX | float]
 Law = Callable[..., Column | tuple[Column, Column]]
-On = Literal["nodes", "faces"]
+On = Literal["nodes", "faces", "elements"]
 # A derivative counts as symmetric if its skew part is at most this fraction of its largest entry.
 SYMMETRY_TOLERANCE = 1e-9
 
@@ -87,9 +87,10 @@ class NodeForce:
     constants : tuple of Constant
     nodes : Selection, (k,) int array or None
         Nodes on which the force acts; None for all.
-    on : {"nodes", "faces"}
+    on : {"nodes", "faces", "elements"}
         "faces": on faces of the surface whose nodes are all selected; quadratic faces are treated
-        as folded along their mid nodes.
+        as folded along their mid nodes. "elements": on elements of a rod, where x is the gradient
+        G (15,), column by column, and `at.volume_m3` the length.
     internal_variable_count : int
         Number of internal variables of a node or face, such as the creep of a dashpot. If it is
         nonzero: ``law(x, v, before, at, **constants) -> (force, after)``, where `before` (carries,)
@@ -115,7 +116,7 @@ class NodeForce:
         *constants: Constant,
         nodes: Selection | ArrayLike | None = None,
         name: str | None = None,
-        on: On = "nodes",
+        on: Literal["nodes", "faces"] = "nodes",
         carries: int = 0,
     ) -> NodeForce:
         """Return a force from a law, after evaluating it once as a check.
@@ -189,7 +190,7 @@ class NodeForce:
         x, v, values, before = ca.vertsplit(u, ends)
         at = ForceContext(*ca.vertsplit(data, [*CONTEXT_OFFSETS]))
         named = {c.name: values[k] for k, c in enumerate(self.constants)}
-        if self.on == "nodes":
+        if self.on != "faces":
             return ca.vertcat(*self._evaluate_law(x, v, before=before, at=at, named=named))
         places = ca.horzsplit(ca.reshape(x, 3, dofs // 3))
         area = area_vector(places)
@@ -218,7 +219,7 @@ class NodeForce:
 
     @property
     def _smallest_dofs(self) -> int:
-        return 3 if self.on == "nodes" else 9
+        return {"nodes": 3, "faces": 9, "elements": 15}[self.on]
 
     @cached_property
     def has_skew_stiffness(self) -> bool:
@@ -348,6 +349,12 @@ class LocatedForce:
         InputError
             If the force is on faces and no face has all of its nodes selected.
         """
+        if force.on == "elements":
+            nodes = mesh.cells[np.isin(mesh.cells, chosen).all(axis=1)]
+            weights, lengths_m = mesh.mesh.gradients(mesh.points_m, nodes)
+            data = np.zeros((CONTEXT_SIZE - 3, len(nodes)))
+            data[4] = lengths_m
+            return cls(force, ForcePoints(nodes, weights, len(volume_m3)), data, columns)
         area, normal = mesh.surface_shares
         data = np.vstack([mesh.points_m.T, area, volume_m3[: len(area)], normal.T])
         if force.on == "nodes":

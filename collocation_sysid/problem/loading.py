@@ -21,6 +21,7 @@ from ..fem.body import Body
 from ..fem.laws.constants import (
     DENSITY,
     FRICTION,
+    FRICTION_MOMENT,
     MASS,
     NATURAL_ENDS,
     NATURAL_STRAINS,
@@ -40,10 +41,12 @@ from ..fem.meshes.structured import (
     count_cylinder_elements,
     cylinder_of_edge,
 )
+from ..fem.node_force import NodeForce
 from ..fem.regions import Region
 from ..fem.rest_shape import UnderGravity
 from ..fem.spatial_field import Field
 from ..kinds.rod.element import ROD_CURVATURE, CrossSection, RodMesh, rod_mesh
+from ..kinds.rod.friction import bending_friction
 from ..model.parameters import Parameters, Tied, Unknown
 from ..recording import Specimen
 from ..recording.homogeneous_deformation import DEFORMATIONS
@@ -233,6 +236,7 @@ def _load_object(
         code=code,
         natural_curvature=isinstance(mesh, RodMesh)
         and _natural_curvature(section, file.parameters),
+        frictions=[bending_friction()] * (FRICTION_MOMENT.name in file.parameters),
     )
     size = replace(size, nodes=len(body.nodes.points_m))
     require_feasible(replace(size, substeps=1), say)
@@ -523,7 +527,11 @@ def fibres_of(section: ObjectSection | RegionSection, where: str) -> Fibres | No
 
 
 def _load_body(
-    section: ObjectSection, mesh: TetMesh, code: CodeLoader, natural_curvature: NaturalCurvature
+    section: ObjectSection,
+    mesh: TetMesh,
+    code: CodeLoader,
+    natural_curvature: NaturalCurvature,
+    frictions: Sequence[NodeForce],
 ) -> Body:
     """Return the body with its materials, regions, forces and fields."""
 
@@ -558,7 +566,10 @@ def _load_body(
         damping=section.damping,
         regions=regions,
         prony=branches(None),
-        forces=[code.force(force, f"force.{k}") for k, force in enumerate(section.force)],
+        forces=[
+            *frictions,
+            *(code.force(force, f"force.{k}") for k, force in enumerate(section.force)),
+        ],
         field=field(section.field, "field"),
         fibres=fibres_of(section, "fibres"),
         rest_shape=_rest_shape(section),

@@ -20,6 +20,8 @@ from ..fem.laws.constants import (
     AXIAL,
     BENDING,
     DENSITY,
+    FRICTION_MOMENT,
+    STICK,
     TORSION,
     is_damping,
     is_density,
@@ -163,7 +165,7 @@ def _common_scaling(
         constant = without_region(name)
         if constant in (DENSITY.name, TORSION.name, AXIAL.name):
             return bool(slope[place].any()) or not includes_declared
-        return is_modulus(name) or constant == BENDING.name
+        return is_modulus(name) or constant in (BENDING.name, FRICTION_MOMENT.name, STICK.name)
 
     scaled = [is_scaled(place, name) for place, name in enumerate(body.constants)]
     return np.where(scaled, theta, 0.0)

@@ -24,6 +24,7 @@ Scale = Literal["log", "linear"]
 _UNITS = {
     "_kg_m3": "kg/m³",
     "_n_m2": "N m²",
+    "friction_n_m": "N m",
     "_1_m": "1/m",
     "_n": "N",
     "_m_s2": "m/s²",
@@ -338,6 +339,12 @@ FIBRE_ANGLE = Constant(
 BENDING = Constant("bending_n_m2", "EI", "bending stiffness", bounds=(1e-7, 1e4), usual=1e-3)
 TORSION = Constant("torsion_n_m2", "GJ", "torsional stiffness", bounds=(1e-7, 1e4), usual=1e-3)
 AXIAL = Constant("axial_n", "EA", "axial stiffness", bounds=(1e-1, 1e8), usual=1e3)
+FRICTION_MOMENT = Constant(
+    "friction_n_m", "m_c", "moment at which layers slip", bounds=(1e-9, 1e3), usual=1e-4
+)
+STICK = Constant(
+    "stick_n_m2", "S", "bending stiffness of friction before slip", bounds=(1e-8, 1e4), usual=1e-3
+)
 NATURAL_STRAINS = tuple(
     Constant(name, symbol, meaning, bounds=(-1e3, 1e3), scale="linear", typical=0.5, usual=0.0)
     for name, symbol, meaning in (
@@ -396,6 +403,8 @@ KNOWN: Mapping[str, Constant] = {
         BENDING,
         TORSION,
         AXIAL,
+        FRICTION_MOMENT,
+        STICK,
         *NATURAL_STRAINS,
         *NATURAL_ENDS,
         INSTANTANEOUS,

@@ -316,6 +316,12 @@ class TetMesh:
         """
         return reference_geometry(nodes.points_m, nodes.cells, element=element)
 
+    def gradients(self, points_m: Array, cells: Index) -> tuple[Array, Array]:
+        """Return weights (E, 5, 6) of the nodes in the gradient of elements (E, 6) of a rod, and their
+        lengths (E,) [m], from positions (n, 3) at rest.
+        """
+        raise InputError("found a force on elements of a rod; expected a rod", where="forces")
+
     def geometry_at(self, positions_m: Array, cells: Index, geometry: Array) -> Array:
         """Return a geometry (E, q, any) of elements (E, nodes) with their nodes at other positions
         (n, 3) [m].

@@ -264,6 +264,11 @@ class RodMesh(TetMesh):
             shares[cells] = (middles - first) / (last - first)
         return self._geometry(nodes.points_m, nodes.cells, shares)
 
+    def gradients(self, points_m: Array, cells: Index) -> tuple[Array, Array]:
+        geometry = self._geometry(points_m, cells, np.zeros(len(cells)))[:, 0]
+        slopes = geometry[:, : 6 * COLUMNS].reshape(len(cells), 6, COLUMNS)
+        return slopes.swapaxes(1, 2), 2 * geometry[:, 6 * COLUMNS]
+
     def geometry_at(self, positions_m: Array, cells: Index, geometry: Array) -> Array:
         return self._geometry(positions_m, cells, geometry[:, 0, -2 - STRAINS])
 
