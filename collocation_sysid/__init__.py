@@ -53,7 +53,14 @@ if TYPE_CHECKING:
     from .pipeline import Run, run
     from .problem import Problem, RolloutOptions, UncertaintyOptions
     from .program.collocation import Collocation
-    from .program.simulation import Trajectory, simulate, with_markers, with_readings, with_wrenches
+    from .program.simulation import (
+        Trajectory,
+        simulate,
+        simulate_each,
+        with_markers,
+        with_readings,
+        with_wrenches,
+    )
     from .recording import (
         Camera,
         Capsule,
@@ -189,6 +196,7 @@ __all__ = [
     "rod_mesh",
     "run",
     "simulate",
+    "simulate_each",
     "solve",
     "testing",
     "with_markers",

@@ -870,7 +870,7 @@ class Body(Discretisation):
         """
         stresses = self._evaluate("resultants", [x, v], theta)
         shares = 1 + velocity_slope * self._rayleigh_rates(np.asarray(theta))
-        return stresses * np.repeat(shares, stresses.shape[1] // len(shares))
+        return stresses * np.repeat(shares, stresses.shape[1] // shares.shape[-1], axis=-1)
 
     def resultant_stiffness(self, x: Array, resultants: Array, theta: Theta) -> Array:
         """Return the lower triangles (T, m) of Σ s ∂²ε/∂x² [N/m] with strains ε of a rod at positions
@@ -880,10 +880,10 @@ class Body(Discretisation):
 
     def _rayleigh_rates(self, theta: Array) -> Array:
         """Return γ_r (E,) [s] of the elements with Rayleigh damping, 0 for others."""
-        rates = np.zeros(len(self.cells))
+        rates = np.zeros((*theta.shape[1:-1], len(self.cells)))
         for part, values in zip(self.parts, self.split_theta(theta), strict=False):
             if part.damping.name == "rayleigh":
-                rates[part.cells] = values[len(part.material.constants)]
+                rates[..., part.cells] = values[len(part.material.constants)]
         return rates
 
     def linearise(

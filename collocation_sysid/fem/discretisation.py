@@ -155,7 +155,7 @@ class Discretisation(ConstantsModel):
 
     def point_constants(self, number: int, theta: Theta) -> Array:
         """Return the constants (`PointLaw.constant_count`,) of the quadrature points of the part
-        with index `number`, at θ (k,).
+        with index `number`, at θ (k,); at θ (k, T, 1) those of T bodies (T, any).
 
         These are the constants of material and damping law, of a part with memory also the first
         constant of its first branch, in whose place the caller sets the stiffening. For a
@@ -165,6 +165,8 @@ class Discretisation(ConstantsModel):
         part_constants = np.asarray(self.split_theta(theta)[number], dtype=float)[
             : self.parts[number].point_constant_count
         ]
+        if part_constants.ndim > 1:
+            return np.ascontiguousarray(part_constants[..., 0].T)
         changes = np.zeros(
             self.inverse_equilibrium.layout.input_count if self.inverse_equilibrium else 0
         )

@@ -546,7 +546,7 @@ class StencilRow:
         """
         values = -self.w[0] * self.p[0] * by_position
         values -= self.w[0] * self.q[0] * by_velocity
-        values[pattern.diagonal] += self.s[0] * self.mass_kg
+        values[..., pattern.diagonal] += self.s[0] * self.mass_kg
         return values
 
     def skew_block(self, by_position_skew: Array, by_velocity_skew: Array) -> Array:

@@ -415,7 +415,8 @@ class CustomForce(Pointwise):
         return self
 
     def constants(self, states: States) -> Array:
-        return states.theta[self.placed.columns][:, None]
+        constants = states.theta[self.placed.columns]
+        return constants.reshape(len(constants), *constants.shape[1:2] or (1,))
 
     def constant_columns(self, places: AssemblyIndices) -> Index:
         return self.placed.columns

@@ -37,7 +37,7 @@ from .force_term import AssemblyIndices, ForceTerm, States
 class DofMasses:
     """Masses of every dof at T times: the body, what is tied to it, and the air."""
 
-    own_kg: Array  # (3n,): mass of the body itself
+    own_kg: Array  # (3n,): mass of the body itself; of B bodies with free densities (B, 3n)
     tied_kg: Array = field(metadata=over_time())  # (T, 3n): point masses
     # (3n,): air that the body displaces; buoyancy reduces the weight by the weight of this air.
     displaced_kg: Array
@@ -67,7 +67,7 @@ class DofMasses:
 
     def _plus_tied(self, constant_kg: Array) -> Array:
         """Return constant (3n,) plus tied masses (T, 3n); a view with stride 0 if those are one."""
-        if len(self.tied_kg) and self.tied_kg.strides[0] == 0:
+        if constant_kg.ndim == 1 and len(self.tied_kg) and self.tied_kg.strides[0] == 0:
             return np.broadcast_to(constant_kg + self.tied_kg[0], self.tied_kg.shape)
         return constant_kg + self.tied_kg
 

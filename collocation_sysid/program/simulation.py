@@ -57,6 +57,8 @@ FIRST_SCHEME_STEPS = 1
 # Largest number of steps a sample that automatic refinement takes: the cost of all refinements
 # together is then 63 times that of one step a sample.
 MOST_AUTOMATIC_STEPS = 32
+# Number of dofs that are simulated together: their factors fit the cache.
+DOFS_TOGETHER = 10_000
 # Share of the first pass in a simulation with automatic steps: half of the second one, which is
 # the last one at the earliest.
 FIRST_PASS_SHARE = 1 / 3
@@ -227,9 +229,9 @@ def simulate(
                 experiment, theta, integrator=integrator, options=options, progress=progress
             )
         else:
-            motion = _with_steps(
+            (motion,) = _with_steps(
                 experiment,
-                theta,
+                theta[None],
                 integrator=integrator,
                 steps=steps,
                 options=options,
@@ -240,6 +242,82 @@ def simulate(
             raise
         raise reason from error
     return replace(motion, predicted=_ideal_predictions(motion)) if is_measured else motion
+
+
+def simulate_each(
+    experiment: Experiment,
+    parameters: Mapping[str, ArrayLike],
+    integrator: str | Scheme = NEWMARK,
+    substeps: int = 1,
+    progress: Progress | None = None,
+    is_measured: bool = True,
+) -> list[Trajectory]:
+    """Simulate a motion with each of B values of the parameters, as B calls of `simulate` would,
+    but many bodies together, step by step; those for which Newton's method does not converge at
+    once are simulated by themselves.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Values (B,) of each parameter, or one number for all.
+    substeps : int
+        Time steps between samples.
+    experiment, integrator, progress, is_measured
+        See `simulate`.
+
+    Raises
+    ------
+    InputError
+        For a static experiment, contact, or a body with memory, fields, custom forces or a shape
+        under gravity; otherwise as `simulate`.
+    SimulationError
+        When a motion fails.
+    """
+    body = experiment.body
+    if (
+        experiment.is_static
+        or experiment.obstacles
+        or experiment.stiffness_deviations
+        or body.has_memory
+        or body.field_coefficient_names
+        or body.forces
+        or body.inverse_equilibrium
+    ):
+        raise InputError(
+            f"{experiment.description}: found equilibria, contact, a stiffness deviation, or a body "
+            "with memory, a field, custom forces or a shape under gravity; expected a motion without "
+            "them: call `simulate` with each of the values"
+        )
+    rows = zip(*np.broadcast_arrays(*parameters.values()), strict=True)
+    draws = (dict(zip(parameters, row, strict=True)) for row in rows)
+    thetas = np.array([resolve_theta(body, draw) for draw in draws])
+    for massless in filter(None, map(body.mass_problem, thetas)):
+        raise InputError(massless)
+    motions: list[Trajectory] = []
+    together = max(1, DOFS_TOGETHER // body.pattern.size)
+    for first in range(0, len(thetas), together):
+        some = thetas[first : first + together]
+        motions += _simulate_together(experiment, some, integrator, substeps)
+        if progress:
+            progress(len(motions) / len(thetas))
+    if not is_measured:
+        return motions
+    return [replace(each, predicted=_ideal_predictions(each)) for each in motions]
+
+
+def _simulate_together(
+    experiment: Experiment, thetas: Array, integrator: str | Scheme, steps: int
+) -> list[Trajectory]:
+    try:
+        return _with_steps(experiment, thetas, integrator, steps, None, None)
+    except SimulationError:
+        if len(thetas) == 1:
+            raise
+        return [
+            motion
+            for half in np.array_split(thetas, 2)
+            for motion in _simulate_together(experiment, half, integrator, steps)
+        ]
 
 
 def _ideal_predictions(motion: Trajectory) -> tuple[Array, ...]:
@@ -297,9 +375,9 @@ def _with_automatic_steps(
         report = None if progress is None else _part(progress, done, share)
         done += share
         try:
-            finer = _with_steps(
+            (finer,) = _with_steps(
                 experiment,
-                theta,
+                theta[None],
                 integrator=integrator,
                 steps=steps,
                 options=options,
@@ -338,13 +416,20 @@ def _accepted_error_m(trajectory: Trajectory) -> float:
 
 def _with_steps(
     experiment: Experiment,
-    theta: Array,
+    thetas: Array,
     integrator: str | Scheme,
     steps: int,
     options: NewtonOptions | None,
     progress: Progress | None,
-) -> Trajectory:
-    """Velocities of a collocation scheme are central differences of its positions."""
+) -> list[Trajectory]:
+    """Return the motion of each θ (B, k). Velocities of a collocation scheme are central differences
+    of its positions.
+    """
+    theta = thetas[0] if len(thetas) == 1 else thetas.T[..., None]
+
+    def of_bodies(values: Array) -> Array:
+        return values.reshape(len(values), len(thetas), -1).swapaxes(0, 1)
+
     sensed = sensed_dofs(experiment)
     equilibria = None
     if integrator == NEWMARK and not experiment.is_static:
@@ -358,26 +443,30 @@ def _with_steps(
         )
         rows = (len(x) - 1) * steps + 1
         at = ReactionGrid.from_times(np.linspace(experiment.t_s[0], experiment.t_s[-1], rows))
+        reactions = map(ReactionForces, of_bodies(forced.reaction), of_bodies(forced.position_m))
     else:
-        dynamics = Dynamics.from_experiment(experiment, integrator, substeps=steps).with_theta(
-            theta
-        )
+        equations = Dynamics.from_experiment(experiment, integrator, substeps=steps)
+        dynamics = equations.with_theta(theta)
         grid = simulate_scheme(experiment, dynamics, options=options, progress=progress)
         x = grid[::steps]
         equilibria = dynamics if experiment.is_static else None
         zeros = np.zeros_like(grid)
         v = zeros if experiment.is_static else np.gradient(grid, dynamics.step_s, axis=0)[::steps]
         at = ReactionGrid.from_dynamics(dynamics)
-        forced = reactions_at(dynamics, grid, dofs=sensed)
+        own = map(equations.with_theta, thetas)
+        reactions = (reactions_at(d, g, sensed) for d, g in zip(own, of_bodies(grid), strict=True))
     shape = (len(x), -1, 3)
-    return Trajectory(
-        experiment,
-        x.reshape(shape),
-        velocities_m_s=v.reshape(shape),
-        reactions=(at, forced),
-        steps_per_sample=steps,
-        equilibria=equilibria,
-    )
+    return [
+        Trajectory(
+            experiment,
+            x.reshape(shape),
+            velocities_m_s=v.reshape(shape),
+            reactions=(at, forced),
+            steps_per_sample=steps,
+            equilibria=equilibria,
+        )
+        for x, v, forced in zip(of_bodies(x), of_bodies(v), reactions, strict=True)
+    ]
 
 
 def _with_values(

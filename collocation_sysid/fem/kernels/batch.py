@@ -33,7 +33,7 @@ class KernelBatch:
 
 class Evaluator(Protocol):
     """Evaluator of a batch: sums the kernel over elements and quadrature points, for each time
-    step.
+    step, with the constants `theta` (c,) or those of each step (T, c).
     """
 
     def __call__(
@@ -93,7 +93,8 @@ class CasadiEvaluator:
                 ]
             else:
                 point_data = []
-            outputs = self._mapped.call([*inputs, self._geometry, theta, *point_data])
+            constants = theta[t] if theta.ndim > 1 else theta
+            outputs = self._mapped.call([*inputs, self._geometry, constants, *point_data])
             stacked = np.concatenate([value.full() for value in outputs])
             total = self._sum @ stacked.ravel(order="F")
             out[t] = out[t] + total if add else total

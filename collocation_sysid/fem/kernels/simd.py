@@ -80,9 +80,9 @@ class SimdEvaluator:
             self._point_data_columns = _block_major(batch.data_columns[lane_element], by_block)
         tables = self._geometry, self._nodes, self._destinations
         self._tables = [address(table) for table in tables]
-        key = f"{lanes} {self._points} {hashlib.sha256(kernel.serialized.encode()).hexdigest()}"
+        key = f"rows of theta {lanes} {self._points} {hashlib.sha256(kernel.serialized.encode()).hexdigest()}"
         # What points carry adds the length of its row, its places and itself.
-        signature = [ctypes.c_int64] * 6 + [ctypes.c_void_p] * (self._fields + 5)
+        signature = [ctypes.c_int64] * 7 + [ctypes.c_void_p] * (self._fields + 5)
         if kernel.point_data_count:
             signature += [ctypes.c_int64] + [ctypes.c_void_p] * 2
         points = self._points
@@ -107,6 +107,7 @@ class SimdEvaluator:
             fields[0].shape[1],
             self._width,
             int(add),
+            theta.shape[1] if theta.ndim > 1 else 0,
             *(address(field) for field in fields),
             *self._tables,
             address(theta),
@@ -170,8 +171,8 @@ class _PhaseLayout:
 
 
 class _KernelEmitter:
-    """Emitter of ``run(t0, t1, blocks, field_stride, out_stride, add, fields…, geometry, …, out,
-    …)``.
+    """Emitter of ``run(t0, t1, blocks, field_stride, out_stride, add, theta_stride, fields…,
+    geometry, …, out, …)``.
 
     For kernels with data of the points, the last arguments are the length of a row of data, the
     columns of each point and the data.
@@ -211,7 +212,7 @@ class _KernelEmitter:
         self.point_data_count = kernel.point_data_count
         if self.point_data_count:
             constants += [I64, I32S, DOUBLES]
-        kind = ir.FunctionType(ir.VoidType(), [I64] * 6 + [DOUBLES] * self.fields + constants)
+        kind = ir.FunctionType(ir.VoidType(), [I64] * 7 + [DOUBLES] * self.fields + constants)
         self.run = ir.Function(self.module, kind, "run")
         for argument in self.run.args:
             if isinstance(argument.type, ir.PointerType):
@@ -222,9 +223,9 @@ class _KernelEmitter:
         """Return the LLVM module with the function ``run``."""
         b = self.builder
         args = self.run.args
-        t0, t1, blocks, field_stride, out_stride, add = args[:6]
-        field_rows = args[6 : 6 + self.fields]
-        geometry, nodes, destinations, theta, out, *memory = args[6 + self.fields :]
+        t0, t1, blocks, field_stride, out_stride, add, theta_stride = args[:7]
+        field_rows = args[7 : 7 + self.fields]
+        geometry, nodes, destinations, theta, out, *memory = args[7 + self.fields :]
         gathered = [self._buffer(self.size, f"field{k}") for k in range(self.fields)]
         phases = [*self.previous_phases, self.last]
         outputs = self.last.outputs[self.own]
@@ -234,10 +235,13 @@ class _KernelEmitter:
         half = self._buffer(3 * self.gradient_size, "half")
         combined = self._buffer(len(self.vectors) * self.size, "combined")
         geometry_size, theta_size = (self.last.sx.nnz_in(self.fields + k) for k in range(2))
-        parameters = [self._splat(b.load(b.gep(theta, [I64(k)]))) for k in range(theta_size)]
         with for_range(b, t0, stop=t1, name="t") as t:
             rows = [b.gep(row, [b.mul(t, field_stride)]) for row in field_rows]
             out_row = b.gep(out, [b.mul(t, out_stride)])
+            constants = b.gep(theta, [b.mul(t, theta_stride)])
+            parameters = [
+                self._splat(b.load(b.gep(constants, [I64(k)]))) for k in range(theta_size)
+            ]
             with b.if_then(b.icmp_signed("==", add, I64(0))):
                 self._clear(out_row, out_stride)
             with for_range(b, I64(0), stop=blocks, name="block") as block:

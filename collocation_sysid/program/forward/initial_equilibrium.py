@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ...common.array_types import Array, Index
 from ...common.step_counting import report_state
+from ...common.time_dependence import at_times
 from ...model.forces import Forces
 from ...model.viscoelasticity import with_start_memory
 from ...recording.experiment import Experiment
@@ -206,7 +207,7 @@ def initial_state(
 ) -> tuple[Array, Array]:
     """Return initial positions x_0 [m] and velocities v_0 [m/s], each (3n,), by the experiment's
     start rule: an equilibrium, stated positions, or the undeformed body in its grasps. Both are new
-    arrays; velocities are zero unless stated.
+    arrays; velocities are zero unless stated. Those of B bodies are (B, 3n).
 
     Parameters
     ----------
@@ -225,6 +226,11 @@ def initial_state(
     SimulationError
         If no stable equilibrium is found.
     """
+    if forces.theta.ndim > 1:
+        each = (at_times(forces, slice(1)).with_theta(theta) for theta in forces.theta[..., 0].T)
+        states = [initial_state(experiment, one, solver, guess, prescribed_m) for one in each]
+        x, v = map(np.array, zip(*states, strict=True))
+        return x, v
     velocity = experiment.initial_velocities_m_s
     v0 = np.zeros(experiment.body.pattern.size) if velocity is None else np.ravel(velocity).copy()
     if experiment.is_balanced_at_start:

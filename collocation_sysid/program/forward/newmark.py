@@ -113,12 +113,11 @@ def simulate_newmark(
     """
     stepper = _Stepper(experiment, theta, options=options)
     times = experiment.t_s
-    x, v = (np.zeros((len(times), experiment.body.pattern.size)) for _ in range(2))
     state = stepper.initial_state()
-    x[0] = state.x
-    v[0] = state.v
+    x, v = (np.repeat(start[None], len(times), axis=0) for start in (state.x, state.v))
     step = experiment.timestep_s / steps_per_sample
-    reactions_and_positions = np.zeros((2, (len(times) - 1) * steps_per_sample + 1, len(sensed)))
+    rows = (len(times) - 1) * steps_per_sample + 1
+    reactions_and_positions = np.zeros((2, rows, *state.x.shape[:-1], len(sensed)))
     at_start = stepper.forces(state.t_s)
     reactions_and_positions[:, 0] = _reactions_and_positions(state, at_start, sensed)
     means_n = np.zeros_like(reactions_and_positions[0])
@@ -149,15 +148,15 @@ def _force_n(state: _State, forces: Forces) -> Array:
     """Return all forces (3n,) [N] but local ones."""
     for each in state.previous_histories:
         forces = each.insert_at_same_time(forces)
-    return forces.without_local_forces().total(state.x, state.v)[0]
+    return forces.without_local_forces().total(state.x, state.v).reshape(state.x.shape)
 
 
 def _reactions_and_positions(state: _State, forces: Forces, dofs: Index) -> tuple[Array, Array]:
     """Return reactions without local ones [N] and positions [m]."""
     if not len(dofs):
-        return np.zeros(0), np.zeros(0)
-    reaction_n = forces.mass.inertia_kg[0] * state.a - _force_n(state, forces)
-    return reaction_n[dofs], state.x[dofs]
+        return state.x[..., dofs], state.x[..., dofs]
+    reaction_n = forces.mass.inertia_at(0) * state.a - _force_n(state, forces)
+    return reaction_n[..., dofs], state.x[..., dofs]
 
 
 class _NewmarkEquations(StepEquations):
@@ -180,7 +179,7 @@ class _NewmarkEquations(StepEquations):
             local_weight=2.0,
             stress=LaggedStress(rest, self._end_states, velocity_slope=2.0 / step_s),
         )
-        self.mass_kg = forces.mass.inertia_kg[0]
+        self.mass_kg = forces.mass.inertia_at(0)
         self._state = state
         self._step_s = step_s
         self._forces = rest
@@ -204,20 +203,20 @@ class _NewmarkEquations(StepEquations):
 
     def with_prescribed_positions(self, x: Array) -> Array:
         moved = x.copy()
-        moved[self._prescribed_dofs] = self._prescribed[0]
+        moved[..., self._prescribed_dofs] = self._prescribed[0]
         return moved
 
     def kinematics(self, x: Array) -> tuple[Array, Array]:
         v = self._slope * x + self._known_v
         a = self._slope**2 * x + self._known_a
         # Finite differences of a grasp's motion ring under this rule; its own motion does not.
-        v[self._prescribed_dofs] = self._prescribed[1]
-        a[self._prescribed_dofs] = self._prescribed[2]
+        v[..., self._prescribed_dofs] = self._prescribed[1]
+        a[..., self._prescribed_dofs] = self._prescribed[2]
         return v, a
 
     def _end_states(self, x: Array) -> tuple[Array, Array]:
         """Return positions x [m] and velocities [m/s] at the end of the step, (1, 3n) each."""
-        return x[None], self.kinematics(x)[0][None]
+        return np.atleast_2d(x), np.atleast_2d(self.kinematics(x)[0])
 
     def states(self, x: Array) -> tuple[Array, Array]:
         before = self._state.x
@@ -225,18 +224,19 @@ class _NewmarkEquations(StepEquations):
 
     def residual_without_local(self, x: Array) -> Array:
         v, a = self.kinematics(x)
-        return self._forces.total(x, v)[0] - self.mass_kg * a
+        return self._forces.total(x, v).reshape(x.shape) - self.mass_kg * a
 
     def linearise_without_local(self, x: Array) -> NewtonLinearisation:
         v, a = self.kinematics(x)
         slope = self._slope
         at = self._forces.linearise(x, v)
-        matrix = -(at.by_position[0] + slope * at.by_velocity[0])
-        matrix[self._forces.pattern.diagonal] += slope**2 * self.mass_kg
-        skew = -at.by_position_skew[0]
+        matrix = -(at.by_position + slope * at.by_velocity)
+        matrix[:, self._forces.pattern.diagonal] += slope**2 * self.mass_kg
+        skew = -at.by_position_skew
         if at.by_velocity_skew.size:
-            skew = skew - slope * at.by_velocity_skew[0]
-        return NewtonLinearisation(at.force[0] - self.mass_kg * a, matrix, skew=skew)
+            skew = skew - slope * at.by_velocity_skew
+        own = 0 if x.ndim == 1 else slice(None)
+        return NewtonLinearisation(at.force[own] - self.mass_kg * a, matrix[own], skew=skew[own])
 
 
 class _Stepper:
@@ -278,7 +278,7 @@ class _Stepper:
                 state = self._step(solver, state, end_s, loads)
             except NewtonFailure as failure:
                 step /= 2
-                if step < smallest:
+                if step < smallest or self.theta.ndim > 1:
                     raise simulation_error(
                         solver, failure, time_s=state.t_s, what="a time step of the Newmark method"
                     ) from failure
@@ -312,7 +312,7 @@ class _Stepper:
         acceleration = state.a.copy()
         forces = self.forces(load_s)
         force_n = _force_n(state, forces)
-        acceleration[dofs] = force_n[dofs] / forces.mass.inertia_kg[0, dofs]
+        acceleration[..., dofs] = (force_n / forces.mass.inertia_at(0))[..., dofs]
         return replace(state, a=acceleration)
 
     def _step(self, solver: NewtonSolver, state: _State, end_s: float, loads: _Loads) -> _State:

@@ -91,11 +91,11 @@ class LaggedStress:
         """Return the lower triangle (m,) [N/m] of the part of the stiffness by ξ that mean stresses
         (E,) [Pa], or resultants (1, any) [J], have at x (3n,) [m].
         """
-        (xi,), _ = self.states(x)
+        xi, _ = self.states(x)
         body = self.forces.body
         own = (
-            body.volume_stiffness(xi, stress_pa)[None]
+            body.volume_stiffness(xi[0], stress_pa)[None]
             if body.is_solid
-            else body.resultant_stiffness(xi[None], stress_pa, self.forces.theta)
+            else body.resultant_stiffness(xi, stress_pa, self.forces.theta)
         )
-        return np.asarray(self.forces.joint_pattern.expand(own)[0])
+        return self.forces.joint_pattern.expand(own).reshape(*x.shape[:-1], -1)

@@ -264,7 +264,8 @@ class NewtonSolver:
         Parameters
         ----------
         x : (3n,) array
-            First guess [m]; not modified. Prescribed dofs keep their values.
+            First guess [m]; not modified. Prescribed dofs keep their values. Those of B bodies
+            without local forces are (B, 3n).
 
         Returns
         -------
@@ -277,7 +278,7 @@ class NewtonSolver:
             If no method converges, or an element is inverted at the start.
         """
         require_time()
-        solution = self._solve_step(x, equations)
+        solution = (self._solve_step if x.ndim == 1 else self._solve_each)(x, equations)
         self._last_step = equations.stress, solution
         return solution
 
@@ -317,6 +318,52 @@ class NewtonSolver:
             return equations.linearise
         stress, before = self._last_step
         return equations.stress.expecting(stress.at(before), equations.linearise)
+
+    def _solve_each(self, x: Array, equations: StepEquations) -> Array:
+        """Solve one implicit time step of B bodies (B, 3n) without local forces by chord steps with
+        the factor of the block-diagonal matrix of all.
+
+        Raises
+        ------
+        NewtonFailure
+            If the steps of a body do not shrink, or an element is inverted.
+        """
+        self._require_upright(x)
+        x = x.copy()
+        factoriser = Factoriser.cached(self.pattern, self.free, bodies=len(x))
+        tolerance_m = self.options.tolerance * self.size_m
+        done = np.zeros((len(x), 1), dtype=bool)
+        factor, before, own_before = None, None, np.inf
+        # As in `_CompleteIteration`.
+        linearise = equations.linearise if self.body.is_solid else self.with_last_stress(equations)
+        for _ in range(self.options.max_iterations):
+            is_own = factor is None
+            if factor is None:
+                residual, matrix, skew = linearise(x)
+                try:
+                    factor = factoriser.factorise(matrix.ravel(), skew.ravel(), is_single=True)
+                except np.linalg.LinAlgError:
+                    break
+            else:
+                residual = equations.residual(x)
+            steps = factor.solve(residual[:, self.free].ravel()).reshape(len(x), -1)
+            steps[done[:, 0]] = 0.0
+            x[:, self.free] += steps
+            largest = np.abs(steps).max(axis=1, keepdims=True)
+            rate = np.ones_like(largest) if before is None else largest / before
+            done |= rate * largest <= LEAST_RESIDUAL_SHARE * tolerance_m
+            done |= is_own & (largest <= tolerance_m)
+            if done.all():
+                self._require_upright(x)
+                return x
+            before = np.maximum(largest, 1e-300)
+            if is_own:
+                if not (done | (largest <= own_before)).all():
+                    break
+                own_before = largest
+            elif (~done & (rate > FAST)).any():
+                factor = None
+        raise NewtonFailure(x, "the steps of many bodies do not shrink")
 
     def _iteration_failure(self, iterate: _Iterate) -> NewtonFailure:
         return NewtonFailure(

@@ -106,7 +106,7 @@ def continue_simulation(
     SimulationError or None
         Why the simulation stopped early; it is not raised.
     """
-    x = np.zeros((dynamics.row_count, dynamics.body.pattern.size))
+    x = np.zeros((dynamics.row_count, *dynamics.theta.shape[1:2], dynamics.body.pattern.size))
     failure = _body_failure(dynamics)
     if failure is not None:
         return x[:0] if known is None else known, failure
@@ -117,7 +117,7 @@ def continue_simulation(
             return equilibria, None
     solvers = NewtonSolvers(experiment, options, stopwatch=stopwatch)
     is_prescribed = ~np.isnan(dynamics.prescribed_m)
-    v0 = np.zeros(x.shape[1])
+    v0 = np.zeros(x.shape[1:])
     if known is None:
         guess = None if approximate_solution is None else approximate_solution[0]
         try:
@@ -175,7 +175,7 @@ def continue_simulation(
         if len(guesses) > 1:
             nearest = int(np.argmin([np.abs(x[t] - each).max() for each in guesses]))
         forces[t] = row.force(x[t])
-        forces[t, dynamics.is_temporarily_prescribed[t]] = 0
+        forces[t, ..., dynamics.is_temporarily_prescribed[t]] = 0
         if previous_histories:
             (xi_t,), (nu_t,) = row.states(x[t])
             previous_histories = advance_states(
@@ -188,6 +188,8 @@ def continue_simulation(
 
 def _body_failure(dynamics: Dynamics) -> SimulationError | None:
     """Return why the body cannot be simulated at all: a node without mass, or no rest shape."""
+    if dynamics.theta.ndim > 1:  # of many bodies, which have been asked one by one
+        return None
     massless = dynamics.body.mass_problem(dynamics.theta)
     if massless is not None:
         return SimulationError(massless, float(dynamics.t_s[0]))
@@ -209,7 +211,7 @@ def forces_and_histories(
         rows = slice(dynamics.first_row, row_count)
         known_forces = dynamics.forces_with_histories(histories, rows)
         forces[rows] = known_forces.total(xi[:evaluations], nu[:evaluations])
-    dynamics.zero_prescribed_forces(forces)
+    dynamics.zero_prescribed_forces(forces.swapaxes(1, -1))
     return forces, tuple(history.extract_final_state() for history in histories)
 
 
@@ -329,11 +331,12 @@ class RowEquations(StepEquations):
         [m], with local forces.
         """
         states = self.states(x)
-        rest = self.rest.total(*states)[0]
+        rest = self.rest.total(*states).reshape(x.shape)
         return rest + self.local.force(*states) if self.local.parts else rest
 
     def states(self, x: Array) -> tuple[Array, Array]:
-        return (self.xi + self.row.p[0] * x)[None], (self.nu + self.row.q[0] * x)[None]
+        row = self.row
+        return np.atleast_2d(self.xi + row.p[0] * x), np.atleast_2d(self.nu + row.q[0] * x)
 
     def _residual_from(self, force: Array, x: Array) -> Array:
         """Return c_t (3n,) [N] from the force F_t (3n,) [N] and x_t (3n,) [m]."""
@@ -341,14 +344,15 @@ class RowEquations(StepEquations):
         return row.w[0] * force + self.known - row.s[0] * row.mass_kg * x
 
     def residual_without_local(self, x: Array) -> Array:
-        return self._residual_from(self.rest.total(*self.states(x))[0], x)
+        return self._residual_from(self.rest.total(*self.states(x)).reshape(x.shape), x)
 
     def linearise_without_local(self, x: Array) -> NewtonLinearisation:
         row = self.row
         at = self.rest.linearise(*self.states(x))
-        matrix = row.block(at.by_position[0], at.by_velocity[0], pattern=self.rest.pattern)
-        skew = row.skew_block(at.by_position_skew[0], at.by_velocity_skew[0])
-        return NewtonLinearisation(self._residual_from(at.force[0], x), matrix, skew=skew)
+        own = 0 if x.ndim == 1 else slice(None)
+        matrix = row.block(at.by_position[own], at.by_velocity[own], pattern=self.rest.pattern)
+        skew = row.skew_block(at.by_position_skew[own], at.by_velocity_skew[own])
+        return NewtonLinearisation(self._residual_from(at.force[own], x), matrix, skew=skew)
 
 
 def solve_row(
@@ -377,6 +381,9 @@ def solve_row(
     NewtonFailure
         If an increment fails after all halvings.
     """
+    if guess.ndim > 1:
+        guess[:, solver.is_prescribed] = prescribed_m
+        return solver.solve_step(guess, row)
     origin = previous[solver.is_prescribed]
     is_static = row.dynamics.is_static
     first = previous if is_static else row.without_forces(solver.free, previous)

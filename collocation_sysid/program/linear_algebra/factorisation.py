@@ -272,11 +272,14 @@ class Factoriser:
             self._pools[False].append(self._pardiso(is_single=False))
 
     @classmethod
-    def cached(cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto") -> Factoriser:
+    def cached(
+        cls, pattern: SymmetricPattern, free: Index, choice: Choice = "auto", bodies: int = 1
+    ) -> Factoriser:
         """Return the analysis of a pattern; the last `LARGEST_CACHED_ANALYSIS_COUNT` are cached.
-        Arguments as in `Factoriser`.
+        Arguments as in `Factoriser`; the matrix of several bodies is block-diagonal, with entries and
+        dofs one body after another.
         """
-        return _cached_analysis(pattern, free.tobytes(), choice=choice)
+        return _cached_analysis(pattern, free.tobytes(), choice=choice, bodies=bodies)
 
     @cached_property
     def is_banded(self) -> bool:
@@ -651,6 +654,11 @@ def _has_positive_pivots(lu: SuperLU) -> bool:
 
 
 @lru_cache(maxsize=LARGEST_CACHED_ANALYSIS_COUNT)
-def _cached_analysis(pattern: SymmetricPattern, free: bytes, choice: Choice) -> Factoriser:
+def _cached_analysis(
+    pattern: SymmetricPattern, free: bytes, choice: Choice, bodies: int
+) -> Factoriser:
     """The last analyses are cached; `free` are the bytes of an array of int64."""
-    return Factoriser(pattern, np.frombuffer(free, dtype=np.int64), choice=choice)
+    size = pattern.size
+    dofs = pattern.rows, pattern.columns, np.frombuffer(free, dtype=np.int64)
+    rows, columns, all_free = (np.add.outer(size * np.arange(bodies), d).ravel() for d in dofs)
+    return Factoriser(SymmetricPattern(bodies * size, rows, columns), all_free, choice=choice)
