@@ -244,11 +244,12 @@ def simulate(
     return replace(motion, predicted=_ideal_predictions(motion)) if is_measured else motion
 
 
+@validated
 def simulate_each(
     experiment: Experiment,
     parameters: Mapping[str, ArrayLike],
     integrator: str | Scheme = NEWMARK,
-    substeps: int = 1,
+    substeps: Substeps = 1,
     progress: Progress | None = None,
     is_measured: bool = True,
 ) -> list[Trajectory]:
@@ -288,7 +289,10 @@ def simulate_each(
             "with memory, a field, custom forces or a shape under gravity; expected a motion without "
             "them: call `simulate` with each of the values"
         )
-    rows = zip(*np.broadcast_arrays(*parameters.values()), strict=True)
+    given = [float_array(each, name, ((), (None,))) for name, each in parameters.items()]
+    if len({len(each) for each in given if each.ndim}) != 1:
+        raise InputError("found values of several lengths, or no array; expected B values")
+    rows = zip(*np.broadcast_arrays(*given), strict=True)
     draws = (dict(zip(parameters, row, strict=True)) for row in rows)
     thetas = np.array([resolve_theta(body, draw) for draw in draws])
     for massless in filter(None, map(body.mass_problem, thetas)):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..common.array_types import Array
 
@@ -33,7 +33,7 @@ def start_forces_n(experiment: Experiment, t_s: Array) -> Array:
     """
     body = experiment.body
     held = np.concatenate([grasp.nodes for grasp in experiment.body_grasps])
-    away_m, _ = cKDTree(body.nodes_m[held]).query(body.nodes_m)
+    away_m, _ = KDTree(body.nodes_m[held]).query(body.nodes_m)
     since_s = t_s - experiment.t_s[0]
     course = np.zeros((2, len(t_s)))
     course[0] = since_s <= 0

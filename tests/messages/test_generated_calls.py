@@ -228,6 +228,7 @@ def valid(name: str) -> dict[str, Any]:
         "refine": {"run": None},
         "run": {"problem": "none.toml"},
         "simulate": {"experiment": experiment, "parameters": KNOWN},
+        "simulate_each": {"experiment": experiment, "parameters": KNOWN},
         "solve": {"problem": "none.toml"},
         "testing.check_damping": {"law": "kelvin-voigt"},
         "testing.check_force": {"force": None},

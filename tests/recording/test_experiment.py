@@ -118,7 +118,7 @@ def test_a_given_start_is_at_rest_unless_velocities_are_given():
         ({"grasps": (lifted([0, 1, 7]),)}, "node 7; expected node indices from 0 to 4"),
         ({"grasps": (lifted([0, 1, 2]), lifted([2, 3]))}, "node 2 is held by the grasps 1 and 2"),
         ({"gravity_m_s2": np.zeros(2)}, r"gravity_m_s2 has the shape \(2,\)"),
-        ({"start": "at rest"}, "expected 'equilibrium', 'undeformed' or 'given'"),
+        ({"start": "at rest"}, "expected 'equilibrium', 'moving', 'undeformed' or 'given'"),
         ({"start_rule": "other"}, "expected 'standard' or 'paper'"),
         ({"start": "given"}, "needs start_positions_m"),
         ({"start_positions_m": NODES}, "but start is 'equilibrium'"),

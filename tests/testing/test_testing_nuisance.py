@@ -17,6 +17,8 @@ from collocation_sysid.recording.nuisance import (
     CLAMP_TURN,
     DEPTH_EDGE,
     KINDS,
+    START_ACCELERATION,
+    START_VELOCITY,
     STRAIN_ZERO,
     TEMPERATURE,
     TOOL_CENTRE,
@@ -75,6 +77,8 @@ def test_every_parameter_of_the_package_passes(row: cs.Deviation):
         experiment = replace(pulled_specimen(), nuisance=cs.Nuisance.none())
     if row == CLAMP_TURN:  # only several clamps have turns of their own
         experiment = replace(bar_with_nuisance(), nuisance=cs.Nuisance.none())
+    if row in (START_ACCELERATION, START_VELOCITY):
+        experiment = hung_cube(4, start="moving")
     if row == TOOL_CENTRE:  # there is none without the mass of a tool
         assert experiment is not None
         experiment = replace(experiment, nuisance=cs.Nuisance.none(tool_kg=0.01))

@@ -101,7 +101,7 @@ def stress_offset_notes(fit: LinearisedFit) -> list[str]:
         return []
     priors_pa = np.array([PRIOR_SIGMAS * fit.blocks[k].sigma_m[0] for k in offsets])
     estimates = priors_pa * gauss_newton_step(complete)[-count:]
-    squares = least_squares_of_fit(complete.only(np.flatnonzero(~complete.at_bound)))
+    squares = least_squares_of_fit(complete.only(np.flatnonzero(~complete.at_bound).tolist()))
     errors = priors_pa * squares.standard_errors[-count:] * np.sqrt(after / free)
     named = [k for k in range(count) if abs(estimates[k]) > NAMED_ERRORS * errors[k]] or [
         int(np.argmax(np.abs(estimates) / errors))
